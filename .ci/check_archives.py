@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Check that a wheel and a source archive hold every file of the checkout that belongs in them.
+
+Usage: python .ci/check_archives.py dist/ltcl-*.whl dist/ltcl-*.tar.gz
+"""
+
+from __future__ import annotations
+
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SUFFIXES = {".py", ".cl", ".h", ".typed"}
+
+
+def checkout(*folders: str) -> set[str]:
+    """Names of the source files in `folders`, relative to the checkout."""
+    files = (path for folder in folders for path in (ROOT / folder).rglob("*"))
+    return {path.relative_to(ROOT).as_posix() for path in files if path.suffix in SUFFIXES}
+
+
+def missing(archive: Path) -> set[str]:
+    """Names that `archive` should hold and does not."""
+    if archive.suffix == ".whl":
+        wanted = checkout("ltcl") | {f"ltcl/{name}" for name in checkout("kernels")}
+        with zipfile.ZipFile(archive) as wheel:
+            return wanted - set(wheel.namelist())
+    wanted = checkout("ltcl", "kernels", "tests", "bench") | {"LICENSE", "README.md", "pyproject.toml"}
+    with tarfile.open(archive) as sdist:
+        return wanted - {name.partition("/")[2] for name in sdist.getnames()}
+
+
+def main(names: list[str]) -> int:
+    """Report on each archive; return the exit status."""
+    archives = [Path(name) for name in names]
+    if sorted(archive.suffix for archive in archives) != [".gz", ".whl"]:
+        print(f"expected one wheel and one source archive, found {names}")
+        return 1
+    if not checkout("kernels"):
+        print("kernels/ holds no OpenCL source")
+        return 1
+    status = 0
+    for archive in archives:
+        lost = sorted(missing(archive))
+        print(f"{archive.name}:", f"lacks {', '.join(lost)}" if lost else "complete")
+        status |= bool(lost)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What every bench shares: options, paired timing, the roofline, and the report.
+
+Ratios count: competitors are timed in turn with us, in one process, so that a machine whose speed drifts
+slows all of them alike. Figures are medians. A target that is missed is printed as plainly as one that is hit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+from rich.console import Console
+from rich.table import Table
+
+import ltcl
+from ltcl.device import Device
+
+
+@dataclass(frozen=True)
+class Options:
+    """Command line of a bench."""
+
+    smoke: bool
+    json: Path | None
+    plot: Path | None
+    device: Device
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison. `ratio` is how many times better ours is; `target` is the least it should be."""
+
+    question: str
+    competitor: str
+    theirs: float
+    ours: float
+    unit: str
+    ratio: float
+    target: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Hit, miss by how much, or nothing where there is no target."""
+        if self.target is None:
+            return ""
+        return "hit" if self.ratio >= self.target else f"MISS: {self.ratio / self.target:.0%} of {self.target:g}x"
+
+
+def options(description: str) -> Options:
+    """Parse the command line and open the device."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--smoke", action="store_true", help="tiny sizes: does it run, not how fast")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--plot", type=Path, help="draw the ratios into this PNG")
+    parser.add_argument("--device", help="as ltcl.open_device takes it")
+    given = parser.parse_args()
+    return Options(given.smoke, given.json, given.plot, ltcl.open_device(given.device))
+
+
+def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> dict[str, float]:
+    """Median seconds of each action, run in turn A B C A B C after one warm-up each."""
+    for action in actions.values():
+        action()
+    times: dict[str, list[float]] = {name: [] for name in actions}
+    for _ in range(repeats):
+        for name, action in actions.items():
+            start = time.perf_counter()
+            action()
+            times[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+class Triad:
+    """a b + c over arrays far larger than the caches: what memory gives (STREAM's count, 12 bytes an element)."""
+
+    def __init__(self, device: Device, smoke: bool) -> None:
+        self.device = device
+        self.count = 1 << (16 if smoke else 25)
+        self._arrays = [device.upload(np.ones(self.count, np.float32)) for _ in range(3)]
+        self._kernel = device.kernel("vector", "vector_triad")
+
+    def __call__(self) -> None:
+        """Run once and wait."""
+        b, c, out = self._arrays
+        self._kernel(self.count // 8, 64, self.count // 8, 2.0, b, c, out)
+        self.device.finish()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes moved by one run."""
+        return 12 * self.count
+
+
+def report(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -> None:
+    """Print the rows, and write them where the command line asked for it."""
+    console = Console(width=150)
+    console.print(f"[bold]{title}[/]\n{given.device.name}, {given.device.driver}")
+    for name, value in facts.items():
+        console.print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
+    if given.smoke:
+        console.print("[yellow]--smoke: sizes this small show that it runs, not how fast[/]")
+    table = Table("question", "competitor", "theirs", "ours", "unit", "ratio", "target", "verdict")
+    for row in rows:
+        target = "" if row.target is None else f"{row.target:g}x"
+        table.add_row(
+            row.question, row.competitor, f"{row.theirs:.4g}", f"{row.ours:.4g}", row.unit, f"{row.ratio:.2f}x",
+            target, "" if given.smoke else row.verdict,
+        )  # fmt: skip
+    console.print(table)
+    if given.json is not None:
+        given.json.parent.mkdir(parents=True, exist_ok=True)
+        given.json.write_text(json.dumps(_record(given, title, rows, facts), indent=1) + "\n")
+    if given.plot is not None:
+        _draw(given.plot, title, rows)
+
+
+def _record(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "title": title,
+        "smoke": given.smoke,
+        "device": given.device.name,
+        "driver": given.device.driver,
+        "versions": {
+            "ltcl": ltcl.__version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "scipy": scipy.__version__,
+        },
+        "facts": facts,
+        "rows": [{**asdict(row), "verdict": row.verdict} for row in rows],
+    }
+
+
+def _draw(path: Path, title: str, rows: list[Row]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 0.45 * len(rows) + 1.4), layout="constrained")
+    axes = figure.subplots()
+    places = range(len(rows))[::-1]
+    axes.barh(places, [row.ratio for row in rows], color="#3b6ea5", label="measured")
+    for place, row in zip(places, rows, strict=True):
+        if row.target is not None:
+            axes.plot([row.target] * 2, [place - 0.4, place + 0.4], color="#c0392b", lw=2)
+    axes.set_yticks(places, [f"{row.question}\nagainst {row.competitor}" for row in rows], fontsize=7)
+    axes.set_xscale("log")
+    axes.set_xlabel("times better (red: target)")
+    axes.set_title(title, fontsize=10)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)

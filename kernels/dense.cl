@@ -1,0 +1,170 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Product of a dense row-major matrix with K right-hand sides: out = scale * (A x) + add, and with A^T.
+//
+// Three kernels do the same; the device layer times them and takes the fastest:
+//   dense_matvec         one work-item a row, as it reads in a textbook
+//   dense_matvec_stream  one work-item a row, in wide loads; for CPUs, where a row is a stream
+//   dense_matvec_group   one work-group a row, its items side by side along the row; for GPUs
+// dense_rmatvec          the transpose: one work-item LANES neighbouring columns, down the rows of a slab
+//
+// Required defines: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8; LANES: 1 or 8.
+// Layout: a slab of `rows` rows of `width` reals, the first of which is row `first` of the matrix. x and
+// out are row-major with `stride` reals a row; the launch works on their columns offset .. offset + K - 1.
+
+#include "common/lanes.h"
+#include "common/reduce.h"
+
+#ifndef LANES
+#error "dense.cl needs -DLANES=<columns one item of dense_rmatvec sums: 1 or 8>"
+#endif
+
+kernel void dense_matvec(
+    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
+    global const real *x, global const real *add, global real *out)
+{
+    const int row = get_global_id(0);
+    if (row >= rows)
+        return;
+    global const real *a = matrix + (size_t)row * width;
+    real sum[K];
+    for (int c = 0; c < K; ++c)
+        sum[c] = 0;
+    for (int j = 0; j < width; ++j)
+        for (int c = 0; c < K; ++c)
+            sum[c] = a[j] * x[j * stride + offset + c] + sum[c];
+    const int i = (first + row) * stride + offset;
+    for (int c = 0; c < K; ++c)
+        LTCL_STORE(out, i + c, sum[c], scale, adds, add);
+}
+
+#if K == 1
+
+kernel void dense_matvec_stream(
+    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
+    global const real *x, global const real *add, global real *out)
+{
+    const int row = get_global_id(0);
+    if (row >= rows)
+        return;
+    x += offset;
+    global const real *a = matrix + (size_t)row * width;
+    real8 s0 = 0, s1 = 0, s2 = 0, s3 = 0;  // four sums hide the latency of the addition
+    int j = 0;
+    if (stride == 1)
+        for (; j + 32 <= width; j += 32) {
+            s0 = vload8(0, a + j) * vload8(0, x + j) + s0;
+            s1 = vload8(0, a + j + 8) * vload8(0, x + j + 8) + s1;
+            s2 = vload8(0, a + j + 16) * vload8(0, x + j + 16) + s2;
+            s3 = vload8(0, a + j + 24) * vload8(0, x + j + 24) + s3;
+        }
+    real sum = sum8((s0 + s1) + (s2 + s3));
+    for (; j < width; ++j)
+        sum = a[j] * x[j * stride] + sum;
+    const int i = (first + row) * stride + offset;
+    LTCL_STORE(out, i, sum, scale, adds, add);
+}
+
+#else
+
+kernel void dense_matvec_stream(
+    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
+    global const real *x, global const real *add, global real *out)
+{
+    const int row = get_global_id(0);
+    if (row >= rows)
+        return;
+    x += offset;
+    global const real *a = matrix + (size_t)row * width;
+    lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;
+    int j = 0;
+    for (; j + 4 <= width; j += 4) {
+        s0 = (lanes)(a[j]) * LOAD(x + j * stride) + s0;
+        s1 = (lanes)(a[j + 1]) * LOAD(x + (j + 1) * stride) + s1;
+        s2 = (lanes)(a[j + 2]) * LOAD(x + (j + 2) * stride) + s2;
+        s3 = (lanes)(a[j + 3]) * LOAD(x + (j + 3) * stride) + s3;
+    }
+    for (; j < width; ++j)
+        s0 = (lanes)(a[j]) * LOAD(x + j * stride) + s0;
+    lanes_items sum;
+    sum.vector = (s0 + s1) + (s2 + s3);
+    const int i = (first + row) * stride + offset;
+    for (int c = 0; c < K; ++c)
+        LTCL_STORE(out, i + c, sum.item[c], scale, adds, add);
+}
+
+#endif
+
+kernel void dense_matvec_group(
+    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
+    global const real *x, global const real *add, global real *out, local real *scratch)
+{
+    const int row = get_group_id(0);  // one group a row exactly: no row is beyond the last
+    global const real *a = matrix + (size_t)row * width;
+    real sum[K];
+    for (int c = 0; c < K; ++c)
+        sum[c] = 0;
+    for (int j = get_local_id(0); j < width; j += get_local_size(0))
+        for (int c = 0; c < K; ++c)
+            sum[c] = a[j] * x[j * stride + offset + c] + sum[c];
+    const int i = (first + row) * stride + offset;
+    for (int c = 0; c < K; ++c) {
+        const real total = group_sum(sum[c], scratch);
+        if (get_local_id(0) == 0)
+            LTCL_STORE(out, i + c, total, scale, adds, add);
+    }
+}
+
+#if LANES == 8
+typedef real8 stretch;
+#define LOAD_STRETCH(a) vload8(0, a)
+#else
+typedef real stretch;
+#define LOAD_STRETCH(a) (*(a))
+#endif
+
+typedef union {
+    stretch vector;
+    real item[LANES];
+} stretch_items;
+
+// out = scale * (slab^T x) + add, where x is read from row `first` on. The host adds the slabs up, one
+// launch after the other, so the sum has one order.
+kernel void dense_rmatvec(
+    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
+    global const real *x, global const real *add, global real *out)
+{
+    const int item = get_global_id(0) * LANES;
+    if (item >= width)
+        return;
+    // The last item moves back to a full stretch where it can; what it shares it does not store again.
+    const int column = width < LANES ? 0 : min(item, width - LANES);
+    const int lanes_here = min(LANES, width);
+    global const real *a = matrix + column;
+    x += first * stride + offset;
+    stretch_items sum[K];
+    for (int c = 0; c < K; ++c)
+        for (int lane = 0; lane < LANES; ++lane)
+            sum[c].item[lane] = 0;
+    if (lanes_here == LANES) {
+        stretch s[K];
+        for (int c = 0; c < K; ++c)
+            s[c] = 0;
+        for (int row = 0; row < rows; ++row) {
+            const stretch v = LOAD_STRETCH(a + (size_t)row * width);
+            for (int c = 0; c < K; ++c)
+                s[c] = v * x[row * stride + c] + s[c];
+        }
+        for (int c = 0; c < K; ++c)
+            sum[c].vector = s[c];
+    } else {
+        for (int row = 0; row < rows; ++row)
+            for (int lane = 0; lane < lanes_here; ++lane)
+                for (int c = 0; c < K; ++c)
+                    sum[c].item[lane] = a[(size_t)row * width + lane] * x[row * stride + c] + sum[c].item[lane];
+    }
+    for (int lane = item - column; lane < lanes_here; ++lane)
+        for (int c = 0; c < K; ++c) {
+            const int i = (column + lane) * stride + offset + c;
+            LTCL_STORE(out, i, sum[c].item[lane], scale, adds, add);
+        }
+}

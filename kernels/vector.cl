@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Vectors: what a solver does between two products.
+//
+// Layout: `count` reals; k right-hand sides of n pixels are stored row-major, so that count = n * k and
+// column c is every k-th value from c on. Elementwise kernels do not care: one work-item an element.
+
+#include "common/real.h"
+#include "common/reduce.h"
+
+kernel void vector_fill(int count, real value, global real *out)
+{
+    const int i = get_global_id(0);
+    if (i < count)
+        out[i] = value;
+}
+
+// out = a x + b y. `out` may be x or y.
+kernel void vector_axpby(int count, real a, global const real *x, real b, global const real *y, global real *out)
+{
+    const int i = get_global_id(0);
+    if (i < count)
+        out[i] = a * x[i] + b * y[i];
+}
+
+// out = diag(d) x for k right-hand sides. `out` may be x.
+kernel void vector_scale_rows(int count, int k, global const real *d, global const real *x, global real *out)
+{
+    const int i = get_global_id(0);
+    if (i < count)
+        out[i] = d[i / k] * x[i];
+}
+
+// The sum of x y for each column. Group (g, c) sums the rows of column c that belong to slice g of
+// get_num_groups(0); a second launch with one slice, `rows` partial sums and ones == 1 (y is not read)
+// adds up the slices. Two launches of a fixed shape: the result is the same at every call.
+kernel void vector_dot(
+    int rows, int k, int ones, global const real *x, global const real *y, global real *out, int first,
+    local real *scratch)
+{
+    const int column = get_group_id(1);
+    const int step = get_global_size(0);
+    real sum = 0;
+    for (int row = get_global_id(0); row < rows; row += step) {
+        const int i = row * k + column;
+        sum += ones ? x[i] : x[i] * y[i];
+    }
+    sum = group_sum(sum, scratch);
+    if (get_local_id(0) == 0)
+        out[first + get_group_id(0) * k + column] = sum;
+}
+
+// out = a b + c: the STREAM triad, the yardstick of bench/.
+kernel void vector_triad(int count, real a, global const real8 *b, global const real8 *c, global real8 *out)
+{
+    const int i = get_global_id(0);
+    if (i < count)
+        out[i] = a * b[i] + c[i];
+}

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""ltcl: inverse light transport on any OpenCL device.
+
+A projector lights a concave, coloured scene; light bounces before the camera sees it: picture = T pattern.
+ltcl undoes the bounces with matrix-vector products only.
+
+    T = ltcl.load("transport.npz")             # measured, or ltcl.scenes.box(40, sides=3).transport()
+    c = ltcl.compensate(T, desired)            # c.pattern makes the wall look like `desired`
+    b = ltcl.separate(T, image)                # b.direct, b.bounces: each bounce as its own picture
+
+After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse Light Transport, IEEE PAMI
+2011; equation numbers in this package are that paper's. Importing ltcl touches no OpenCL driver.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from ltcl import errors
+from ltcl.analysis import Analysis, analyze
+from ltcl.compensation import Compensation, compensate
+from ltcl.device import Device, list_devices, open_device
+from ltcl.relighting import relight
+from ltcl.separation import Separation, separate
+from ltcl.solvers import Solution, Status, solve
+from ltcl.store import load, save
+from ltcl.transport import Transport
+
+if TYPE_CHECKING:
+    from ltcl import images, plots, scenes
+
+__version__ = "0.1.0"
+__all__ = [
+    "Analysis",
+    "Compensation",
+    "Device",
+    "Separation",
+    "Solution",
+    "Status",
+    "Transport",
+    "analyze",
+    "compensate",
+    "errors",
+    "images",
+    "list_devices",
+    "load",
+    "open_device",
+    "plots",
+    "relight",
+    "save",
+    "scenes",
+    "separate",
+    "solve",
+]
+
+_LAZY = ("images", "plots", "scenes")  # they bring OpenCV or matplotlib, which not everybody needs
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return importlib.import_module(f"ltcl.{name}")
+    raise AttributeError(f"module 'ltcl' has no attribute {name!r}")

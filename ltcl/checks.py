@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Refusals of bad input: one line each that names the argument, what it was and what it must be.
+
+Everything here runs on the host before anything is built, uploaded or overwritten.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+
+
+def finite(name: str, array: np.ndarray) -> np.ndarray:
+    """Return `array` unchanged; refuse NaN and Inf with their number and first place."""
+    # The sum is finite in almost every good case and reads the array once, without a mask.
+    with np.errstate(over="ignore", invalid="ignore"):
+        if array.size == 0 or np.isfinite(np.sum(array, dtype=np.float64)):
+            return array
+    bad = ~np.isfinite(array)
+    count = int(np.count_nonzero(bad))
+    if count:
+        first = tuple(int(i) for i in np.argwhere(bad)[0])
+        place = first[0] if len(first) == 1 else first
+        raise InputError(
+            f"{name} has {count} NaN or infinite value(s), the first at {place}; all must be finite"
+        )
+    return array
+
+
+def real(name: str, value: Any) -> np.ndarray:
+    """Return `value` as an array of real numbers (no copy where it is one); refuse others."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        raise InputTypeError(f"{name} holds {array.dtype}; it must hold real numbers")
+    return array
+
+
+def shape(name: str, array: np.ndarray, *allowed: tuple[int, ...]) -> np.ndarray:
+    """Return `array` unchanged if its shape is one of `allowed`."""
+    if array.shape not in allowed:
+        wanted = " or ".join(str(s) for s in allowed)
+        raise InputError(f"{name} has shape {array.shape}; it must be {wanted}")
+    return array
+
+
+def grid(name: str, value: Any, pixels: int | None = None) -> tuple[int, int]:
+    """Return `value` as (h, w) of positive integers, with h * w == pixels where that is given."""
+    try:
+        h, w = (int(v) for v in value)
+        whole = (h, w) == tuple(value)
+    except (TypeError, ValueError):
+        h = w = 0
+        whole = False
+    if not whole or h < 1 or w < 1:
+        raise InputError(f"{name} is {value!r}; it must be two positive integers (h, w)")
+    if pixels is not None and h * w != pixels:
+        raise InputError(
+            f"{name} is {h} x {w} = {h * w} pixels, but the matrix is for {pixels}; h * w must be {pixels}"
+        )
+    return h, w
+
+
+def number(
+    name: str,
+    value: Any,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+    below: float | None = None,
+) -> float:
+    """Return `value` as a finite float inside the bounds given."""
+    limits = [
+        (f"above {above:g}" if above is not None else "", above is None or _as_float(value) > above),
+        (f"at least {least:g}" if least is not None else "", least is None or _as_float(value) >= least),
+        (f"at most {most:g}" if most is not None else "", most is None or _as_float(value) <= most),
+        (f"below {below:g}" if below is not None else "", below is None or _as_float(value) < below),
+    ]
+    if not np.isfinite(_as_float(value)) or not all(ok for _, ok in limits):
+        wanted = " and ".join(text for text, _ in limits if text)
+        raise InputError(f"{name} is {value!r}; it must be a finite number {wanted}".rstrip())
+    return float(value)
+
+
+def count(name: str, value: Any, *, least: int = 1) -> int:
+    """Return `value` as an integer of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name} is {value!r}; it must be a whole number of at least {least}")
+    return int(value)
+
+
+def one_of(name: str, value: Any, allowed: Iterable[str]) -> str:
+    """Return `value` if it is one of the names `allowed`."""
+    names = list(allowed)
+    if value not in names:
+        raise InputError(f"{name} is {value!r}; it must be one of {', '.join(names)}")
+    return value
+
+
+def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
+    """Return `matrix` as a checked `csr_array` with sorted, unique indices.
+
+    A compressed matrix is checked as it stands, before SciPy touches it: SciPy itself accepts
+    column indices beyond the matrix, and its conversions then read outside their arrays.
+    """
+    if matrix.format in ("csr", "csc"):
+        major, minor = matrix.shape if matrix.format == "csr" else matrix.shape[::-1]
+        compressed(name, matrix.indptr, matrix.indices, matrix.data, (major, minor))
+    real(name, matrix.data if hasattr(matrix, "data") else np.zeros(0, matrix.dtype))
+    result = scipy.sparse.csr_array(matrix)
+    if not result.has_canonical_format:
+        result = result.copy()
+        result.sum_duplicates()
+    return result
+
+
+def compressed(
+    name: str, indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, shape: tuple[int, int]
+) -> None:
+    """Refuse compressed rows whose pointers or indices do not describe a matrix of `shape`."""
+    rows, columns = shape
+    for part, array in (("indptr", indptr), ("indices", indices)):
+        if array.ndim != 1 or array.dtype.kind not in "iu":
+            raise InputError(f"{name}.{part} must be a vector of integers, not {array.dtype} {array.shape}")
+    if data.ndim != 1:
+        raise InputError(f"{name}.data has shape {data.shape}; it must be a vector")
+    if len(indptr) != rows + 1 or indptr[0] != 0:
+        raise InputError(
+            f"{name}.indptr has {len(indptr)} entries from {indptr[0] if len(indptr) else 'none'}; "
+            f"it must have {rows + 1} entries from 0"
+        )
+    falls = np.flatnonzero(indptr[1:] < indptr[:-1])
+    if len(falls):
+        raise InputError(f"{name}.indptr falls after entry {falls[0]}; row pointers must never fall")
+    if indptr[-1] != len(indices) or len(indices) != len(data):
+        raise InputError(
+            f"{name}.indptr ends at {indptr[-1]} with {len(indices)} indices and {len(data)} values; "
+            "the three must agree"
+        )
+    if len(indices) and (indices.min() < 0 or indices.max() >= columns):
+        worst = indices.min() if indices.min() < 0 else indices.max()
+        raise InputError(f"{name}.indices holds {worst}; column indices must be in 0..{columns - 1}")
+    finite(f"{name}.data", data)
+
+
+def host_memory() -> int:
+    """Bytes of memory the host can still give, as far as the system says."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            fields = dict(line.split(":", 1) for line in file)
+        return int(fields["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 1 << 62  # unknown: let the allocation itself decide
+
+
+def fits_host(what: str, needed: int) -> None:
+    """Refuse an allocation of `needed` bytes that the host does not have, before it is tried."""
+    available = host_memory()
+    if needed > available:
+        raise MemoryLimitError(f"{what} needs {size(needed)}, but the host has {size(available)} free")
+
+
+def size(nbytes: float) -> str:
+    """Bytes as people read them: 1536 -> '1.5 KiB'."""
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if nbytes < 1024:
+            return f"{nbytes:.4g} {unit}"
+        nbytes /= 1024
+    return f"{nbytes:.4g} TiB"
+
+
+def _as_float(value: Any) -> float:
+    if isinstance(value, (bool, str, bytes)):
+        return float("nan")
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")

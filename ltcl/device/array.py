@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Arrays on a device: (N,) one right-hand side, (N, k) several of them, row-major."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ltcl.device import failures
+from ltcl.errors import InputError
+
+if TYPE_CHECKING:
+    from ltcl.device.device import Device
+
+
+@dataclass(frozen=True, eq=False)
+class Array:
+    """A buffer with a shape and a type; values move only when asked to."""
+
+    device: Device
+    buffer: Any
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the values."""
+        return self.size * self.dtype.itemsize
+
+    @property
+    def columns(self) -> int:
+        """Number of right-hand sides: k of (N, k), 1 of (N,)."""
+        return 1 if len(self.shape) == 1 else self.shape[1]
+
+    def get(self) -> np.ndarray:
+        """The values on the host, once everything queued before has run."""
+        import pyopencl as cl
+
+        host = np.empty(self.shape, self.dtype)
+        if host.size:
+            with failures.translated(f"reading from {self.device.name}"):
+                cl.enqueue_copy(self.device.queue, host, self.buffer)
+        return host
+
+    def set(self, values: np.ndarray) -> Array:
+        """Overwrite with host values of the same shape; returns the array."""
+        import pyopencl as cl
+
+        if values.shape != self.shape:
+            raise InputError(f"values have shape {values.shape}; the array on the device has {self.shape}")
+        host = np.ascontiguousarray(values, dtype=self.dtype)
+        if host.size:
+            with failures.translated(f"writing to {self.device.name}"):
+                cl.enqueue_copy(self.device.queue, self.buffer, host)
+        return self
+
+    def copy_from(self, other: Array) -> Array:
+        """Overwrite with the values of another array of the device; returns this one."""
+        import pyopencl as cl
+
+        if other.shape != self.shape:
+            raise InputError(f"cannot copy an array of shape {other.shape} into one of {self.shape}")
+        if self.nbytes:
+            with failures.translated(f"copying on {self.device.name}"):
+                cl.enqueue_copy(self.device.queue, self.buffer, other.buffer, byte_count=self.nbytes)
+        return self
+
+    def copy(self) -> Array:
+        """Another array with the same values."""
+        return self.like().copy_from(self)
+
+    def like(self) -> Array:
+        """An uninitialised array of the same shape and type."""
+        return self.device.empty(self.shape, self.dtype)

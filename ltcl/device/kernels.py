@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One way to run a kernel: build once per (source, defines, device), typed arguments, launch."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+from ltcl.device import failures, sources
+from ltcl.errors import DeviceError
+
+if TYPE_CHECKING:
+    from ltcl.device.device import Device
+
+# Exact float32: no fast-math (it deletes NaN tests), contraction of a * b + c is left to the driver.
+_OPTIONS = ["-cl-std=CL1.2"]
+
+
+class Kernel:
+    """A compiled kernel of one device.
+
+    Call it with the number of work-items, the work-group size (None: the driver's choice) and the
+    arguments: Python numbers, `Array`, or pyopencl buffers and local memory.
+    """
+
+    def __init__(self, device: Device, built: Any, name: str, types: tuple[type | None, ...]) -> None:
+        self.device = device
+        self.name = name
+        self._kernel = built
+        # Untyped Python scalars are refused by pyopencl with CL_INVALID_VALUE: their types are set once.
+        self._kernel.set_scalar_arg_dtypes(list(types))
+        # Arguments live in the cl_kernel until the launch: one thread at a time.
+        self._lock = threading.Lock()
+
+    def __call__(self, items: int | tuple[int, ...], group: int | tuple[int, ...] | None, *arguments: Any) -> None:
+        size = items if isinstance(items, tuple) else (items,)
+        local = (group,) if isinstance(group, int) else group
+        if 0 in size:
+            return
+        if local is not None:
+            size = tuple(-(-n // g) * g for n, g in zip(size, local, strict=True))
+        raw = [getattr(argument, "buffer", argument) for argument in arguments]
+        with self._lock, failures.translated(f"running {self.name} on {self.device.name}"):
+            event = self._kernel(self.device.queue, size, local, *raw)
+        self.device.record(self.name, event)
+
+    def largest_group(self) -> int:
+        """The largest work-group this kernel can run with on its device."""
+        import pyopencl as cl
+
+        return self._kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, self.device.handle)
+
+
+def build(device: Device, file: str, defines: dict[str, Any]) -> dict[str, Kernel]:
+    """Compile `kernels/<file>.cl` for `device`; returns its kernels by name."""
+    import pyopencl as cl
+
+    source = sources.load(file)
+    options = _OPTIONS + [f"-D{name}={value}" for name, value in sorted(defines.items())]
+    try:
+        # The driver keeps its own binary cache; pyopencl's would write pickles.
+        program = cl.Program(device.context, source.text).build(options, cache_dir=False)
+    except cl.Error as error:
+        raise DeviceError(
+            f"kernels/{file}.cl does not compile on {device.name} ({device.driver}) with "
+            f"{' '.join(options)}:\n{_log(error)}"
+        ) from error
+    return {
+        name: Kernel(device, cl.Kernel(program, name), name, types) for name, types in source.signatures.items()
+    }
+
+
+def _log(error: Exception) -> str:
+    """The compiler's own words: pyopencl puts options and source around them."""
+    return str(error).split("(options:")[0].strip()

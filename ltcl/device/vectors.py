@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a solver does between two products: fill, axpby, diagonal scaling, dot, norm.
+
+Everything is queued and returns at once; only `dot` and `norm` give numbers to the host and so wait.
+Sums are trees over a fixed number of slices: the same bits at every call on a given device.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ltcl.device.array import Array
+from ltcl.errors import InputError
+
+_SLICES = 64  # partial sums of a dot product: enough groups for a large GPU, few enough for one last group
+
+
+def fill(x: Array, value: float) -> Array:
+    """x = value everywhere."""
+    _elementwise(x, "vector_fill", float(value), x)
+    return x
+
+
+def axpby(a: float, x: Array, b: float, y: Array, out: Array) -> Array:
+    """out = a x + b y; `out` may be `x` or `y`."""
+    _same_shape(x, y, out)
+    _elementwise(out, "vector_axpby", float(a), x, float(b), y, out)
+    return out
+
+
+def axpy(a: float, x: Array, y: Array) -> Array:
+    """y = a x + y."""
+    return axpby(a, x, 1.0, y, y)
+
+
+def difference(x: Array, y: Array, out: Array) -> Array:
+    """out = x - y."""
+    return axpby(1.0, x, -1.0, y, out)
+
+
+def scale_rows(d: Array, x: Array, out: Array) -> Array:
+    """out = diag(d) x with d (N,) and x (N,) or (N, k); `out` may be `x`."""
+    _same_shape(x, out)
+    if d.shape != x.shape[:1]:
+        raise InputError(f"the diagonal has shape {d.shape}; it must be {x.shape[:1]}")
+    _elementwise(out, "vector_scale_rows", x.columns, d, x, out)
+    return out
+
+
+def dot(x: Array, y: Array) -> np.ndarray:
+    """<x_c, y_c> of every column c, as (k,) float64; waits for the device."""
+    _same_shape(x, y)
+    device, k = x.device, x.columns
+    rows = x.shape[0]
+    kernel = device.kernel("vector", "vector_dot")
+    group = 64 if device.is_cpu else 256
+    group = min(group, kernel.largest_group())
+    slices = min(_SLICES, max(1, -(-rows // group)))
+    # (slices, k) partial sums, then the k results behind them.
+    sums = device.empty(((slices + 1) * k,))
+    scratch = device.local(group)
+    kernel((slices * group, k), (group, 1), rows, k, 0, x, y, sums, 0, scratch)
+    kernel((group, k), (group, 1), slices, k, 1, sums, sums, sums, slices * k, scratch)
+    return sums.get()[slices * k :].astype(np.float64)
+
+
+def norm(x: Array) -> np.ndarray:
+    """Euclidean norm of every column, as (k,) float64; waits for the device."""
+    return np.sqrt(dot(x, x))
+
+
+def _elementwise(out: Array, name: str, *arguments: float | Array) -> None:
+    kernel = out.device.kernel("vector", name)
+    kernel(out.size, min(256, kernel.largest_group()), out.size, *arguments)
+
+
+def _same_shape(*arrays: Array) -> None:
+    shapes = {array.shape for array in arrays}
+    if len(shapes) > 1:
+        raise InputError(f"vectors of different shapes {sorted(shapes)} cannot be combined")

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Every problem ltcl raises, as one small family.
+
+A message is one line: it names the argument, says what it was and what it must be.
+`LtclError` catches them all; each child is also the builtin exception a Python user expects.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ltcl.solvers.result import Solution
+
+
+class LtclError(Exception):
+    """Base of every exception that ltcl raises on purpose."""
+
+
+class InputError(LtclError, ValueError):
+    """An argument has an unusable value: shape, range, NaN, structure."""
+
+
+class InputTypeError(LtclError, TypeError):
+    """An argument is of an unusable type, or an unknown option was given."""
+
+
+class FileError(InputError, OSError):
+    """A file is missing, truncated, lies about its size, or has an unknown format."""
+
+
+class MemoryLimitError(LtclError, MemoryError):
+    """Something would not fit in the memory of the host or of the device; said before allocation."""
+
+
+class DeviceError(LtclError, RuntimeError):
+    """An OpenCL device is missing, or failed; the message says what to do."""
+
+
+class ConvergenceError(LtclError, ArithmeticError):
+    """A solve did not reach its tolerance. `solution` holds the best iterate and the history."""
+
+    def __init__(self, message: str, solution: Solution) -> None:
+        super().__init__(message)
+        self.solution = solution

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Linear operators on an OpenCL device, each also a `scipy.sparse.linalg.LinearOperator`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import scipy.sparse
+
+from ltcl.device import Device, open_device
+from ltcl.operators.base import Norms, Operator, Transposed
+from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators.csr import CSR, Pattern
+from ltcl.operators.dense import Dense
+
+__all__ = [
+    "CSR",
+    "Dense",
+    "Host",
+    "IdentityPlus",
+    "Norms",
+    "Operator",
+    "Pattern",
+    "ScaledColumns",
+    "Shifted",
+    "Transposed",
+    "as_operator",
+]
+
+
+def as_operator(matrix: Any, device: Device | None = None) -> Operator:
+    """An operator on a device from whatever SciPy users hold.
+
+    Parameters
+    ----------
+    matrix : Operator, (M, N) array, scipy.sparse matrix or array, or LinearOperator
+        An `Operator` is returned as it is.
+    device : Device, optional
+        The best one when not given.
+
+    Examples
+    --------
+    >>> import numpy
+    >>> from ltcl.operators import as_operator
+    >>> type(as_operator(numpy.eye(4))).__name__
+    'Dense'
+    """
+    if isinstance(matrix, Operator):
+        return matrix
+    device = device if device is not None else open_device()
+    if scipy.sparse.issparse(matrix):
+        return CSR(device, matrix)
+    if hasattr(matrix, "matvec"):
+        return Host(device, matrix)
+    return Dense(device, matrix)

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What every linear operator on a device promises.
+
+The contract for subclasses is `_product` and `diagonal`; everything else is made of those.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse.linalg
+
+from ltcl import checks
+from ltcl.device import Array, Device
+from ltcl.errors import InputError
+
+WIDTHS = (8, 4, 3, 2, 1)  # right-hand sides one launch of a product kernel takes
+
+
+@dataclass(frozen=True)
+class Norms:
+    """Largest column sum, largest row sum (both of absolute values) and Frobenius norm."""
+
+    one: float
+    inf: float
+    frobenius: float
+
+
+class Operator(scipy.sparse.linalg.LinearOperator):
+    """An (M, N) linear operator in float32 on an OpenCL device.
+
+    NumPy in, NumPy out, wherever SciPy takes a `LinearOperator`; device arrays in, device arrays out
+    through `apply`, with no host copy between products.
+
+    Attributes
+    ----------
+    device : Device
+        Where it lives.
+    shape : tuple of int
+        (M, N).
+    nbytes : int
+        Bytes of its matrix on the device.
+    error : float
+        Bound on the 2-norm of what a compressed operator dropped; 0 for exact ones.
+    """
+
+    error = 0.0
+
+    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
+        super().__init__(np.float32, shape)
+        self.device = device
+        self._row_sums: np.ndarray | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the matrix on the device."""
+        return 0
+
+    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        """Queue ``out = scale * (A x) + add``, or with A^T. `out` is never `x`, but may be `add`."""
+        raise TypeError(f"{type(self).__name__} does not implement _product")
+
+    def diagonal(self) -> np.ndarray:
+        """The main diagonal, (min(M, N),) float64, on the host."""
+        raise TypeError(f"{type(self).__name__} does not implement diagonal")
+
+    def apply(self, x: Array, out: Array | None = None, *, scale: float = 1.0, add: Array | None = None) -> Array:
+        """Queue ``out = scale * (A x) + add`` on the device.
+
+        Parameters
+        ----------
+        x : Array, (N,) or (N, k)
+        out : Array, (M,) or (M, k), optional
+            Made when not given; must not be `x`.
+        scale : float
+        add : Array like `out`, optional
+            May be `out` itself, which is then added to.
+
+        Returns
+        -------
+        Array
+            `out`. A residual is ``S.apply(x, r, scale=-1, add=b)``: one launch, no extra pass.
+
+        Raises
+        ------
+        InputError
+            Shapes that do not fit.
+        """
+        return self._checked(x, out, scale, add, transpose=False)
+
+    def apply_transpose(
+        self, x: Array, out: Array | None = None, *, scale: float = 1.0, add: Array | None = None
+    ) -> Array:
+        """Queue ``out = scale * (A^T x) + add`` on the device; see `apply`."""
+        return self._checked(x, out, scale, add, transpose=True)
+
+    def norms(self) -> Norms:
+        """Norms that need the entries; operators that cannot see theirs refuse."""
+        raise InputError(f"{type(self).__name__} cannot see its entries, so their norms are unknown")
+
+    def row_sums(self) -> np.ndarray:
+        """A 1, (M,) float32: one product, at the first call only."""
+        if self._row_sums is None:
+            self._row_sums = self._matvec(np.ones(self.shape[1], np.float32))
+        return self._row_sums
+
+    def to_dense(self) -> np.ndarray:
+        """The whole matrix as (M, N) float64 on the host, column block by column block."""
+        rows, columns = self.shape
+        checks.fits_host(f"a dense {rows} x {columns} matrix", 8 * rows * columns)
+        dense = np.empty(self.shape)
+        for start in range(0, columns, 64):
+            block = np.zeros((columns, min(64, columns - start)), np.float32)
+            block[start + np.arange(block.shape[1]), np.arange(block.shape[1])] = 1
+            dense[:, start : start + block.shape[1]] = self._matmat(block)
+        return dense
+
+    # What SciPy asks for: NumPy in, NumPy out.
+
+    def _matvec(self, x: np.ndarray) -> np.ndarray:
+        return self.apply(self.device.upload(np.ravel(x))).get()
+
+    def _matmat(self, x: np.ndarray) -> np.ndarray:
+        return self.apply(self.device.upload(x)).get()
+
+    def _rmatvec(self, x: np.ndarray) -> np.ndarray:
+        return self.apply_transpose(self.device.upload(np.ravel(x))).get()
+
+    def _rmatmat(self, x: np.ndarray) -> np.ndarray:
+        return self.apply_transpose(self.device.upload(x)).get()
+
+    def _transpose(self) -> Transposed:
+        return Transposed(self)
+
+    _adjoint = _transpose  # real numbers
+
+    def _checked(self, x: Array, out: Array | None, scale: float, add: Array | None, transpose: bool) -> Array:
+        rows, columns = self.shape[::-1] if transpose else self.shape
+        if x.shape[0] != columns or len(x.shape) > 2:
+            raise InputError(f"x has shape {x.shape}; the operator {self.shape} needs ({columns},) or ({columns}, k)")
+        if max(rows, columns) * x.columns >= 1 << 31:
+            raise InputError(f"x has {x.columns} right-hand sides; at most {(1 << 31) // max(rows, columns)} fit one product")
+        wanted = (rows, *x.shape[1:])
+        out = self.device.empty(wanted) if out is None else out
+        for name, array in (("out", out), ("add", add)):
+            if array is not None and array.shape != wanted:
+                raise InputError(f"{name} has shape {array.shape}; it must be {wanted}")
+        if out.buffer is x.buffer:
+            raise InputError("out is x; a product cannot be written over its own operand")
+        self._product(x, out, float(scale), add, transpose)
+        return out
+
+
+class Transposed(Operator):
+    """A^T of another operator, sharing its memory."""
+
+    def __init__(self, base: Operator) -> None:
+        super().__init__(base.device, base.shape[::-1])
+        self.base = base
+        self.error = base.error
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the matrix on the device."""
+        return self.base.nbytes
+
+    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        self.base._product(x, out, scale, add, not transpose)
+
+    def diagonal(self) -> np.ndarray:
+        """The main diagonal of the transpose is that of the operator."""
+        return self.base.diagonal()
+
+    def _transpose(self) -> Operator:
+        return self.base
+
+    _adjoint = _transpose
+
+
+def widths(columns: int) -> list[tuple[int, int]]:
+    """Cut k right-hand sides into launches: (offset, width) pairs.
+
+    >>> widths(11)
+    [(0, 8), (8, 3)]
+    """
+    pieces, offset = [], 0
+    while offset < columns:
+        width = next(w for w in WIDTHS if w <= columns - offset)
+        pieces.append((offset, width))
+        offset += width
+    return pieces

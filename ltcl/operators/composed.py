@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Operators made of others: S = I + R, columns scaled by a diagonal, and operators that live on the host."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse.linalg
+
+from ltcl import checks
+from ltcl.device import Array, Device, vectors
+from ltcl.errors import InputError
+from ltcl.operators.base import Operator
+
+
+class IdentityPlus(Operator):
+    """S = I + R, the interreflection operator (eq. 6), or I - A with ``sign=-1``; the identity is not stored.
+
+    The two are the paper's duality: S^-1 undoes all bounces, (I - A)^-1 adds them (eq. 4 and 7), and a
+    solver cannot tell them apart.
+
+    Parameters
+    ----------
+    R : Operator, (N, N)
+        Global illumination R, or one bounce A.
+    sign : float
+        +1 for I + R, -1 for I - R.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> from ltcl.operators import Dense, IdentityPlus
+    >>> S = IdentityPlus(Dense(ltcl.open_device(), [[0.0, 0.5], [0.5, 0.0]]))
+    >>> (S @ numpy.array([1.0, 0.0])).tolist()
+    [1.0, 0.5]
+    """
+
+    def __init__(self, R: Operator, sign: float = 1.0) -> None:
+        if R.shape[0] != R.shape[1]:
+            raise InputError(f"R has shape {R.shape}; S = I + R needs a square one")
+        if sign not in (1.0, -1.0):
+            raise InputError(f"sign is {sign!r}; it must be 1 for I + R or -1 for I - R")
+        super().__init__(R.device, R.shape)
+        self.R = R
+        self.sign = float(sign)
+        self.error = R.error
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of R."""
+        return self.R.nbytes
+
+    def diagonal(self) -> np.ndarray:
+        """1 + sign diag(R), (N,) float64."""
+        return 1.0 + self.sign * self.R.diagonal()
+
+    def to_dense(self) -> np.ndarray:
+        """I + sign R, (N, N) float64, on the host."""
+        dense = self.R.to_dense()
+        dense *= self.sign
+        dense[np.diag_indices_from(dense)] += 1.0
+        return dense
+
+    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        # Where something is added anyway, x joins it afterwards; else x itself is what R x is added to.
+        if add is None and scale == 1.0:
+            self.R._product(x, out, self.sign, x, transpose)
+        else:
+            self.R._product(x, out, scale * self.sign, add, transpose)
+            vectors.axpy(scale, x, out)
+
+
+class ScaledColumns(Operator):
+    """A diag(d): T from S and the first bounce, T = S F (eq. 3), or the other way round with 1 / F."""
+
+    def __init__(self, A: Operator, d: np.ndarray) -> None:
+        super().__init__(A.device, A.shape)
+        self.A = A
+        self.d = checks.shape("d", checks.real("d", d), A.shape[1:])
+        self._d = A.device.upload(self.d)
+        self.error = A.error * float(np.max(np.abs(self.d), initial=0.0))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the matrix and of the diagonal."""
+        return self.A.nbytes + self._d.nbytes
+
+    def diagonal(self) -> np.ndarray:
+        """diag(A) d, (min(M, N),) float64."""
+        diagonal = self.A.diagonal()
+        return diagonal * self.d[: len(diagonal)]
+
+    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        if not transpose:
+            self.A._product(vectors.scale_rows(self._d, x, x.like()), out, scale, add, False)
+            return
+        product = self.A.device.empty(out.shape)
+        self.A._product(x, product, scale, None, True)
+        vectors.scale_rows(self._d, product, product)
+        if add is None:
+            out.copy_from(product)
+        else:
+            vectors.axpby(1.0, product, 1.0, add, out)
+
+
+class Shifted(Operator):
+    """A - I: turns any square S into the R of S = I + R."""
+
+    def __init__(self, A: Operator) -> None:
+        if A.shape[0] != A.shape[1]:
+            raise InputError(f"the operator has shape {A.shape}; A - I needs a square one")
+        super().__init__(A.device, A.shape)
+        self.A = A
+        self.error = A.error
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of A."""
+        return self.A.nbytes
+
+    def diagonal(self) -> np.ndarray:
+        """diag(A) - 1, (N,) float64."""
+        return self.A.diagonal() - 1.0
+
+    def to_dense(self) -> np.ndarray:
+        """A - I, (N, N) float64, on the host."""
+        dense = self.A.to_dense()
+        dense[np.diag_indices_from(dense)] -= 1.0
+        return dense
+
+    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        self.A._product(x, out, scale, add, transpose)
+        vectors.axpy(-scale, x, out)
+
+
+class Host(Operator):
+    """Somebody's own `scipy.sparse.linalg.LinearOperator`: each product goes through the host.
+
+    Slow beside the others, but everything that takes an operator takes it.
+    """
+
+    def __init__(self, device: Device, operator: Any) -> None:
+        self.operator = scipy.sparse.linalg.aslinearoperator(operator)
+        super().__init__(device, self.operator.shape)
+
+    def diagonal(self) -> np.ndarray:
+        """Asked of the operator, where it can tell; else one product per pixel would be needed: refused."""
+        if callable(getattr(self.operator, "diagonal", None)):
+            return np.asarray(self.operator.diagonal(), np.float64)
+        raise InputError(
+            f"{type(self.operator).__name__} has no diagonal(); give first_bounce as an array (N,)"
+        )
+
+    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        host = x.get().astype(np.float64)
+        act = self.operator.T if transpose else self.operator
+        product = np.asarray(act @ host)
+        checks.finite(f"the product of {type(self.operator).__name__}", product)
+        if add is None:
+            out.set((scale * product).astype(np.float32))
+        else:
+            out.set((scale * product + add.get()).astype(np.float32))

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Relighting: the picture of the scene under any projector pattern, l_out = T l_in (eq. 3)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ltcl.transport import Transport
+
+
+def relight(T: Transport, pattern: Any) -> np.ndarray:
+    """The picture the camera sees under `pattern`; the same as ``T @ pattern``.
+
+    Parameters
+    ----------
+    T : Transport, (M, N)
+    pattern : (h, w), (h, w, 3), frames of these, or (N,)
+        Linear projector light.
+
+    Returns
+    -------
+    array, float32
+        On the camera's grid; in colour where the transport or the pattern is.
+
+    Raises
+    ------
+    InputError
+        A pattern of another size, NaN or infinite values.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
+    >>> ltcl.relight(T, numpy.array([[1.0, 1.0]])).round(2).tolist()
+    [[0.6, 0.6]]
+    """
+    return T @ pattern

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A unit cube with one to six walls, seen from its open front: the scenes of figures 4 and 5.
+
+The far upright edge of the room is the z axis. From the viewer, the walls come in this order:
+
+    1 left, 2 right, 3 floor, 4 ceiling, 5 near right (faces left), 6 near left (faces right)
+
+so three make a room corner, five an open box, six a closed one. The first two are the dihedral.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.errors import InputError
+from ltcl.scenes.scene import Scene
+from ltcl.scenes.viewer import Viewer
+from ltcl.scenes.walls import Wall, form_factors, spread_albedo
+
+WALLS = (
+    Wall("left", corner=(1, 0, 1), right=(-1, 0, 0), down=(0, 0, -1)),
+    Wall("right", corner=(0, 0, 1), right=(0, 1, 0), down=(0, 0, -1)),
+    Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0)),
+    Wall("ceiling", corner=(0, 0, 1), right=(1, 0, 0), down=(0, 1, 0)),
+    Wall("near right", corner=(0, 1, 1), right=(1, 0, 0), down=(0, 0, -1)),
+    Wall("near left", corner=(1, 1, 1), right=(0, -1, 0), down=(0, 0, -1)),
+)
+"""Faces of the unit cube from inside, in the order in which `box` adds them."""
+
+_ABOVE = Viewer(eye=(2.6, 2.6, 2.1), target=(0, 0, 0.25))
+_LEVEL = Viewer(eye=(2.6, 2.6, 0.5), target=(0, 0, 0.5))
+
+
+def box(n: int, sides: int = 6, albedo: Any = 0.7) -> Scene:
+    """A unit cube with some of its walls, n x n square patches each.
+
+    Parameters
+    ----------
+    n : int
+        Patches along each side of a wall.
+    sides : int
+        Walls present, 1 to 6: left, right, floor, ceiling, near right, near left. One wall alone
+        has no interreflection (A = 0).
+    albedo : array_like in [0, 1)
+        A scalar; (sides,), one per wall; (3,), one colour; (sides, 3), one colour per wall. With
+        three sides, three numbers could mean both and are refused: write (3, 1) or (1, 3).
+
+    Returns
+    -------
+    Scene
+        Grid (n, sides * n), walls side by side in the order above. The floor's left edge meets the
+        left wall and its top edge the right one; the ceiling's are the other way round.
+
+    Raises
+    ------
+    InputError
+        If n or sides or albedo is out of range, or albedo has another shape.
+    MemoryLimitError
+        If form factors and transport would not fit in the memory of the host; nothing is allocated then.
+
+    Notes
+    -----
+    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.form_factors`.
+
+    Examples
+    --------
+    >>> room = box(4, sides=3, albedo=[(0.7, 0.1, 0.1), (0.1, 0.7, 0.1), (0.6, 0.6, 0.6)])
+    >>> room.grid, room.channels, [wall.name for wall in room.walls]
+    ((4, 12), 3, ['left', 'right', 'floor'])
+    """
+    if checks.count("sides", sides) > len(WALLS):
+        raise InputError(f"sides is {sides}; it must be at most {len(WALLS)}")
+    # From above a ceiling would show its back, and walls alone look best at eye level.
+    viewer = _ABOVE if sides == 3 else _LEVEL
+    return cube_faces(f"box with {sides} side(s)", WALLS[:sides], n, albedo, viewer)
+
+
+def cube_faces(name: str, walls: tuple[Wall, ...], n: int, albedo: Any, viewer: Viewer) -> Scene:
+    """Scene of faces of the unit cube, n x n patches each; what `box` and `dihedral` share."""
+    n = checks.count("n", n)
+    pixels = n * n * len(walls)
+    # Form factors, transport, its copy for the device, and room to work.
+    checks.fits_host(f"{name}, {pixels} x {pixels}, with its transport,", 4 * 8 * pixels**2)
+    patches = spread_albedo(albedo, len(walls), n)
+    area = np.full(pixels, 1 / n**2)
+    return Scene(name, (n, len(walls) * n), form_factors(walls, n), patches, area, walls, viewer)

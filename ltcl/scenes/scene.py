@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A Lambertian scene of flat patches: form factors and albedo in, exact light transport out.
+
+    l_out = (I - A)^-1 l_d,    A = diag(albedo) F    (eq. 4),    l_d = diag(albedo) l_in
+
+Projector pixel i lights patch i with unit irradiance, and a white patch (albedo 1) under unit light
+shows 1. So the transport is T = (I - A)^-1 diag(albedo), (N, N), one per colour; `exchange` computes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.errors import InputError
+from ltcl.scenes import exchange
+from ltcl.scenes import viewer as viewing
+from ltcl.scenes.viewer import Viewer
+from ltcl.scenes.walls import Wall, check_albedo
+from ltcl.transport import Transport
+
+_LONGEST = 32766  # pixels along an image that OpenCV can still address
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Patches that light each other; made by `dihedral`, `box`, or from form factors of your own.
+
+    Parameters
+    ----------
+    name : str
+        Shown in messages and plots.
+    grid : (h, w)
+        The patches as a picture, row-major; N = h * w. The walls lie side by side in it.
+    form_factors : ndarray, (N, N), float64
+        Entry [i, j]: share of the light leaving patch i that meets patch j. Stored once for all colours.
+    albedo : ndarray, (channels, N), float64
+        Share of the light a patch gives back, in [0, 1); one channel or three.
+    area : ndarray, (N,), float64
+        Areas of the patches, any unit; area_i F_ij = area_j F_ji.
+    walls : tuple of Wall
+        Where the parts of the picture stand in space, left to right.
+    viewer : Viewer
+        Who looks in `view` and `sample`.
+
+    Raises
+    ------
+    InputError
+        If shapes disagree, a value is NaN, infinite or negative, an albedo is not below 1, rows of the
+        form factors sum to more than 1, they break reciprocity, or the viewer sees no wall.
+
+    Examples
+    --------
+    >>> from ltcl.scenes import box
+    >>> scene = box(4, sides=5, albedo=0.6)
+    >>> scene.grid, scene.channels
+    ((4, 20), 1)
+    """
+
+    name: str
+    grid: tuple[int, int]
+    form_factors: np.ndarray = field(repr=False)
+    albedo: np.ndarray = field(repr=False)
+    area: np.ndarray = field(repr=False)
+    walls: tuple[Wall, ...]
+    viewer: Viewer
+
+    def __post_init__(self) -> None:
+        h, w = checks.grid("grid", self.grid)
+        object.__setattr__(self, "grid", (h, w))
+        if not self.walls or w % len(self.walls):
+            raise InputError(f"walls are {len(self.walls)}; they must divide the {w} columns of the grid")
+        for name, shapes in {
+            "form_factors": [(h * w, h * w)],
+            "albedo": [(1, h * w), (3, h * w)],
+            "area": [(h * w,)],
+        }.items():
+            value = checks.real(name, getattr(self, name)).astype(np.float64, copy=False)
+            checks.finite(name, checks.shape(name, value, *shapes))
+            # A view, so that the caller's own array stays writeable.
+            value = value.view()
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        check_albedo(self.albedo)
+        exchange.check(self.form_factors, self.area)
+        viewing.frame(self.viewer, self.walls)
+
+    @property
+    def channels(self) -> int:
+        """1 for a scene without colour, 3 for red, green and blue."""
+        return len(self.albedo)
+
+    @property
+    def first_bounce(self) -> np.ndarray:
+        """Direct light of a unit pattern, F = albedo: (N,), or (3, N) in colour."""
+        return self.albedo[0] if self.channels == 1 else self.albedo
+
+    @property
+    def A(self) -> np.ndarray | tuple[np.ndarray, ...]:
+        """One physical bounce, diag(albedo) @ form_factors (eq. 4): (N, N), or a tuple of three."""
+        self._fits(self.channels)
+        bounces = tuple(albedo[:, None] * self.form_factors for albedo in self.albedo)
+        return bounces[0] if self.channels == 1 else bounces
+
+    def matrices(self) -> tuple[np.ndarray, ...]:
+        """Light transport T = (I - A)^-1 diag(albedo), exact in float64, one (N, N) array per channel.
+
+        Returns
+        -------
+        tuple of ndarray, (N, N), float64
+            One for each channel; T_ij is what patch i shows when unit light falls on patch j.
+
+        Raises
+        ------
+        MemoryLimitError
+            If the matrices do not fit in the memory of the host; nothing is allocated then.
+        InputError
+            If the scene makes light: form factors a little above 1 and albedos hardly below.
+
+        Notes
+        -----
+        Eq. 4 of the paper, solved by Cholesky, see `ltcl.scenes.exchange`.
+
+        Examples
+        --------
+        >>> from ltcl.scenes import dihedral
+        >>> (T,) = dihedral(2, albedo=0.5).matrices()
+        >>> T.shape, bool((T.diagonal() >= 0.5).all())
+        ((8, 8), True)
+        """
+        self._fits(self.channels)
+        return tuple(exchange.transport(self.form_factors, albedo, self.area) for albedo in self.albedo)
+
+    def transport(self, first_bounce: Any = "diagonal", device: Any = None) -> Transport:
+        """The scene's `ltcl.Transport`, ready to compensate, separate and relight.
+
+        Parameters
+        ----------
+        first_bounce : "diagonal", "exact" or ndarray, (N,) or (3, N)
+            What `Transport` takes as F; `scene.first_bounce` is the truth.
+        device : optional
+            The device that `Transport` computes on; the best one if omitted.
+
+        Raises
+        ------
+        MemoryLimitError
+            If the matrices do not fit in the memory of the host.
+
+        Examples
+        --------
+        >>> from ltcl.scenes import dihedral
+        >>> dihedral(4).transport().grid
+        (4, 8)
+        """
+        matrices = self.matrices()
+        matrix = matrices[0] if self.channels == 1 else matrices
+        return Transport(matrix, grid=self.grid, first_bounce=first_bounce, device=device)
+
+    def picture(self, patches: Any) -> np.ndarray:
+        """Values per patch, (N,) or (3, N), as a picture on the grid, (h, w) or (h, w, 3).
+
+        Raises
+        ------
+        InputError
+            If the shape is neither.
+
+        Examples
+        --------
+        >>> from ltcl.scenes import dihedral
+        >>> scene = dihedral(2, albedo=(0.9, 0.5, 0.2))
+        >>> scene.picture(scene.first_bounce)[0, 0]
+        array([0.9, 0.5, 0.2])
+        """
+        values, pixels = np.asarray(patches), len(self.area)
+        checks.shape("patches", values, (pixels,), (3, pixels))
+        return np.moveaxis(values.reshape(*values.shape[:-1], *self.grid), 0, -1 if values.ndim == 2 else 0)
+
+    def view(self, picture: Any, size: int = 480, supersample: int = 3) -> np.ndarray:
+        """What a viewer who looks into the room sees of a picture on its walls.
+
+        Parameters
+        ----------
+        picture : array_like, (h, w) or (h, w, 3)
+            Linear values on the patch grid, any real type, negative ones too.
+        size : int
+            Pixels along the longer side of the image, up to 32766.
+        supersample : int
+            Points averaged along each side of a pixel.
+
+        Returns
+        -------
+        ndarray, (H, W) or (H, W, 3), float32
+            The image; 0 beside the walls. Walls that show the viewer their back are left out.
+
+        Raises
+        ------
+        InputError
+            If the picture is not on the grid or not finite, or size or supersample is not a whole
+            number of at least 1.
+
+        Examples
+        --------
+        >>> from ltcl.scenes import box
+        >>> room = box(8, sides=3)
+        >>> image = room.view(np.ones(room.grid), size=64)
+        >>> max(image.shape), float(image.max())
+        (64, 1.0)
+        """
+        picture = checks.finite("picture", checks.real("picture", picture))
+        checks.shape("picture", picture, self.grid, (*self.grid, 3))
+        size, supersample = checks.count("size", size), checks.count("supersample", supersample)
+        _addressable("size", size)
+        return viewing.draw(self.viewer, self.walls, picture, size, supersample)
+
+    def sample(self, image: Any) -> np.ndarray:
+        """The picture on the walls that looks like a flat image from where the viewer stands.
+
+        Each patch takes the mean of the image over its footprint in `view`; the image is centred and
+        just covers the walls, undistorted. The target of a compensation is made like this.
+
+        Parameters
+        ----------
+        image : array_like, (H, W) or (H, W, 3)
+            Linear values, any real type, up to 32766 pixels a side.
+
+        Returns
+        -------
+        ndarray, (h, w) or (h, w, 3), float32
+            On the patch grid; 0 on walls the viewer does not see.
+
+        Raises
+        ------
+        InputError
+            If the image has another shape, or is empty, too large or not finite.
+
+        Examples
+        --------
+        >>> from ltcl.scenes import dihedral, landscape
+        >>> dihedral(8).sample(landscape(60, 80)).shape
+        (8, 16, 3)
+        """
+        image = checks.finite("image", checks.real("image", image))
+        if image.ndim not in (2, 3) or image.size == 0 or image.shape[2:] not in ((), (3,)):
+            raise InputError(f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty")
+        _addressable("image", max(image.shape))
+        return viewing.read(self.viewer, self.walls, image, self.grid)
+
+    def _fits(self, matrices: int) -> None:
+        pixels = len(self.area)
+        what = f"{matrices} matrix(es) of {pixels} x {pixels} for the scene {self.name}"
+        checks.fits_host(what, matrices * 8 * pixels**2)
+
+
+def _addressable(name: str, longest: int) -> None:
+    if longest > _LONGEST:
+        raise InputError(f"{name} has {longest} pixels along a side; it must have at most {_LONGEST}")

@@ -1,0 +1,9 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Solvers of S x = b: one algorithm per file, one stopping rule, one result."""
+
+from __future__ import annotations
+
+from ltcl.solvers.result import Solution, Status
+from ltcl.solvers.solve import METHODS, solve
+
+__all__ = ["METHODS", "Solution", "Status", "solve"]

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a solve returns: the iterate, and what happened."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+
+
+class Status(enum.Enum):
+    """How a solve ended; the value says what to try next."""
+
+    CONVERGED = "the true residual is within the tolerance"
+    MAXITER = "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try method='chebyshev'"
+    DIVERGED = (
+        "the residual grew: the series converges only where the spectral radius of R is below 1; "
+        "try method='chebyshev' or 'direct'"
+    )
+    STAGNATED = (
+        "the residual stopped falling above the tolerance, as float32 products do near 1e-6; "
+        "loosen rtol or try method='direct'"
+    )
+    BREAKDOWN = "the system is singular; check the first bounce and the transport"
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of `ltcl.solve`.
+
+    Attributes
+    ----------
+    x : (N,) or (N, k) float32 (float64 of method "direct")
+        The solution; where `converged` is False, the iterate with the smallest residual.
+    status : Status
+    iterations : int
+    products : int
+        Products with S, all included.
+    residuals : tuple of float
+        ``||b - S x|| / ||b||`` before each iteration and at the end; the largest over right-hand sides.
+    seconds : float
+        Wall time, transfers included.
+    method : str
+        The one that ran; for "auto" the one chosen.
+    reason : str
+        Why "auto" chose it, else empty.
+    """
+
+    x: np.ndarray
+    status: Status
+    iterations: int
+    products: int
+    residuals: tuple[float, ...]
+    seconds: float
+    method: str
+    reason: str = ""
+
+    @property
+    def converged(self) -> bool:
+        """Whether the tolerance was met by a true residual."""
+        return self.status is Status.CONVERGED
+
+    @property
+    def residual(self) -> float:
+        """The relative residual of `x`."""
+        finite = [value for value in self.residuals if np.isfinite(value)]
+        if not finite:
+            return float("inf")
+        return finite[-1] if self.converged else min(finite)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, {self.products} products, "
+            f"relative residual {self.residual:.2g}: {self.status.value}"
+        )

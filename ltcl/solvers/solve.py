@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`solve`: one entrance for every method."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.device import Array
+from ltcl.errors import ConvergenceError, InputError, InputTypeError
+from ltcl.operators import Operator, as_operator
+from ltcl.solvers import auto
+from ltcl.solvers.chebyshev import Chebyshev
+from ltcl.solvers.direct import Direct
+from ltcl.solvers.jacobi import Jacobi
+from ltcl.solvers.neumann import Neumann
+from ltcl.solvers.result import Solution, Status
+from ltcl.solvers.stopping import Monitor, Rule, System
+
+ITERATIVE = {method.name: method for method in (Jacobi, Neumann, Chebyshev)}
+METHODS: tuple[str, ...] = (*ITERATIVE, Direct.name, "auto")
+_MAXITER = 1000
+
+
+def solve(
+    S: Any,
+    b: Any,
+    method: str = "auto",
+    *,
+    rtol: float = 1e-2,
+    atol: float = 0.0,
+    maxiter: int | None = None,
+    x0: Any = None,
+    callback: Callable[[int, float], object] | None = None,
+    throw: bool = True,
+    **options: Any,
+) -> Solution:
+    """Solve S x = b with products by S only.
+
+    Parameters
+    ----------
+    S : (N, N) Operator, array, scipy.sparse matrix or LinearOperator
+        `T.interreflection` undoes bounces (eq. 7); ``I - A`` adds them (eq. 4): the same call.
+    b : (N,) or (N, k)
+        k right-hand sides are solved together, each to its own tolerance.
+    method : str
+        "jacobi", "neumann", "chebyshev", "direct" or "auto".
+    rtol, atol : float
+        Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column.
+    maxiter : int, optional
+        1000 when not given.
+    x0 : like b, optional
+        Start; zero when not given.
+    callback : callable(iteration, relative residual), optional
+    throw : bool
+        Raise where the tolerance is not met; otherwise look at ``.converged``.
+    **options
+        Of the method, for instance ``bounds=(0.5, 4.0)`` of chebyshev. An unknown one is an error.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    InputError, InputTypeError
+        Shapes that do not fit, NaN, a tolerance or option out of range.
+    ConvergenceError
+        Divergence or ``maxiter``, with the best iterate in ``.solution``.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> s = ltcl.solve(numpy.array([[1.0, 0.5], [0.5, 1.0]]), numpy.array([1.0, 0.5]), "jacobi")
+    >>> s.converged, s.x.round(2).tolist()
+    (True, [1.0, 0.0])
+    """
+    start = time.perf_counter()
+    checks.one_of("method", method, METHODS)
+    b_host = checks.finite("b", checks.real("b", b))
+    S = as_operator(S)
+    rule = _rule(S, b_host, rtol, atol, maxiter, callback)
+    guess = _guess(x0, b_host)
+    reason, fallback = "", None
+    if method == "auto":
+        method, reason = auto.choose(S, rtol)
+        if options:
+            raise InputTypeError(f"unknown option {next(iter(options))!r}; options belong to a named method, not to 'auto'")
+        fallback = Direct() if method != Direct.name and S.shape[0] <= auto.LARGEST_DIRECT else None
+    chosen = _method(method, options)
+    solution = _run(chosen, S, b_host, guess, rule)
+    if fallback is not None and not solution.converged:
+        reason += f"; {solution.method} ended {solution.status.name.lower()}, so a dense factorization took over"
+        solution = _run(fallback, S, b_host, guess, rule)
+    solution = dataclasses.replace(solution, seconds=time.perf_counter() - start, reason=reason)
+    if throw and not solution.converged:
+        raise ConvergenceError(str(solution), solution)
+    return solution
+
+
+def _rule(S: Operator, b: np.ndarray, rtol: float, atol: float, maxiter: int | None, callback: Any) -> Rule:
+    rows, columns = S.shape
+    if rows != columns:
+        raise InputError(f"S has shape {S.shape}; it must be square")
+    if b.ndim not in (1, 2) or b.shape[0] != rows or b.size == 0:
+        raise InputError(f"b has shape {b.shape}; it must be ({rows},) or ({rows}, k)")
+    rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
+    atol = checks.number("atol", atol, least=0.0)
+    if rtol == 0.0 and atol == 0.0:
+        raise InputError("rtol and atol are both 0; one of them must be positive")
+    return Rule(rtol, atol, _MAXITER if maxiter is None else checks.count("maxiter", maxiter), callback)
+
+
+def _guess(x0: Any, b: np.ndarray) -> np.ndarray | None:
+    if x0 is None:
+        return None
+    return checks.shape("x0", checks.finite("x0", checks.real("x0", x0)), b.shape)
+
+
+def _method(name: str, options: dict[str, Any]) -> Any:
+    """The method with its options; an unknown option is named, with those there are."""
+    kind = Direct if name == Direct.name else ITERATIVE[name]
+    known = [field.name for field in dataclasses.fields(kind)]
+    for option in options:
+        if option not in known:
+            has = f"has {', '.join(known)}" if known else "has none"
+            raise InputTypeError(f"unknown option {option!r}; method {name!r} {has}")
+    return kind(**options)
+
+
+def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
+    if isinstance(method, Direct):
+        return _run_direct(method, S, b, rule)
+    system = System(S, S.device.upload(b))
+    monitor = Monitor(system, rule)
+    x, r = _start(system, guess)
+    method.iterate(system, x, r, monitor)
+    best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
+    assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
+    return Solution(
+        best.get(), monitor.status, monitor.iterations, system.products, tuple(monitor.residuals), 0.0, method.name
+    )
+
+
+def _start(system: System, guess: np.ndarray | None) -> tuple[Array, Array]:
+    """The first iterate and its residual; that of zero is b and costs no product."""
+    device, b = system.S.device, system.b
+    if guess is None:
+        return device.upload(np.zeros(b.shape, np.float32)), b.copy()
+    x = device.upload(guess)
+    return x, system.residual(x, b.like())
+
+
+def _run_direct(method: Direct, S: Operator, b: np.ndarray, rule: Rule) -> Solution:
+    try:
+        x, residual = method.solve(S, b.astype(np.float64))
+    except np.linalg.LinAlgError:
+        return Solution(np.zeros(b.shape), Status.BREAKDOWN, 0, 0, (1.0,), 0.0, method.name)
+    norms = np.linalg.norm(b, axis=0)
+    left = np.linalg.norm(residual, axis=0)
+    relative = float(np.max(left / np.where(norms > 0, norms, 1.0)))
+    met = np.all(left <= np.maximum(rule.rtol * norms, rule.atol))
+    return Solution(
+        x, Status.CONVERGED if met else Status.STAGNATED, 1, 0, (1.0, relative), 0.0, method.name
+    )

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One stopping rule for every method, and the system it is asked about.
+
+A right-hand side b is solved when ``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2 solved for l_d), for each
+column of b. Convergence is claimed only of a residual that was computed from x itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ltcl.device import Array, vectors
+from ltcl.operators import Operator
+from ltcl.solvers.result import Status
+
+_GROWTH = 100.0  # times the best residual: past all transient growth of a nearly self-adjoint system
+_RISES = 20  # residuals in a row, each above the one before
+_PATIENCE = 25  # steps without a new best residual
+
+
+class System:
+    """S x = b on the device, counting products."""
+
+    def __init__(self, S: Operator, b: Array) -> None:
+        self.S = S
+        self.b = b
+        self.products = 0
+
+    def apply(self, x: Array, out: Array, *, scale: float = 1.0, add: Array | None = None) -> Array:
+        """out = scale * (S x) + add; see `Operator.apply`."""
+        self.products += 1
+        return self.S.apply(x, out, scale=scale, add=add)
+
+    def residual(self, x: Array, r: Array) -> Array:
+        """r = b - S x."""
+        return self.apply(x, r, scale=-1.0, add=self.b)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """The tolerance of a solve."""
+
+    rtol: float
+    atol: float
+    maxiter: int
+    callback: Callable[[int, float], object] | None = None
+
+
+@dataclass
+class Monitor:
+    """Watches a solve: decides when it ends, keeps the history and the best iterate.
+
+    A method calls `done(x, r)` once an iteration, with the residual `r` of `x`. A method that keeps its
+    residual by recursion passes ``recursive=True``, and it is recomputed before convergence is claimed.
+    """
+
+    system: System
+    rule: Rule
+    status: Status | None = None
+    residuals: list[float] = field(default_factory=list)
+    best: Array | None = None
+
+    def __post_init__(self) -> None:
+        norms = vectors.norm(self.system.b)
+        self._scale = np.where(norms > 0, norms, 1.0)
+        self._target = np.maximum(self.rule.rtol * norms, self.rule.atol)
+        self._lowest = np.inf
+        self._since_lowest = 0
+        self._rises = 0
+
+    @property
+    def iterations(self) -> int:
+        """Iterations done: the first residual is that of the start."""
+        return max(0, len(self.residuals) - 1)
+
+    def done(self, x: Array, r: Array, *, recursive: bool = False) -> bool:
+        """Whether the solve ends with the iterate `x`; sets `status` when it does."""
+        norms = vectors.norm(r)
+        if recursive and np.all(norms <= self._target):
+            norms = vectors.norm(self.system.residual(x, r.like()))
+        self._record(x, float(np.max(norms / self._scale, initial=0.0)))
+        if np.all(norms <= self._target):
+            self.status = Status.CONVERGED
+        else:
+            self.status = self._trouble()
+        return self.status is not None
+
+    def _record(self, x: Array, residual: float) -> None:
+        previous = self.residuals[-1] if self.residuals else np.inf
+        self.residuals.append(residual)
+        if self.rule.callback is not None:
+            self.rule.callback(self.iterations, residual)
+        self._rises = self._rises + 1 if residual > previous else 0
+        if residual < self._lowest:
+            self._lowest, self._since_lowest = residual, 0
+            self.best = (x.like() if self.best is None else self.best).copy_from(x)
+        else:
+            self._since_lowest += 1
+
+    def _trouble(self) -> Status | None:
+        residual = self.residuals[-1]
+        if not np.isfinite(residual) or residual > _GROWTH * self._lowest or self._rises >= _RISES:
+            return Status.DIVERGED
+        if self._since_lowest >= _PATIENCE:
+            return Status.STAGNATED
+        return Status.MAXITER if self.iterations >= self.rule.maxiter else None

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Transports on disk: load one from, and save one to, .npz, .npy and .mtx files.
+
+Everything that a file declares is checked before memory is taken for it; pickles are never loaded.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from ltcl import checks
+from ltcl.errors import FileError, InputTypeError
+from ltcl.files import as_path
+from ltcl.store import arrays, formats
+from ltcl.store.record import Matrix, Record
+from ltcl.transport import Transport
+
+__all__ = ["Record", "load", "save"]
+
+
+def load(
+    path: str | os.PathLike[str],
+    *,
+    grid: tuple[int, int] | None = None,
+    camera_grid: tuple[int, int] | None = None,
+    first_bounce: str | np.ndarray | None = None,
+    on_dark: str = "raise",
+    device: Any = None,
+) -> Transport:
+    """Load a transport, `picture = T @ pattern`.
+
+    Parameters
+    ----------
+    path
+        A .npz file (SciPy's sparse layouts, or arrays: `T` (M, N) or (3, M, N), and perhaps `grid`,
+        `camera_grid`, `first_bounce`), a .npy or a .mtx file.
+    grid, camera_grid
+        (h, w) of projector and camera; needed where the file does not tell, and preferred to what it tells.
+    first_bounce
+        As in `Transport`; None takes the file's, or else "diagonal".
+    on_dark, device
+        As in `Transport`.
+
+    Returns
+    -------
+    Transport
+        float32 values stay float32; 8- and 16-bit values become float32, all others float64.
+
+    Raises
+    ------
+    FileError
+        The file is missing, empty, damaged, truncated, lies about a size, is of an unknown format, holds no
+        transport or one that `Transport` refuses, or does not tell its grid.
+    MemoryLimitError
+        It does not fit the memory of the host or of the device.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib, numpy as np
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "T.npy"
+    >>> np.save(path, np.eye(6, dtype=np.float32))
+    >>> load(path, grid=(2, 3)).shape
+    (6, 6)
+    """
+    path = as_path(path)
+    record = formats.read(path)
+    with formats.about(path):
+        rows, columns = record.shape
+        grid = checks.grid("grid", grid or record.grid or _unknown("grid", columns, "projector"), columns)
+        camera_grid = camera_grid or record.camera_grid
+        if camera_grid is not None or rows != columns:
+            wanted = camera_grid or _unknown("camera_grid", rows, "camera")
+            camera_grid = checks.grid("camera_grid", wanted, rows)
+        if first_bounce is None:
+            first_bounce = "diagonal" if record.first_bounce is None else record.first_bounce
+        return Transport(
+            record.matrices if len(record.matrices) == 3 else record.matrices[0],
+            grid=grid,
+            camera_grid=camera_grid,
+            first_bounce=first_bounce,
+            on_dark=on_dark,
+            device=device,
+        )
+
+
+def save(path: str | os.PathLike[str], T: Transport) -> None:
+    """Save a transport; an earlier file at `path` is replaced whole or not at all.
+
+    Parameters
+    ----------
+    path
+        .npz keeps everything; .npy (dense only) the matrix; .mtx (one channel only) matrix and grids.
+    T
+        A transport made of matrices.
+
+    Raises
+    ------
+    FileError
+        An unknown extension, a format that cannot hold this transport, or the file cannot be written.
+    InputTypeError
+        T is no Transport, or made of operators whose entries are not at hand.
+
+    Notes
+    -----
+    Pixels dropped by ``on_dark="mask"`` are saved with a first bounce of 0 and masked in the same way on loading.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib, numpy as np
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "T.npz"
+    >>> save(path, Transport(np.eye(6), grid=(2, 3)))
+    >>> load(path).grid
+    (2, 3)
+    """
+    if not isinstance(T, Transport):
+        raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport")
+    matrices = tuple(_entries(matrix) for matrix in T.matrices)
+    bounce = T.first_bounce if T.is_square else None
+    formats.write(as_path(path), Record(matrices, T.grid, T.camera_grid, bounce))
+
+
+def _entries(matrix: Any) -> Matrix:
+    if isinstance(matrix, scipy.sparse.csr_array):
+        parts = (arrays.as_floats("T", matrix.data), matrix.indices, matrix.indptr)
+        return scipy.sparse.csr_array(parts, shape=matrix.shape)
+    if isinstance(matrix, np.ndarray):
+        return arrays.as_floats("T", matrix)
+    raise InputTypeError(
+        f"T is made of {type(matrix).__name__}; only arrays and sparse matrices can be saved"
+    )
+
+
+def _unknown(name: str, pixels: int, whose: str) -> tuple[int, int]:
+    side = round(pixels**0.5)
+    example = f", perhaps {name}=({side}, {side})" if side * side == pixels else ""
+    raise FileError(f"does not tell how the {pixels} {whose} pixels lie; give {name}=(h, w){example}")

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Formats of transport files by extension: modules with `read(path) -> Record` and `write(path, record)`.
+
+The modules say what is wrong, and here the file's name is put in front: one line about one file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from ltcl.errors import FileError, InputError, InputTypeError, MemoryLimitError
+from ltcl.files import as_path, input_file, replace_file
+from ltcl.store import mtx, npy, npz
+from ltcl.store.record import Record
+
+logger = logging.getLogger(__name__)
+
+FORMATS: dict[str, ModuleType] = {".npz": npz, ".npy": npy, ".mtx": mtx}
+
+
+def read(path: str | Path) -> Record:
+    """Read a transport file.
+
+    Raises
+    ------
+    FileError
+        Missing, empty, of an unknown extension, damaged, truncated, lying about a size, or not a transport.
+    MemoryLimitError
+        What it honestly declares does not fit the host.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "T.npz"
+    >>> write(path, Record((np.eye(6),), grid=(2, 3)))
+    >>> read(path).grid
+    (2, 3)
+    """
+    path = as_path(path)
+    module = find(path)
+    input_file(path)
+    with about(path):
+        return module.read(path)
+
+
+def write(path: str | Path, record: Record) -> None:
+    """Write a transport file whole or not at all.
+
+    Raises
+    ------
+    FileError
+        The extension is unknown, or the file cannot be written.
+    InputError
+        The format cannot hold this transport.
+    """
+    path = as_path(path)
+    module = find(path)
+    if not module.KEEPS_FIRST_BOUNCE and not _is_diagonal(record):
+        logger.warning("%s: %s does not keep the first bounce; .npz does", path, path.suffix)
+    with replace_file(path) as temporary, about(path):
+        module.write(temporary, record)
+
+
+def find(path: Path) -> ModuleType:
+    """Module of the format that the extension of `path` names."""
+    try:
+        return FORMATS[path.suffix.lower()]
+    except KeyError:
+        known = ", ".join(FORMATS)
+        raise FileError(
+            f"{path}: extension {path.suffix or 'missing'} is unknown; transports are {known}"
+        ) from None
+
+
+@contextlib.contextmanager
+def about(path: Path) -> Iterator[None]:
+    """Put the name of `path` in front of whatever is refused inside the block."""
+    try:
+        yield
+    except (InputError, InputTypeError) as error:
+        raise FileError(f"{path}: {error}") from error.__cause__
+    except MemoryError as error:
+        raise MemoryLimitError(f"{path}: {error or 'the host has no memory left'}") from None
+    except OSError as error:
+        raise FileError(f"{path}: {error.strerror or error}") from error
+
+
+def _is_diagonal(record: Record) -> bool:
+    """Whether a first bounce taken from the diagonal of T, the default on loading, would be the same."""
+    if record.first_bounce is None or record.shape[0] != record.shape[1]:
+        return True
+    diagonals = np.stack([T.diagonal() for T in record.matrices])
+    return np.allclose(record.first_bounce, diagonals, rtol=1e-6, atol=0)

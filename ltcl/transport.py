@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`Transport`: a measured light transport T, split as T = S F into first bounce and interreflection (eq. 3).
+
+F is diagonal: projector pixel j lights the point that camera pixel j sees. Dividing its columns by F gives
+S = T F^-1 = I + R, one operator per colour channel, on the device from its first use on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+
+from ltcl import checks, layout
+from ltcl.device import Array, Device, open_device
+from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import (
+    CSR,
+    Dense,
+    Host,
+    IdentityPlus,
+    Operator,
+    Pattern,
+    ScaledColumns,
+    Shifted,
+    as_operator,
+)
+
+
+class Transport:
+    """Light transport T of a scene: picture = T pattern.
+
+    Parameters
+    ----------
+    matrix : (M, N) array, scipy.sparse matrix, LinearOperator, or a sequence of 3 of them for RGB
+        T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j; pixels
+        are row-major.
+    grid : (h, w)
+        Of the projector; N = h * w.
+    first_bounce : "diagonal", "exact" or array (N,) or (3, N)
+        How F is found: diag(T), which also holds light that came back; 1 / diag(T^-1), which does not, for
+        Lambertian scenes without self-illumination, at the cost of a dense inverse; or F itself.
+    camera_grid : (h, w), optional
+        Of the camera where T is rectangular, M = h * w; S then does not exist and T only relights.
+    device : Device or str, optional
+        As `open_device` takes it; opened at the first product only.
+    on_dark : "raise" or "mask"
+        What to do where F is zero or negative: refuse, or never light these projector pixels.
+
+    Attributes
+    ----------
+    matrices : tuple of 1 or 3
+        T on the host, as given and checked.
+    masked : (N,) bool
+        Projector pixels dropped by ``on_dark="mask"``, in any channel.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, NaN or infinite values, malformed sparse structure, a first bounce that is not
+        positive.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
+    >>> (T @ numpy.array([[1.0, 0.0]])).round(3).tolist()
+    [[0.5, 0.1]]
+    """
+
+    def __init__(
+        self,
+        matrix: Any,
+        grid: tuple[int, int],
+        first_bounce: Any = "diagonal",
+        camera_grid: tuple[int, int] | None = None,
+        device: Device | str | None = None,
+        *,
+        on_dark: str = "raise",
+    ) -> None:
+        self.matrices = _channels(matrix)
+        self.shape: tuple[int, int] = self.matrices[0].shape
+        self.grid = checks.grid("grid", grid, self.shape[1])
+        self.camera_grid = _camera_grid(camera_grid, self.shape, self.grid)
+        self._wanted_device = device
+        self._device: Device | None = None
+        self._systems: tuple[IdentityPlus, ...] | None = None
+        self._forward: tuple[Operator, ...] | None = None
+        self.masked = np.zeros(self.shape[1], bool)
+        self._first_bounce: np.ndarray | None = None
+        if self.is_square:
+            checks.one_of("on_dark", on_dark, ("raise", "mask"))
+            F = _first_bounce(self.matrices, first_bounce)
+            dark = F <= 0.0
+            if dark.any():
+                _refuse_dark(dark, self.grid, on_dark, self.matrices)
+                self.masked = dark.any(axis=0)
+                F = np.where(self.masked, 0.0, F)
+            self._first_bounce = F
+
+    def __repr__(self) -> str:
+        kind = {1: "grey", 3: "colour"}[self.channels]
+        return f"<ltcl Transport {self.shape[0]} x {self.shape[1]}, {kind}, grid {self.grid[0]} x {self.grid[1]}>"
+
+    @property
+    def channels(self) -> int:
+        """1 for grey, 3 for colour."""
+        return len(self.matrices)
+
+    @property
+    def is_square(self) -> bool:
+        """Whether camera and projector have the same pixels, so that S exists."""
+        return self.shape[0] == self.shape[1]
+
+    @property
+    def first_bounce(self) -> np.ndarray:
+        """Diagonal of F: (N,) float64, or (3, N) in colour; 0 at masked pixels."""
+        F = self._require_first_bounce()
+        return F[0] if self.channels == 1 else F
+
+    @property
+    def device(self) -> Device:
+        """The device of the operators; opened here if it was not yet."""
+        if self._device is None:
+            self._device = open_device(self._wanted_device)
+        return self._device
+
+    @property
+    def systems(self) -> tuple[IdentityPlus, ...]:
+        """S = I + R of each channel, always as a tuple; uploaded at the first call."""
+        if self._systems is None:
+            self._systems = _systems(self.matrices, self._require_first_bounce(), self.device)
+        return self._systems
+
+    @property
+    def interreflection(self) -> IdentityPlus | tuple[IdentityPlus, ...]:
+        """S = I + R: the operator itself, or three of them in colour."""
+        return self.systems[0] if self.channels == 1 else self.systems
+
+    @property
+    def operators(self) -> tuple[Operator, ...]:
+        """T of each channel on the device; S F where S exists, so that nothing is stored twice."""
+        if self._forward is None:
+            if self.is_square:
+                F = self._require_first_bounce()
+                self._forward = tuple(ScaledColumns(S, f) for S, f in zip(self.systems, F, strict=True))
+            else:
+                self._forward = tuple(as_operator(matrix, self.device) for matrix in self.matrices)
+        return self._forward
+
+    def __matmul__(self, pattern: Any) -> np.ndarray:
+        """Relight: the picture (float32) under `pattern`, frames and colours as in `ltcl.relight`."""
+        columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
+        pictures = [_product(T, x) for T, x in zip(self.operators, columns, strict=True)]
+        return shape.pack(pictures, self.camera_grid)
+
+    def to_light(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 at masked pixels."""
+        return [
+            np.divide(l_d, F[:, None], out=np.zeros(l_d.shape), where=F[:, None] > 0)
+            for l_d, F in zip(columns, self._require_first_bounce(), strict=True)
+        ]
+
+    def _require_first_bounce(self) -> np.ndarray:
+        if self._first_bounce is None:
+            raise InputError(
+                f"T is {self.shape[0]} x {self.shape[1]}; S = T F^-1 exists only for a square T, with the camera on "
+                "the projector's grid; this one can only relight"
+            )
+        return self._first_bounce
+
+
+def _product(T: Operator, x: np.ndarray) -> np.ndarray:
+    """T x on the host for x (N, k)."""
+    pattern: Array = T.device.upload(x)
+    return T.apply(pattern).get()
+
+
+def _channels(matrix: Any) -> tuple[Any, ...]:
+    """The checked matrices of 1 or 3 channels."""
+    if isinstance(matrix, (list, tuple)) and any(_is_matrix(part) for part in matrix):
+        parts = list(matrix)
+    elif isinstance(matrix, np.ndarray) and matrix.ndim == 3:
+        parts = list(matrix)
+    else:
+        parts = [matrix]
+    if len(parts) not in (1, 3):
+        raise InputError(f"matrix has {len(parts)} channels; it must be one matrix, or three for RGB")
+    names = ["matrix"] if len(parts) == 1 else [f"matrix[{channel}]" for channel in range(3)]
+    checked = tuple(_checked(name, part) for name, part in zip(names, parts, strict=True))
+    shapes = [part.shape for part in checked]
+    if len(set(shapes)) > 1:
+        raise InputError(f"matrix has channels of shapes {shapes}; all must be the same")
+    return checked
+
+
+def _is_matrix(part: Any) -> bool:
+    return scipy.sparse.issparse(part) or hasattr(part, "matvec") or getattr(part, "ndim", 0) == 2
+
+
+def _checked(name: str, part: Any) -> Any:
+    if scipy.sparse.issparse(part):
+        result = checks.csr(name, part)
+    elif hasattr(part, "matvec"):
+        result = scipy.sparse.linalg.aslinearoperator(part)
+    else:
+        result = checks.finite(name, checks.real(name, part))
+        if result.ndim != 2:
+            raise InputError(f"{name} has shape {result.shape}; it must be (M, N)")
+    if 0 in result.shape:
+        raise InputError(f"{name} has shape {result.shape}; it must have at least one row and one column")
+    return result
+
+
+def _camera_grid(camera_grid: Any, shape: tuple[int, int], grid: tuple[int, int]) -> tuple[int, int]:
+    if camera_grid is not None:
+        return checks.grid("camera_grid", camera_grid, shape[0])
+    if shape[0] != shape[1]:
+        raise InputError(f"matrix has shape {shape}; a rectangular T needs camera_grid=(h, w) with h * w = {shape[0]}")
+    return grid
+
+
+def _first_bounce(matrices: Sequence[Any], wanted: Any) -> np.ndarray:
+    """F of each channel, (channels, N) float64, not yet checked for sign."""
+    n = matrices[0].shape[0]
+    if isinstance(wanted, str):
+        checks.one_of("first_bounce", wanted, ("diagonal", "exact"))
+        find = _diagonal if wanted == "diagonal" else _exact
+        return np.stack([find(matrix) for matrix in matrices])
+    F = checks.finite("first_bounce", checks.real("first_bounce", wanted)).astype(np.float64)
+    checks.shape("first_bounce", F, *([(n,), (1, n)] if len(matrices) == 1 else [(n,), (3, n)]))
+    return np.broadcast_to(F, (len(matrices), n))
+
+
+def _diagonal(matrix: Any) -> np.ndarray:
+    if callable(getattr(matrix, "diagonal", None)):
+        return np.asarray(matrix.diagonal(), np.float64)
+    raise InputError(
+        f"first_bounce is 'diagonal', but a {type(matrix).__name__} does not tell its diagonal; "
+        "give first_bounce as an array (N,)"
+    )
+
+
+def _exact(matrix: Any) -> np.ndarray:
+    """F_ii = 1 / (T^-1)_ii: of T^-1 = F^-1 (I - A) the diagonal is 1 / F where A has none."""
+    if not isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)):
+        raise InputTypeError(
+            f"first_bounce='exact' inverts the matrix densely, which a {type(matrix).__name__} does not allow; "
+            "give first_bounce as an array (N,)"
+        )
+    n = matrix.shape[0]
+    checks.fits_host(f"first_bounce='exact' inverts T densely, which for N = {n}", 3 * 8 * n * n)
+    dense = matrix.astype(np.float64) if isinstance(matrix, np.ndarray) else matrix.toarray().astype(np.float64)
+    try:
+        inverse = scipy.linalg.inv(dense, overwrite_a=True, check_finite=False)
+    except np.linalg.LinAlgError as error:
+        raise InputError("first_bounce='exact' needs an invertible T, but this one is singular") from error
+    with np.errstate(divide="ignore"):
+        F = 1.0 / np.diagonal(inverse)
+    return np.where(np.isfinite(F), F, 0.0)
+
+
+def _refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, matrices: Sequence[Any]) -> None:
+    """Refuse pixels without a positive first bounce, unless they may be masked."""
+    pixels = np.flatnonzero(dark.any(axis=0))
+    if on_dark == "mask" and len(pixels) == dark.shape[1]:
+        raise InputError("first_bounce is zero or negative at every pixel; there is nothing left to light")
+    if on_dark == "mask" and all(isinstance(m, (np.ndarray, scipy.sparse.csr_array)) for m in matrices):
+        return
+    listed = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
+    more = f" and {len(pixels) - 8} more" if len(pixels) > 8 else ""
+    advice = (
+        "mask the LinearOperator itself" if on_dark == "mask" else "give on_dark='mask' to leave these pixels unlit"
+    )
+    raise InputError(
+        f"first_bounce is zero or negative at {len(pixels)} of {dark.shape[1]} pixels (row, column): "
+        f"{listed}{more}; it must be positive; {advice}"
+    )
+
+
+def _systems(matrices: Sequence[Any], F: np.ndarray, device: Device) -> tuple[IdentityPlus, ...]:
+    """S = I + R of every channel on the device; sparse channels share one pattern where they can."""
+    systems, pattern = [], None
+    for matrix, f in zip(matrices, F, strict=True):
+        R = _interreflection(matrix, f, device, pattern)
+        pattern = R.pattern if isinstance(R, CSR) else None
+        systems.append(IdentityPlus(R))
+    return tuple(systems)
+
+
+def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Pattern | None) -> Operator:
+    """R = T F^-1 - I, computed in float64 and rounded once."""
+    lit = F > 0
+    inverse = np.divide(1.0, F, out=np.zeros(len(F)), where=lit)
+    if isinstance(matrix, np.ndarray):
+        return Dense(device, _dense_R(matrix, inverse, lit))
+    if isinstance(matrix, scipy.sparse.csr_array):
+        return CSR(device, _sparse_R(matrix, inverse, lit), pattern)
+    return Shifted(ScaledColumns(Host(device, matrix), inverse))
+
+
+def _dense_R(T: np.ndarray, inverse: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    n = len(inverse)
+    checks.fits_host(f"R of {n} x {n}", 4 * n * n)
+    R = np.empty((n, n), np.float32)
+    rows = max(1, (1 << 24) // (8 * n))  # float64 only a block at a time
+    for start in range(0, n, rows):
+        block = T[start : start + rows] * inverse
+        here = np.arange(len(block))
+        block[here, start + here] -= lit[start : start + rows]
+        R[start : start + rows] = block
+    return R
+
+
+def _sparse_R(T: scipy.sparse.csr_array, inverse: np.ndarray, lit: np.ndarray) -> scipy.sparse.csr_array:
+    """T F^-1 - I that keeps T's pattern, or drops its whole diagonal, so that channels stay alike."""
+    row = np.repeat(np.arange(T.shape[0]), np.diff(T.indptr))
+    on_diagonal = T.indices == row
+    data = T.data * inverse[T.indices]
+    data[on_diagonal] -= lit[row[on_diagonal]]
+    if np.count_nonzero(on_diagonal) < T.shape[0]:  # some F was given where T stores nothing
+        missing = lit.copy()
+        missing[row[on_diagonal]] = False
+        R = scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
+        return scipy.sparse.csr_array(R - scipy.sparse.diags_array(missing.astype(np.float64)))
+    if data[on_diagonal].any():
+        return scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
+    keep = ~on_diagonal
+    indptr = T.indptr - np.arange(T.shape[0] + 1)  # exactly one diagonal entry a row is gone
+    return scipy.sparse.csr_array((data[keep], T.indices[keep], indptr), shape=T.shape)

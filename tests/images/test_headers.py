@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Broken, lying and foreign picture files give one clear line: no crash, no print, no huge allocation."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ltcl import images
+from ltcl.errors import FileError, LtclError
+from ltcl.images.headers import declared_size
+
+SUFFIXES = [".png", ".jpg", ".tif", ".bmp", ".exr"]
+
+
+def good(folder: Path, suffix: str, shape: tuple[int, ...] = (20, 30, 3)) -> bytes:
+    images.write(folder / f"good{suffix}", np.random.default_rng(5).random(shape))
+    return (folder / f"good{suffix}").read_bytes()
+
+
+def refusal(path: Path, data: bytes) -> str:
+    """Message of the FileError that reading `data` gives."""
+    path.write_bytes(data)
+    with pytest.raises(FileError) as error:
+        images.read(path)
+    text = str(error.value)
+    assert text.startswith(str(path))
+    assert "\n" not in text
+    return text
+
+
+def resized(suffix: str, data: bytes, h: int, w: int) -> bytes:
+    """`data` with a header that declares (h, w), all checksums correct."""
+    changed = bytearray(data)
+    if suffix == ".png":
+        changed[16:24] = struct.pack(">II", w, h)
+        changed[29:33] = struct.pack(">I", zlib.crc32(changed[12:29]))
+    elif suffix == ".jpg":
+        place = data.index(b"\xff\xc0")
+        changed[place + 5 : place + 9] = struct.pack(">HH", min(h, 65535), min(w, 65535))
+    elif suffix == ".bmp":
+        changed[18:26] = struct.pack("<ii", w, h)
+    elif suffix == ".tif":
+        for tag, value in ((256, w), (257, h)):
+            for kind in (3, 4):  # stored as SHORT or LONG; becomes LONG
+                place = data.find(struct.pack("<HHI", tag, kind, 1))
+                if place >= 0:
+                    changed[place : place + 12] = struct.pack("<HHII", tag, 4, 1, value)
+    else:
+        for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+            place = data.index(name) + len(name) + 4
+            changed[place : place + 16] = struct.pack("<4i", 0, 0, w - 1, h - 1)
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".bmp"])
+@pytest.mark.parametrize("shape", [(20, 30, 3), (7, 300)])
+def test_the_declared_size_is_found(tmp_path, suffix, shape):
+    assert declared_size(good(tmp_path, suffix, shape)) == shape[:2]
+
+
+def test_the_declared_size_of_big_endian_and_big_tiff():
+    entries = struct.pack(">HHIHH", 256, 3, 1, 640, 0) + struct.pack(">HHII", 257, 4, 1, 480)
+    assert declared_size(b"MM\0*" + struct.pack(">IH", 8, 2) + entries) == (480, 640)
+    entries = struct.pack("<HHQQ", 256, 4, 1, 640) + struct.pack("<HHQQ", 257, 16, 1, 480)
+    assert declared_size(b"II+\0\x08\0\0\0" + struct.pack("<QQ", 16, 2) + entries) == (480, 640)
+
+
+@pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (60000, 60000), (30000, 30000), (0, 5)])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_absurd_sizes_are_refused_before_decoding(tmp_path, capfd, suffix, size):
+    if suffix == ".exr" and size == (0, 5):
+        pytest.skip("a window cannot be empty in this layout")
+    data = resized(suffix, good(tmp_path, suffix), *size)
+    refusal(tmp_path / f"bad{suffix}", data)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("part", [0.02, 0.3, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_truncated_files_are_refused_quietly(tmp_path, capfd, suffix, part):
+    data = good(tmp_path, suffix)
+    refusal(tmp_path / f"bad{suffix}", data[: int(len(data) * part)])
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_no_picture_is_refused(tmp_path, capfd, suffix):
+    path = tmp_path / f"bad{suffix}"
+    refusal(path, b"this is a letter, not a picture; " * 30)
+    refusal(path, b"\x89PNG\r\n\x1a\n")
+    refusal(path, b"\x76\x2f\x31\x01\x02\0\0\0")
+    assert "empty" in refusal(path, b"")
+    path.unlink()
+    with pytest.raises(FileError, match="no such file"):
+        images.read(path)
+    path.mkdir()
+    with pytest.raises(FileError, match="folder"):
+        images.read(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_unknown_extensions_list_the_known_ones(tmp_path):
+    with pytest.raises(FileError, match=r"\.webp is unknown; pictures are .*\.png.*\.exr"):
+        images.read(tmp_path / "a.webp")
+
+
+def test_other_pixel_types_are_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.tif"), np.zeros((2, 2), np.int16))
+    with pytest.raises(FileError, match="int16"):
+        images.read(tmp_path / "a.tif")
+
+
+def test_damaged_png_names_the_place(tmp_path):
+    data = bytearray(good(tmp_path, ".png"))
+    data[len(data) // 2] ^= 1
+    assert "checksum" in refusal(tmp_path / "bad.png", bytes(data))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(place=st.floats(0, 1, exclude_max=True), byte=st.integers(0, 255), keep=st.sampled_from([1.0, 0.7]))
+def test_any_damage_gives_a_picture_or_an_error_of_ours(tmp_path, suffix, place, byte, keep):
+    data = bytearray(good(tmp_path, suffix, (6, 5, 3)))
+    data[int(place * len(data))] = byte
+    path = tmp_path / f"bad{suffix}"
+    path.write_bytes(data[: int(keep * len(data))])
+    try:
+        picture = images.read(path)
+    except LtclError as error:
+        message = str(error)
+    else:
+        message = ""
+        assert picture.dtype == np.float32
+        assert np.isfinite(picture).all()
+    assert not message or message.startswith(str(path))
+    assert "\n" not in message
