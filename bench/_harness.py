@@ -2,7 +2,7 @@
 """What every bench shares: options, paired timing, the roofline, and the report.
 
 Ratios count: competitors are timed in turn with us, in one process, so that a machine whose speed drifts
-slows all of them alike. Figures are medians. A target that is missed is printed as plainly as one that is hit.
+slows all of them alike. Figures are medians. A missed target is printed as plainly as one that is hit.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class Row:
         """Hit, miss by how much, or nothing where there is no target."""
         if self.target is None:
             return ""
-        return "hit" if self.ratio >= self.target else f"MISS: {self.ratio / self.target:.0%} of {self.target:g}x"
+        part = self.ratio / self.target
+        return "hit" if part >= 1.0 else f"MISS: {part:.0%} of {self.target:g}x"
 
 
 def options(description: str) -> Options:
@@ -81,7 +82,7 @@ def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> di
 
 
 class Triad:
-    """a b + c over arrays far larger than the caches: what memory gives (STREAM's count, 12 bytes an element)."""
+    """a b + c over arrays far larger than the caches: what memory gives (as STREAM: 12 bytes an element)."""
 
     def __init__(self, device: Device, smoke: bool) -> None:
         self.device = device
@@ -112,10 +113,8 @@ def report(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -
     table = Table("question", "competitor", "theirs", "ours", "unit", "ratio", "target", "verdict")
     for row in rows:
         target = "" if row.target is None else f"{row.target:g}x"
-        table.add_row(
-            row.question, row.competitor, f"{row.theirs:.4g}", f"{row.ours:.4g}", row.unit, f"{row.ratio:.2f}x",
-            target, "" if given.smoke else row.verdict,
-        )  # fmt: skip
+        figures = (f"{row.theirs:.4g}", f"{row.ours:.4g}", row.unit, f"{row.ratio:.2f}x")
+        table.add_row(row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict)
     console.print(table)
     if given.json is not None:
         given.json.parent.mkdir(parents=True, exist_ok=True)

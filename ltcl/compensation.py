@@ -116,9 +116,7 @@ def compensate(
     )
     wanted = T.to_light([solution.x for solution in solutions])
     light, clipped = _within(wanted, low, high, T.masked)
-    seen = [
-        operator @ p + dark for operator, p, dark in zip(T.operators, light, backgrounds, strict=True)
-    ]
+    seen = [operator @ p + dark for operator, p, dark in zip(T.operators, light, backgrounds, strict=True)]
     return Compensation(
         pattern=shape.pack(light, T.grid).astype(np.float32),
         appearance=shape.pack(seen, T.grid).astype(np.float32),
@@ -145,13 +143,17 @@ def _background(
     if background is None:
         return [np.zeros((column.shape[0], 1)) for column in like]
     columns, own = layout.unpack("background", background, T.grid, T.channels)
-    if own.frames not in (None, shape.frames):
-        raise InputError(f"background has {own.frames} frames and desired {shape.frames or 1}; give one, or as many")
-    if own.frames is None and shape.frames is not None:
-        columns = [np.tile(column, (1, shape.frames)) for column in columns]
-    if columns[0].shape[1] not in (1, like[0].shape[1]):
-        raise InputError("background is in colour where desired is grey; both must be of one kind")
-    return columns
+    # (N, frames, colours): one frame or one grey serves all.
+    have, want = (
+        (len(like[0]), part.frames or 1, 3 if part.colour and T.channels == 1 else 1) for part in (own, shape)
+    )
+    try:
+        return [np.broadcast_to(c.reshape(have), want).reshape(c.shape[0], -1) for c in columns]
+    except ValueError:
+        raise InputError(
+            f"background has {have[1]} frame(s) of {have[2]} colour(s), desired {want[1]} of {want[2]}; "
+            "background must have as many, or one"
+        ) from None
 
 
 def _within(

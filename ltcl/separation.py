@@ -6,8 +6,8 @@ light that bounced at least once, and of it b_1 = X l^(1) bounced exactly once, 
 
     b_k = X l^(k),    l^(k+1) = l^(k) - b_k
 
-Equal to the paper's chain b_k = b_(k-1) - X b_(k-1) in exact arithmetic; in this form the bounces and the rest
-add up to the picture whatever the tolerance of the solves. Nothing is clipped on the way.
+Equal to the paper's chain b_k = b_(k-1) - X b_(k-1) in exact arithmetic; in this form the bounces and the
+rest add up to the picture whatever the tolerance of the solves. Nothing is clipped on the way.
 """
 
 from __future__ import annotations

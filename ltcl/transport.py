@@ -11,24 +11,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ltcl import checks, layout
-from ltcl.device import Array, Device, open_device
-from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import (
-    CSR,
-    Dense,
-    Host,
-    IdentityPlus,
-    Operator,
-    Pattern,
-    ScaledColumns,
-    Shifted,
-    as_operator,
-)
+from ltcl import checks, first_bounces, layout
+from ltcl.device import Device, open_device
+from ltcl.errors import InputError
+from ltcl.operators import IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
 
 
 class Transport:
@@ -90,21 +79,22 @@ class Transport:
         self._device: Device | None = None
         self._systems: tuple[IdentityPlus, ...] | None = None
         self._forward: tuple[Operator, ...] | None = None
-        self.masked = np.zeros(self.shape[1], bool)
+        self.masked: np.ndarray = np.zeros(self.shape[1], bool)
         self._first_bounce: np.ndarray | None = None
         if self.is_square:
             checks.one_of("on_dark", on_dark, ("raise", "mask"))
-            F = _first_bounce(self.matrices, first_bounce)
+            F = first_bounces.find(self.matrices, first_bounce)
             dark = F <= 0.0
             if dark.any():
-                _refuse_dark(dark, self.grid, on_dark, self.matrices)
-                self.masked = dark.any(axis=0)
+                first_bounces.refuse_dark(dark, self.grid, on_dark, self.matrices)
+                self.masked = np.asarray(dark.any(axis=0))
                 F = np.where(self.masked, 0.0, F)
             self._first_bounce = F
 
     def __repr__(self) -> str:
         kind = {1: "grey", 3: "colour"}[self.channels]
-        return f"<ltcl Transport {self.shape[0]} x {self.shape[1]}, {kind}, grid {self.grid[0]} x {self.grid[1]}>"
+        (rows, columns), (h, w) = self.shape, self.grid
+        return f"<ltcl Transport {rows} x {columns}, {kind}, grid {h} x {w}>"
 
     @property
     def channels(self) -> int:
@@ -133,7 +123,7 @@ class Transport:
     def systems(self) -> tuple[IdentityPlus, ...]:
         """S = I + R of each channel, always as a tuple; uploaded at the first call."""
         if self._systems is None:
-            self._systems = _systems(self.matrices, self._require_first_bounce(), self.device)
+            self._systems = interreflections(self.matrices, self._require_first_bounce(), self.device)
         return self._systems
 
     @property
@@ -168,23 +158,22 @@ class Transport:
     def _require_first_bounce(self) -> np.ndarray:
         if self._first_bounce is None:
             raise InputError(
-                f"T is {self.shape[0]} x {self.shape[1]}; S = T F^-1 exists only for a square T, with the camera on "
-                "the projector's grid; this one can only relight"
+                f"T is {self.shape[0]} x {self.shape[1]}; S = T F^-1 exists only for a square T, with the "
+                "camera on the projector's grid; this one can only relight"
             )
         return self._first_bounce
 
 
 def _product(T: Operator, x: np.ndarray) -> np.ndarray:
     """T x on the host for x (N, k)."""
-    pattern: Array = T.device.upload(x)
-    return T.apply(pattern).get()
+    return T.apply(T.device.upload(x)).get()
 
 
 def _channels(matrix: Any) -> tuple[Any, ...]:
     """The checked matrices of 1 or 3 channels."""
-    if isinstance(matrix, (list, tuple)) and any(_is_matrix(part) for part in matrix):
-        parts = list(matrix)
-    elif isinstance(matrix, np.ndarray) and matrix.ndim == 3:
+    if (isinstance(matrix, (list, tuple)) and any(_is_matrix(part) for part in matrix)) or (
+        isinstance(matrix, np.ndarray) and matrix.ndim == 3
+    ):
         parts = list(matrix)
     else:
         parts = [matrix]
@@ -211,7 +200,7 @@ def _checked(name: str, part: Any) -> Any:
         result = checks.finite(name, checks.real(name, part))
         if result.ndim != 2:
             raise InputError(f"{name} has shape {result.shape}; it must be (M, N)")
-    if 0 in result.shape:
+    if 0 in (result.shape or ()):
         raise InputError(f"{name} has shape {result.shape}; it must have at least one row and one column")
     return result
 
@@ -220,115 +209,7 @@ def _camera_grid(camera_grid: Any, shape: tuple[int, int], grid: tuple[int, int]
     if camera_grid is not None:
         return checks.grid("camera_grid", camera_grid, shape[0])
     if shape[0] != shape[1]:
-        raise InputError(f"matrix has shape {shape}; a rectangular T needs camera_grid=(h, w) with h * w = {shape[0]}")
-    return grid
-
-
-def _first_bounce(matrices: Sequence[Any], wanted: Any) -> np.ndarray:
-    """F of each channel, (channels, N) float64, not yet checked for sign."""
-    n = matrices[0].shape[0]
-    if isinstance(wanted, str):
-        checks.one_of("first_bounce", wanted, ("diagonal", "exact"))
-        find = _diagonal if wanted == "diagonal" else _exact
-        return np.stack([find(matrix) for matrix in matrices])
-    F = checks.finite("first_bounce", checks.real("first_bounce", wanted)).astype(np.float64)
-    checks.shape("first_bounce", F, *([(n,), (1, n)] if len(matrices) == 1 else [(n,), (3, n)]))
-    return np.broadcast_to(F, (len(matrices), n))
-
-
-def _diagonal(matrix: Any) -> np.ndarray:
-    if callable(getattr(matrix, "diagonal", None)):
-        return np.asarray(matrix.diagonal(), np.float64)
-    raise InputError(
-        f"first_bounce is 'diagonal', but a {type(matrix).__name__} does not tell its diagonal; "
-        "give first_bounce as an array (N,)"
-    )
-
-
-def _exact(matrix: Any) -> np.ndarray:
-    """F_ii = 1 / (T^-1)_ii: of T^-1 = F^-1 (I - A) the diagonal is 1 / F where A has none."""
-    if not isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)):
-        raise InputTypeError(
-            f"first_bounce='exact' inverts the matrix densely, which a {type(matrix).__name__} does not allow; "
-            "give first_bounce as an array (N,)"
+        raise InputError(
+            f"camera_grid is None, but matrix has shape {shape}; it must be (h, w) with h * w = {shape[0]}"
         )
-    n = matrix.shape[0]
-    checks.fits_host(f"first_bounce='exact' inverts T densely, which for N = {n}", 3 * 8 * n * n)
-    dense = matrix.astype(np.float64) if isinstance(matrix, np.ndarray) else matrix.toarray().astype(np.float64)
-    try:
-        inverse = scipy.linalg.inv(dense, overwrite_a=True, check_finite=False)
-    except np.linalg.LinAlgError as error:
-        raise InputError("first_bounce='exact' needs an invertible T, but this one is singular") from error
-    with np.errstate(divide="ignore"):
-        F = 1.0 / np.diagonal(inverse)
-    return np.where(np.isfinite(F), F, 0.0)
-
-
-def _refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, matrices: Sequence[Any]) -> None:
-    """Refuse pixels without a positive first bounce, unless they may be masked."""
-    pixels = np.flatnonzero(dark.any(axis=0))
-    if on_dark == "mask" and len(pixels) == dark.shape[1]:
-        raise InputError("first_bounce is zero or negative at every pixel; there is nothing left to light")
-    if on_dark == "mask" and all(isinstance(m, (np.ndarray, scipy.sparse.csr_array)) for m in matrices):
-        return
-    listed = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
-    more = f" and {len(pixels) - 8} more" if len(pixels) > 8 else ""
-    advice = (
-        "mask the LinearOperator itself" if on_dark == "mask" else "give on_dark='mask' to leave these pixels unlit"
-    )
-    raise InputError(
-        f"first_bounce is zero or negative at {len(pixels)} of {dark.shape[1]} pixels (row, column): "
-        f"{listed}{more}; it must be positive; {advice}"
-    )
-
-
-def _systems(matrices: Sequence[Any], F: np.ndarray, device: Device) -> tuple[IdentityPlus, ...]:
-    """S = I + R of every channel on the device; sparse channels share one pattern where they can."""
-    systems, pattern = [], None
-    for matrix, f in zip(matrices, F, strict=True):
-        R = _interreflection(matrix, f, device, pattern)
-        pattern = R.pattern if isinstance(R, CSR) else None
-        systems.append(IdentityPlus(R))
-    return tuple(systems)
-
-
-def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Pattern | None) -> Operator:
-    """R = T F^-1 - I, computed in float64 and rounded once."""
-    lit = F > 0
-    inverse = np.divide(1.0, F, out=np.zeros(len(F)), where=lit)
-    if isinstance(matrix, np.ndarray):
-        return Dense(device, _dense_R(matrix, inverse, lit))
-    if isinstance(matrix, scipy.sparse.csr_array):
-        return CSR(device, _sparse_R(matrix, inverse, lit), pattern)
-    return Shifted(ScaledColumns(Host(device, matrix), inverse))
-
-
-def _dense_R(T: np.ndarray, inverse: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    n = len(inverse)
-    checks.fits_host(f"R of {n} x {n}", 4 * n * n)
-    R = np.empty((n, n), np.float32)
-    rows = max(1, (1 << 24) // (8 * n))  # float64 only a block at a time
-    for start in range(0, n, rows):
-        block = T[start : start + rows] * inverse
-        here = np.arange(len(block))
-        block[here, start + here] -= lit[start : start + rows]
-        R[start : start + rows] = block
-    return R
-
-
-def _sparse_R(T: scipy.sparse.csr_array, inverse: np.ndarray, lit: np.ndarray) -> scipy.sparse.csr_array:
-    """T F^-1 - I that keeps T's pattern, or drops its whole diagonal, so that channels stay alike."""
-    row = np.repeat(np.arange(T.shape[0]), np.diff(T.indptr))
-    on_diagonal = T.indices == row
-    data = T.data * inverse[T.indices]
-    data[on_diagonal] -= lit[row[on_diagonal]]
-    if np.count_nonzero(on_diagonal) < T.shape[0]:  # some F was given where T stores nothing
-        missing = lit.copy()
-        missing[row[on_diagonal]] = False
-        R = scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
-        return scipy.sparse.csr_array(R - scipy.sparse.diags_array(missing.astype(np.float64)))
-    if data[on_diagonal].any():
-        return scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
-    keep = ~on_diagonal
-    indptr = T.indptr - np.arange(T.shape[0] + 1)  # exactly one diagonal entry a row is gone
-    return scipy.sparse.csr_array((data[keep], T.indices[keep], indptr), shape=T.shape)
+    return grid

@@ -14,7 +14,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import failures, kernels
 from ltcl.device.array import Array
-from ltcl.device.discovery import Description
+from ltcl.device.description import Description
 from ltcl.device.kernels import Kernel
 from ltcl.errors import MemoryLimitError
 

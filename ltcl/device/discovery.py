@@ -11,43 +11,19 @@ import os
 import re
 import sys
 import weakref
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ltcl.device import trial
+from ltcl.device.description import KINDS, Description, describe
+from ltcl.device.device import Device
 from ltcl.errors import DeviceError
 
-if TYPE_CHECKING:
-    from ltcl.device.device import Device
-
-_KINDS = ("gpu", "accelerator", "cpu", "simulator")
 _FIXES = {
     "linux": "pip install 'pyopencl[pocl]' (any x86-64 CPU), apt install pocl-opencl-icd (any CPU), "
     "or your GPU vendor's OpenCL driver",
     "darwin": "macOS brings OpenCL; on newer machines: conda install -c conda-forge pocl",
     "win32": "install the GPU vendor's driver, or Intel's CPU Runtime for OpenCL Applications",
 }
-
-
-@dataclass(frozen=True)
-class Description:
-    """One device as the drivers describe it. `index` is what `open_device` takes: "platform:device"."""
-
-    index: str
-    name: str
-    kind: str
-    platform: str
-    driver: str
-    compute_units: int
-    memory: int
-    max_allocation: int
-    handle: Any = field(repr=False, compare=False)
-
-    @property
-    def rank(self) -> tuple:
-        """Sort key: the best device first."""
-        newest = tuple(-number for number in _version(self.driver))
-        return (_KINDS.index(self.kind), -self.compute_units if self.kind == "gpu" else 0, newest, self.index)
 
 
 _opened: weakref.WeakValueDictionary[str, Device] = weakref.WeakValueDictionary()
@@ -75,7 +51,7 @@ def list_devices() -> list[Description]:
     except cl.Error:  # the loader calls "no platform" an error
         return []
     found = [
-        _describe(f"{p}:{d}", platform, handle)
+        describe(f"{p}:{d}", platform, handle)
         for p, platform in enumerate(platforms)
         for d, handle in enumerate(_devices(platform))
     ]
@@ -108,8 +84,6 @@ def open_device(select: str | Device | None = None) -> Device:
     >>> ltcl.open_device("cpu").kind
     'cpu'
     """
-    from ltcl.device.device import Device
-
     if isinstance(select, Device):
         return select
     description = choose(list_devices(), select or os.environ.get("LTCL_DEVICE") or None)
@@ -121,26 +95,29 @@ def open_device(select: str | Device | None = None) -> Device:
 
 def choose(devices: list[Description], select: str | None) -> Description:
     """The one of `devices`, best first, that `select` means."""
+    fix = _FIXES.get(sys.platform, _FIXES["linux"])
     if not devices:
-        fix = _FIXES.get(sys.platform, _FIXES["linux"])
         raise DeviceError(f"no OpenCL device was found; install a driver: {fix}")
     if select is None:
         real = [device for device in devices if device.kind != "simulator"]
         if not real:
-            raise DeviceError(f"only a simulator was found ({devices[0].name}); name it to use it, or {_FIXES['linux']}")
+            raise DeviceError(
+                f"only a simulator was found; name it ({devices[0].name}), or install a driver: {fix}"
+            )
         return real[0]
     matches = [device for device in devices if _means(select, device)]
     if not matches:
         known = "; ".join(f"{device.index} {device.name} ({device.kind})" for device in devices)
         raise DeviceError(
-            f"device is {select!r}; it must be gpu, cpu, accelerator, an index or part of a name; there are: {known}"
+            f"device is {select!r}; it must be gpu, cpu, accelerator, an index or part of a name; "
+            f"there are: {known}"
         )
     return matches[0]
 
 
 def _means(select: str, device: Description) -> bool:
     wanted = select.strip().lower()
-    if wanted in _KINDS:
+    if wanted in KINDS:
         return device.kind == wanted
     if re.fullmatch(r"\d+:\d+", wanted):
         return device.index == wanted
@@ -154,33 +131,3 @@ def _devices(platform: Any) -> list[Any]:
         return platform.get_devices()
     except cl.Error:  # a platform without devices answers DEVICE_NOT_FOUND
         return []
-
-
-def _describe(index: str, platform: Any, handle: Any) -> Description:
-    return Description(
-        index=index,
-        name=handle.name.strip(),
-        kind=_kind(platform, handle),
-        platform=platform.name.strip(),
-        driver=f"{platform.name.strip()} {handle.driver_version.strip()}",
-        compute_units=handle.max_compute_units,
-        memory=handle.global_mem_size,
-        max_allocation=handle.max_mem_alloc_size,
-        handle=handle,
-    )
-
-
-def _kind(platform: Any, handle: Any) -> str:
-    import pyopencl as cl
-
-    if "oclgrind" in platform.name.lower():
-        return "simulator"
-    if handle.type & cl.device_type.GPU:
-        return "gpu"
-    return "cpu" if handle.type & cl.device_type.CPU else "accelerator"
-
-
-def _version(text: str) -> tuple[int, ...]:
-    """The numbers of the last dotted version in `text`: 'Portable ... 3.0-rc2' -> (3, 0)."""
-    found = re.findall(r"\d+(?:\.\d+)+", text)
-    return tuple(int(number) for number in found[-1].split(".")) if found else (0,)

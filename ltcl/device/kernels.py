@@ -6,14 +6,14 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, Any
 
-from ltcl.device import failures, sources
-from ltcl.errors import DeviceError
+from ltcl.device import failures, programs, sources
 
 if TYPE_CHECKING:
     from ltcl.device.device import Device
 
 # Exact float32: no fast-math (it deletes NaN tests), contraction of a * b + c is left to the driver.
 _OPTIONS = ["-cl-std=CL1.2"]
+_Size = int | tuple[int, ...]
 
 
 class Kernel:
@@ -32,7 +32,8 @@ class Kernel:
         # Arguments live in the cl_kernel until the launch: one thread at a time.
         self._lock = threading.Lock()
 
-    def __call__(self, items: int | tuple[int, ...], group: int | tuple[int, ...] | None, *arguments: Any) -> None:
+    def __call__(self, items: _Size, group: _Size | None, *arguments: Any) -> None:
+        """Queue a launch over `items` rounded up to whole groups; returns at once."""
         size = items if isinstance(items, tuple) else (items,)
         local = (group,) if isinstance(group, int) else group
         if 0 in size:
@@ -57,19 +58,8 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> dict[str, Kerne
 
     source = sources.load(file)
     options = _OPTIONS + [f"-D{name}={value}" for name, value in sorted(defines.items())]
-    try:
-        # The driver keeps its own binary cache; pyopencl's would write pickles.
-        program = cl.Program(device.context, source.text).build(options, cache_dir=False)
-    except cl.Error as error:
-        raise DeviceError(
-            f"kernels/{file}.cl does not compile on {device.name} ({device.driver}) with "
-            f"{' '.join(options)}:\n{_log(error)}"
-        ) from error
+    program = programs.build(device, source, options)
     return {
-        name: Kernel(device, cl.Kernel(program, name), name, types) for name, types in source.signatures.items()
+        name: Kernel(device, cl.Kernel(program, name), name, types)
+        for name, types in source.signatures.items()
     }
-
-
-def _log(error: Exception) -> str:
-    """The compiler's own words: pyopencl puts options and source around them."""
-    return str(error).split("(options:")[0].strip()

@@ -36,7 +36,7 @@ class Source:
 
 
 def folder() -> Path:
-    """The folder of `.cl` files: `ltcl/kernels` when installed, `kernels/` beside the package in a checkout."""
+    """The folder of `.cl` files: `ltcl/kernels` where installed, `kernels/` beside `ltcl/` in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for place in (package / "kernels", package.parent / "kernels"):
         if (place / "common" / "real.h").is_file():

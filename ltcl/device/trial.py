@@ -24,7 +24,17 @@ log = logging.getLogger(__name__)
 _FILE = "drivers.json"
 _SCRIPT = Path(__file__).with_name("probe.py")
 _SECONDS = 120  # a driver that hangs is treated as one that died
-_PREFIXES = ("OCL_", "OPENCL_", "POCL_", "CUDA_VISIBLE", "ROCR_", "HIP_VISIBLE", "ZE_", "ONEAPI_", "LD_LIBRARY_PATH")
+_PREFIXES = (
+    "OCL_",
+    "OPENCL_",
+    "POCL_",
+    "CUDA_VISIBLE",
+    "ROCR_",
+    "HIP_VISIBLE",
+    "ZE_",
+    "ONEAPI_",
+    "LD_LIBRARY_PATH",
+)
 
 
 def hide_fatal_drivers() -> list[str]:
@@ -57,7 +67,11 @@ def survives(environment: dict[str, str]) -> bool:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **environment}
     try:
         child = subprocess.run(  # noqa: S603 - our own script with our own interpreter
-            [sys.executable, str(_SCRIPT)], env=environment, capture_output=True, timeout=_SECONDS, check=False
+            [sys.executable, str(_SCRIPT)],
+            env=environment,
+            capture_output=True,
+            timeout=_SECONDS,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return False

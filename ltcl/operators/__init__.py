@@ -12,6 +12,7 @@ from ltcl.operators.base import Norms, Operator, Transposed
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
+from ltcl.operators.interreflection import interreflections
 
 __all__ = [
     "CSR",
@@ -25,6 +26,7 @@ __all__ = [
     "Shifted",
     "Transposed",
     "as_operator",
+    "interreflections",
 ]
 
 

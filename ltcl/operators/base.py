@@ -65,7 +65,9 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         """The main diagonal, (min(M, N),) float64, on the host."""
         raise TypeError(f"{type(self).__name__} does not implement diagonal")
 
-    def apply(self, x: Array, out: Array | None = None, *, scale: float = 1.0, add: Array | None = None) -> Array:
+    def apply(
+        self, x: Array, out: Array | None = None, *, scale: float = 1.0, add: Array | None = None
+    ) -> Array:
         """Queue ``out = scale * (A x) + add`` on the device.
 
         Parameters
@@ -121,26 +123,33 @@ class Operator(scipy.sparse.linalg.LinearOperator):
     def _matvec(self, x: np.ndarray) -> np.ndarray:
         return self.apply(self.device.upload(np.ravel(x))).get()
 
-    def _matmat(self, x: np.ndarray) -> np.ndarray:
-        return self.apply(self.device.upload(x)).get()
+    def _matmat(self, X: np.ndarray) -> np.ndarray:
+        return self.apply(self.device.upload(X)).get()
 
     def _rmatvec(self, x: np.ndarray) -> np.ndarray:
         return self.apply_transpose(self.device.upload(np.ravel(x))).get()
 
-    def _rmatmat(self, x: np.ndarray) -> np.ndarray:
-        return self.apply_transpose(self.device.upload(x)).get()
+    def _rmatmat(self, X: np.ndarray) -> np.ndarray:
+        return self.apply_transpose(self.device.upload(X)).get()
 
-    def _transpose(self) -> Transposed:
+    def _transpose(self) -> Operator:  # pyright: ignore[reportIncompatibleMethodOverride]
         return Transposed(self)
 
-    _adjoint = _transpose  # real numbers
+    def _adjoint(self) -> Operator:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self._transpose()  # real numbers
 
-    def _checked(self, x: Array, out: Array | None, scale: float, add: Array | None, transpose: bool) -> Array:
+    def _checked(
+        self, x: Array, out: Array | None, scale: float, add: Array | None, transpose: bool
+    ) -> Array:
         rows, columns = self.shape[::-1] if transpose else self.shape
         if x.shape[0] != columns or len(x.shape) > 2:
-            raise InputError(f"x has shape {x.shape}; the operator {self.shape} needs ({columns},) or ({columns}, k)")
+            raise InputError(
+                f"x has shape {x.shape}; the operator {self.shape} needs ({columns},) or ({columns}, k)"
+            )
         if max(rows, columns) * x.columns >= 1 << 31:
-            raise InputError(f"x has {x.columns} right-hand sides; at most {(1 << 31) // max(rows, columns)} fit one product")
+            raise InputError(
+                f"x has {x.columns} right-hand sides; one product takes {(1 << 31) // max(rows, columns)}"
+            )
         wanted = (rows, *x.shape[1:])
         out = self.device.empty(wanted) if out is None else out
         for name, array in (("out", out), ("add", add)):
@@ -174,8 +183,6 @@ class Transposed(Operator):
 
     def _transpose(self) -> Operator:
         return self.base
-
-    _adjoint = _transpose
 
 
 def widths(columns: int) -> list[tuple[int, int]]:

@@ -146,8 +146,9 @@ class Host(Operator):
 
     def diagonal(self) -> np.ndarray:
         """Asked of the operator, where it can tell; else one product per pixel would be needed: refused."""
-        if callable(getattr(self.operator, "diagonal", None)):
-            return np.asarray(self.operator.diagonal(), np.float64)
+        diagonal = getattr(self.operator, "diagonal", None)
+        if callable(diagonal):
+            return np.asarray(diagonal(), np.float64)
         raise InputError(
             f"{type(self.operator).__name__} has no diagonal(); give first_bounce as an array (N,)"
         )

@@ -7,6 +7,8 @@ but the same speed and the same bits at every call, which scattered additions wo
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,10 +24,11 @@ from ltcl.operators.rows import RowOperator, Slab
 class Pattern:
     """Where the nonzeros are, on the device. Colour channels with one pattern store it once.
 
-    Slabs are (start, stop) rows; each has pointers (rows + 1,) from 0 and columns (nnz,).
+    Made from a checked `csr_array`. Slabs are (start, stop) rows; each has pointers (rows + 1,) from 0 and
+    columns (nnz,).
     """
 
-    def __init__(self, device: Device, matrix: scipy.sparse.csr_array) -> None:
+    def __init__(self, device: Device, matrix: Any) -> None:
         self.device = device
         self.shape: tuple[int, int] = matrix.shape
         self.indptr = matrix.indptr.astype(np.int64)
@@ -47,7 +50,7 @@ class Pattern:
             slabs.append(Slab(start, stop - start, (pointers, columns, values)))
         return slabs
 
-    def matches(self, matrix: scipy.sparse.csr_array) -> bool:
+    def matches(self, matrix: Any) -> bool:
         """Whether `matrix` has its nonzeros in the same places."""
         if self.shape != matrix.shape or len(self.indices) != matrix.nnz:
             return False
@@ -83,7 +86,7 @@ class CSR(RowOperator):
     """
 
     file = "csr"
-    defines: dict[str, Any] = {}
+    defines: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, device: Device, matrix: Any, pattern: Pattern | None = None) -> None:
         matrix = checks.csr("matrix", matrix)

@@ -95,6 +95,17 @@ class Dense(RowOperator):
         for slab in self.slabs:
             adds, added = (0, out) if add is None else (1, add)
             kernel(
-                items, 16, slab.rows, slab.first, x.columns, offset, scale, adds, *slab.arguments, x, added, out
+                items,
+                16,
+                slab.rows,
+                slab.first,
+                x.columns,
+                offset,
+                scale,
+                adds,
+                *slab.arguments,
+                x,
+                added,
+                out,
             )
             add = out  # the following slabs add to what the first has written

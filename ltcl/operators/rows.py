@@ -7,6 +7,7 @@ add, out)`, and come as `f_matvec`, `f_matvec_stream` and `f_matvec_group`; see 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +40,7 @@ class Launch:
     group: int
 
     def __call__(self, rows: int, *arguments: Any) -> None:
+        """Queue the kernel over `rows` rows."""
         if self.group:
             local = self.kernel.device.local(self.group)
             self.kernel(rows * self.group, self.group, rows, *arguments, local)
@@ -50,7 +52,7 @@ class RowOperator(Operator):
     """An operator stored as slabs of rows. Subclasses set `file`, `defines` and `slabs`."""
 
     file: str  # stem of the kernel file
-    defines: dict[str, Any]
+    defines: Mapping[str, Any]
     slabs: list[Slab]
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:

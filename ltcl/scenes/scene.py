@@ -10,7 +10,7 @@ shows 1. So the transport is T = (I - A)^-1 diag(albedo), (N, N), one per colour
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from ltcl.scenes import viewer as viewing
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall, check_albedo
 from ltcl.transport import Transport
+
+if TYPE_CHECKING:
+    from ltcl.device import Device
 
 _LONGEST = 32766  # pixels along an image that OpenCV can still address
 
@@ -134,18 +137,28 @@ class Scene:
         self._fits(self.channels)
         return tuple(exchange.transport(self.form_factors, albedo, self.area) for albedo in self.albedo)
 
-    def transport(self, first_bounce: Any = "diagonal", device: Any = None) -> Transport:
+    def transport(
+        self,
+        first_bounce: Any = "diagonal",
+        device: Device | str | None = None,
+        *,
+        on_dark: str = "raise",
+    ) -> Transport:
         """The scene's `ltcl.Transport`, ready to compensate, separate and relight.
 
         Parameters
         ----------
         first_bounce : "diagonal", "exact" or ndarray, (N,) or (3, N)
             What `Transport` takes as F; `scene.first_bounce` is the truth.
-        device : optional
+        device : Device or str, optional
             The device that `Transport` computes on; the best one if omitted.
+        on_dark : "raise" or "mask"
+            What `Transport` does about patches of albedo 0: refuse, or never light them.
 
         Raises
         ------
+        InputError
+            If `Transport` refuses an option, or a patch is black and not to be masked.
         MemoryLimitError
             If the matrices do not fit in the memory of the host.
 
@@ -157,7 +170,7 @@ class Scene:
         """
         matrices = self.matrices()
         matrix = matrices[0] if self.channels == 1 else matrices
-        return Transport(matrix, grid=self.grid, first_bounce=first_bounce, device=device)
+        return Transport(matrix, grid=self.grid, first_bounce=first_bounce, device=device, on_dark=on_dark)
 
     def picture(self, patches: Any) -> np.ndarray:
         """Values per patch, (N,) or (3, N), as a picture on the grid, (h, w) or (h, w, 3).

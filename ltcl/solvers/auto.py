@@ -25,7 +25,10 @@ def choose(S: Operator, rtol: float) -> tuple[str, str]:
     if rtol < 1e-6:
         return "direct", f"rtol={rtol:g} is below what float32 products reach"
     rho = float(np.max(np.abs(S.row_sums() - 1.0)))
-    plain, chebyshev = theory.series_products(rho, rtol), theory.chebyshev_products(*theory.free_bounds(S), rtol)
+    plain, chebyshev = (
+        theory.series_products(rho, rtol),
+        theory.chebyshev_products(*theory.free_bounds(S), rtol),
+    )
     if plain <= chebyshev:
         return "jacobi", f"row sums of R are at most {rho:.2g}: {plain} products, Chebyshev {chebyshev}"
     return "chebyshev", f"row sums of R are at most {rho:.2g}: {chebyshev} products"

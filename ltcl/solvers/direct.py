@@ -13,6 +13,7 @@ import scipy.linalg
 from ltcl import checks
 from ltcl.operators import Operator
 
+(_getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), dtype=np.float64)
 _factors: weakref.WeakKeyDictionary[Operator, Factors] = weakref.WeakKeyDictionary()
 
 
@@ -44,7 +45,7 @@ def _factorize(S: Operator) -> Factors:
         checks.fits_host(f"method='direct' factorizes S densely, which for N = {n}", 3 * 8 * n * n)
         dense = S.to_dense()
         with np.errstate(all="ignore"):
-            lu, pivots, info = scipy.linalg.lapack.dgetrf(dense)
+            lu, pivots, info = _getrf(dense)
         if info != 0:
             raise np.linalg.LinAlgError("S is singular")
         _factors[S] = Factors(dense, (lu, pivots))

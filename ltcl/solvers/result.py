@@ -13,7 +13,9 @@ class Status(enum.Enum):
     """How a solve ended; the value says what to try next."""
 
     CONVERGED = "the true residual is within the tolerance"
-    MAXITER = "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try method='chebyshev'"
+    MAXITER = (
+        "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try method='chebyshev'"
+    )
     DIVERGED = (
         "the residual grew: the series converges only where the spectral radius of R is below 1; "
         "try method='chebyshev' or 'direct'"
@@ -71,6 +73,6 @@ class Solution:
 
     def __str__(self) -> str:
         return (
-            f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, {self.products} products, "
-            f"relative residual {self.residual:.2g}: {self.status.value}"
+            f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, "
+            f"{self.products} products, relative residual {self.residual:.2g}: {self.status.value}"
         )

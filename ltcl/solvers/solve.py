@@ -90,12 +90,16 @@ def solve(
     if method == "auto":
         method, reason = auto.choose(S, rtol)
         if options:
-            raise InputTypeError(f"unknown option {next(iter(options))!r}; options belong to a named method, not to 'auto'")
+            raise InputTypeError(
+                f"unknown option {next(iter(options))!r}; options belong to a named method, not to 'auto'"
+            )
         fallback = Direct() if method != Direct.name and S.shape[0] <= auto.LARGEST_DIRECT else None
     chosen = _method(method, options)
     solution = _run(chosen, S, b_host, guess, rule)
     if fallback is not None and not solution.converged:
-        reason += f"; {solution.method} ended {solution.status.name.lower()}, so a dense factorization took over"
+        reason += (
+            f"; {solution.method} ended {solution.status.name.lower()}, so a dense factorization took over"
+        )
         solution = _run(fallback, S, b_host, guess, rule)
     solution = dataclasses.replace(solution, seconds=time.perf_counter() - start, reason=reason)
     if throw and not solution.converged:
@@ -143,7 +147,13 @@ def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule
     best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
     assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
     return Solution(
-        best.get(), monitor.status, monitor.iterations, system.products, tuple(monitor.residuals), 0.0, method.name
+        best.get(),
+        monitor.status,
+        monitor.iterations,
+        system.products,
+        tuple(monitor.residuals),
+        0.0,
+        method.name,
     )
 
 
@@ -165,6 +175,4 @@ def _run_direct(method: Direct, S: Operator, b: np.ndarray, rule: Rule) -> Solut
     left = np.linalg.norm(residual, axis=0)
     relative = float(np.max(left / np.where(norms > 0, norms, 1.0)))
     met = np.all(left <= np.maximum(rule.rtol * norms, rule.atol))
-    return Solution(
-        x, Status.CONVERGED if met else Status.STAGNATED, 1, 0, (1.0, relative), 0.0, method.name
-    )
+    return Solution(x, Status.CONVERGED if met else Status.STAGNATED, 1, 0, (1.0, relative), 0.0, method.name)

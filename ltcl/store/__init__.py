@@ -106,7 +106,7 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
 
     Notes
     -----
-    Pixels dropped by ``on_dark="mask"`` are saved with a first bounce of 0 and masked in the same way on loading.
+    Pixels dropped by ``on_dark="mask"`` are saved with a first bounce of 0; loading needs the same again.
 
     Examples
     --------

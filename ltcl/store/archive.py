@@ -57,6 +57,7 @@ class Archive:
     def __init__(self, path: Path) -> None:
         with _refusing("the archive"):
             self._zip = zipfile.ZipFile(path)
+        self._size = path.stat().st_size
         members = [info for info in self._zip.infolist() if info.filename.endswith(".npy")]
         self._members = {info.filename.removesuffix(".npy"): info for info in members}
         self._headers: dict[str, arrays.Header] = {}
@@ -113,6 +114,10 @@ class Archive:
                 f"array {name!r} is compressed by method {info.compress_type}; it must be deflate or none"
             )
         most = info.compress_size * (1 if info.compress_type == zipfile.ZIP_STORED else _MOST_EXPANSION)
+        if info.compress_size > self._size:
+            raise FileError(
+                f"array {name!r} declares {info.compress_size} bytes in an archive of {self._size}"
+            )
         if info.file_size > most:
             raise FileError(
                 f"array {name!r} declares {checks.size(info.file_size)}, but its "

@@ -75,7 +75,7 @@ def _only_candidate(archive: Archive) -> str:
             header = archive.header(name)
         except FileError:
             continue
-        if header.dtype.kind in "fiub" and name not in _EXTRAS:
+        if header.dtype.kind in "fiu" and name not in _EXTRAS:  # not a mask of bool
             shapes[name] = header.shape
     found = [name for name, shape in shapes.items() if is_matrix_shape(shape)]
     if len(found) != 1:

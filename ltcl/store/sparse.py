@@ -68,6 +68,8 @@ def _bsr(data: np.ndarray, parts: Parts, shape: Shape) -> scipy.sparse.csr_array
 
 
 def _coo(data: np.ndarray, parts: Parts, shape: Shape) -> scipy.sparse.csr_array:
+    if "coords" in parts and parts["coords"].shape[:1] != (2,):
+        raise FileError(f"coords has shape {parts['coords'].shape}; it must be (2, entries)")
     row, column = parts["coords"] if "coords" in parts else (parts["row"], parts["col"])
     for name, indices, most in (("row", row, shape[0]), ("col", column, shape[1])):
         if indices.dtype.kind not in "iu" or indices.shape != data.shape or data.ndim != 1:

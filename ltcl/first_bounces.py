@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The first bounce F, found from a measured T = S F (eq. 3), and what to do where it is dark."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+
+from ltcl import checks
+from ltcl.errors import InputError, InputTypeError
+
+
+def find(matrices: Sequence[Any], wanted: Any) -> np.ndarray:
+    """F of each channel, (channels, N) float64, not yet checked for sign."""
+    n = matrices[0].shape[0]
+    if isinstance(wanted, str):
+        checks.one_of("first_bounce", wanted, ("diagonal", "exact"))
+        find = _diagonal if wanted == "diagonal" else _exact
+        return np.stack([find(matrix) for matrix in matrices])
+    F = checks.finite("first_bounce", checks.real("first_bounce", wanted)).astype(np.float64)
+    checks.shape("first_bounce", F, *([(n,), (1, n)] if len(matrices) == 1 else [(n,), (3, n)]))
+    return np.broadcast_to(F, (len(matrices), n))
+
+
+def _diagonal(matrix: Any) -> np.ndarray:
+    if callable(getattr(matrix, "diagonal", None)):
+        return np.asarray(matrix.diagonal(), np.float64)
+    raise InputError(
+        f"first_bounce is 'diagonal', but a {type(matrix).__name__} does not tell its diagonal; "
+        "give first_bounce as an array (N,)"
+    )
+
+
+def _exact(matrix: Any) -> np.ndarray:
+    """F_ii = 1 / (T^-1)_ii: of T^-1 = F^-1 (I - A) the diagonal is 1 / F where A has none."""
+    if not isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)):
+        raise InputTypeError(
+            f"first_bounce='exact' inverts the matrix densely, which a {type(matrix).__name__} does not "
+            "allow; give first_bounce as an array (N,)"
+        )
+    n = len(matrix.indptr) - 1 if isinstance(matrix, scipy.sparse.csr_array) else len(matrix)
+    checks.fits_host(f"first_bounce='exact' inverts T densely, which for N = {n}", 3 * 8 * n * n)
+    dense = (matrix if isinstance(matrix, np.ndarray) else matrix.toarray()).astype(np.float64)
+    try:
+        inverse = scipy.linalg.inv(dense, overwrite_a=True, check_finite=False)
+    except np.linalg.LinAlgError as error:
+        raise InputError("first_bounce='exact' needs an invertible T, but this one is singular") from error
+    with np.errstate(divide="ignore"):
+        F = 1.0 / np.diagonal(inverse)
+    return np.where(np.isfinite(F), F, 0.0)
+
+
+def refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, matrices: Sequence[Any]) -> None:
+    """Refuse pixels without a positive first bounce, unless they may be masked."""
+    pixels = np.flatnonzero(dark.any(axis=0))
+    if on_dark == "mask" and len(pixels) == dark.shape[1]:
+        raise InputError("first_bounce is zero or negative at every pixel; there is nothing left to light")
+    if on_dark == "mask" and all(isinstance(m, (np.ndarray, scipy.sparse.csr_array)) for m in matrices):
+        return
+    listed = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
+    more = f" and {len(pixels) - 8} more" if len(pixels) > 8 else ""
+    advice = "give on_dark='mask' to leave these pixels unlit"
+    if on_dark == "mask":
+        advice = "a LinearOperator cannot be masked here, mask it yourself"
+    raise InputError(
+        f"first_bounce is zero or negative at {len(pixels)} of {dark.shape[1]} pixels (row, column): "
+        f"{listed}{more}; it must be positive; {advice}"
+    )
