@@ -7,6 +7,7 @@
 //   csr_matvec_group   one work-group a row, its items side by side along the row; for GPUs
 //
 // Required define: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8.
+// Optional: PACKED, see common/lanes.h.
 // Layout: a slab of `rows` rows, the first of which is row `first` of the matrix. pointers[rows + 1]
 // counts from 0 within the slab; columns and values follow it. x and out are row-major with `stride` reals
 // a row; the launch works on their columns offset .. offset + K - 1.
@@ -19,6 +20,7 @@ kernel void csr_matvec(
     global const int *columns, global const real *values, global const real *x, global const real *add,
     global real *out)
 {
+    stride = STRIDE(stride);
     const int row = get_global_id(0);
     if (row >= rows)
         return;
@@ -49,6 +51,7 @@ kernel void csr_matvec_stream(
     global const int *columns, global const real *values, global const real *x, global const real *add,
     global real *out)
 {
+    stride = STRIDE(stride);
     const int row = get_global_id(0);
     if (row >= rows)
         return;
@@ -59,11 +62,11 @@ kernel void csr_matvec_stream(
     for (; j + 16 <= end; j += 16) {
         const int column = columns[j];
         if (stride == 1 && columns[j + 15] == column + 15) {
-            even = vload8(0, values + j) * vload8(0, x + column) + even;
-            odd = vload8(0, values + j + 8) * vload8(0, x + column + 8) + odd;
+            even = LOAD8(values + j) * LOAD8(x + column) + even;
+            odd = LOAD8(values + j + 8) * LOAD8(x + column + 8) + odd;
         } else {
-            even = vload8(0, values + j) * gather8(x, stride, columns + j) + even;
-            odd = vload8(0, values + j + 8) * gather8(x, stride, columns + j + 8) + odd;
+            even = LOAD8(values + j) * gather8(x, stride, columns + j) + even;
+            odd = LOAD8(values + j + 8) * gather8(x, stride, columns + j + 8) + odd;
         }
     }
     real sum = sum8(even + odd);
@@ -81,6 +84,7 @@ kernel void csr_matvec_stream(
     global const int *columns, global const real *values, global const real *x, global const real *add,
     global real *out)
 {
+    stride = STRIDE(stride);
     const int row = get_global_id(0);
     if (row >= rows)
         return;
@@ -110,6 +114,7 @@ kernel void csr_matvec_group(
     global const int *columns, global const real *values, global const real *x, global const real *add,
     global real *out, local real *scratch)
 {
+    stride = STRIDE(stride);
     const int row = get_group_id(0);  // one group a row exactly: no row is beyond the last
     real sum[K];
     for (int c = 0; c < K; ++c)

@@ -8,6 +8,7 @@
 // dense_rmatvec          the transpose: one work-item LANES neighbouring columns, down the rows of a slab
 //
 // Required defines: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8; LANES: 1 or 8.
+// Optional: PACKED, see common/lanes.h.
 // Layout: a slab of `rows` rows of `width` reals, the first of which is row `first` of the matrix. x and
 // out are row-major with `stride` reals a row; the launch works on their columns offset .. offset + K - 1.
 
@@ -22,6 +23,7 @@ kernel void dense_matvec(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
     global const real *x, global const real *add, global real *out)
 {
+    stride = STRIDE(stride);
     const int row = get_global_id(0);
     if (row >= rows)
         return;
@@ -43,6 +45,7 @@ kernel void dense_matvec_stream(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
     global const real *x, global const real *add, global real *out)
 {
+    stride = STRIDE(stride);
     const int row = get_global_id(0);
     if (row >= rows)
         return;
@@ -52,10 +55,10 @@ kernel void dense_matvec_stream(
     int j = 0;
     if (stride == 1)
         for (; j + 32 <= width; j += 32) {
-            s0 = vload8(0, a + j) * vload8(0, x + j) + s0;
-            s1 = vload8(0, a + j + 8) * vload8(0, x + j + 8) + s1;
-            s2 = vload8(0, a + j + 16) * vload8(0, x + j + 16) + s2;
-            s3 = vload8(0, a + j + 24) * vload8(0, x + j + 24) + s3;
+            s0 = LOAD8(a + j) * LOAD8(x + j) + s0;
+            s1 = LOAD8(a + j + 8) * LOAD8(x + j + 8) + s1;
+            s2 = LOAD8(a + j + 16) * LOAD8(x + j + 16) + s2;
+            s3 = LOAD8(a + j + 24) * LOAD8(x + j + 24) + s3;
         }
     real sum = sum8((s0 + s1) + (s2 + s3));
     for (; j < width; ++j)
@@ -70,6 +73,7 @@ kernel void dense_matvec_stream(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
     global const real *x, global const real *add, global real *out)
 {
+    stride = STRIDE(stride);
     const int row = get_global_id(0);
     if (row >= rows)
         return;
@@ -98,6 +102,7 @@ kernel void dense_matvec_group(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
     global const real *x, global const real *add, global real *out, local real *scratch)
 {
+    stride = STRIDE(stride);
     const int row = get_group_id(0);  // one group a row exactly: no row is beyond the last
     global const real *a = matrix + (size_t)row * width;
     real sum[K];
@@ -116,7 +121,7 @@ kernel void dense_matvec_group(
 
 #if LANES == 8
 typedef real8 stretch;
-#define LOAD_STRETCH(a) vload8(0, a)
+#define LOAD_STRETCH(a) LOAD8(a)
 #else
 typedef real stretch;
 #define LOAD_STRETCH(a) (*(a))
@@ -133,6 +138,7 @@ kernel void dense_rmatvec(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
     global const real *x, global const real *add, global real *out)
 {
+    stride = STRIDE(stride);
     const int item = get_global_id(0) * LANES;
     if (item >= width)
         return;

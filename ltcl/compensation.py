@@ -104,15 +104,15 @@ def compensate(
     >>> ltcl.compensate(T, numpy.array([[0.3, 0.3]])).pattern.round(2).tolist()
     [[0.5, 0.5]]
     """
+    T.require_square()
     low, high = _bounds(bounds)
     gain = checks.number("gain", gain, above=0.0)
-    systems = T.systems  # refuses a rectangular T before anything else
     columns, shape = layout.unpack("desired", desired, T.grid, T.channels)
     target = [gain * column for column in columns]
     backgrounds = _background(background, T, shape, columns)
     solutions = tuple(
         solve(S, l_out - dark, method, rtol=rtol, **options)
-        for S, l_out, dark in zip(systems, target, backgrounds, strict=True)
+        for S, l_out, dark in zip(T.systems, target, backgrounds, strict=True)
     )
     wanted = T.to_light([solution.x for solution in solutions])
     light, clipped = _within(wanted, low, high, T.masked)

@@ -45,13 +45,18 @@ def _exact(matrix: Any) -> np.ndarray:
     n = len(matrix.indptr) - 1 if isinstance(matrix, scipy.sparse.csr_array) else len(matrix)
     checks.fits_host(f"first_bounce='exact' inverts T densely, which for N = {n}", 3 * 8 * n * n)
     dense = (matrix if isinstance(matrix, np.ndarray) else matrix.toarray()).astype(np.float64)
+    lit = dense.any(axis=0) & dense.any(axis=1)  # a dark pixel would make T singular; its F is 0
+    if not lit.all():
+        dense = dense[np.ix_(lit, lit)]
     try:
         inverse = scipy.linalg.inv(dense, overwrite_a=True, check_finite=False)
     except np.linalg.LinAlgError as error:
         raise InputError("first_bounce='exact' needs an invertible T, but this one is singular") from error
     with np.errstate(divide="ignore"):
-        F = 1.0 / np.diagonal(inverse)
-    return np.where(np.isfinite(F), F, 0.0)
+        found = 1.0 / np.diagonal(inverse)
+    F = np.zeros(n)
+    F[lit] = np.where(np.isfinite(found), found, 0.0)
+    return F
 
 
 def refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, matrices: Sequence[Any]) -> None:

@@ -84,11 +84,11 @@ def separate(
     >>> bool(abs(b.direct - 0.5).max() < 1e-3)
     True
     """
+    T.require_square()
     checks.count("bounces", bounces, least=0)
-    systems = T.systems  # refuses a rectangular T before anything else
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     chains = [
-        _chain(S, l_out, bounces, method, rtol, options) for S, l_out in zip(systems, columns, strict=True)
+        _chain(S, l_out, bounces, method, rtol, options) for S, l_out in zip(T.systems, columns, strict=True)
     ]
 
     def picture(parts: list[np.ndarray]) -> np.ndarray:

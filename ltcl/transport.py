@@ -81,8 +81,8 @@ class Transport:
         self._forward: tuple[Operator, ...] | None = None
         self.masked: np.ndarray = np.zeros(self.shape[1], bool)
         self._first_bounce: np.ndarray | None = None
+        checks.one_of("on_dark", on_dark, ("raise", "mask"))
         if self.is_square:
-            checks.one_of("on_dark", on_dark, ("raise", "mask"))
             F = first_bounces.find(self.matrices, first_bounce)
             dark = F <= 0.0
             if dark.any():
@@ -104,7 +104,7 @@ class Transport:
     @property
     def is_square(self) -> bool:
         """Whether camera and projector have the same pixels, so that S exists."""
-        return self.shape[0] == self.shape[1]
+        return self.camera_grid == self.grid
 
     @property
     def first_bounce(self) -> np.ndarray:
@@ -155,11 +155,16 @@ class Transport:
             for l_d, F in zip(columns, self._require_first_bounce(), strict=True)
         ]
 
+    def require_square(self) -> None:
+        """Refuse, before anything is uploaded, what needs S where T can only relight."""
+        self._require_first_bounce()
+
     def _require_first_bounce(self) -> np.ndarray:
         if self._first_bounce is None:
+            (h, w), (rows, columns) = self.grid, self.camera_grid
             raise InputError(
-                f"T is {self.shape[0]} x {self.shape[1]}; S = T F^-1 exists only for a square T, with the "
-                "camera on the projector's grid; this one can only relight"
+                f"T maps a projector of {h} x {w} pixels to a camera of {rows} x {columns}; S = T F^-1 needs "
+                "both on one grid, this T can only relight"
             )
         return self._first_bounce
 
@@ -171,12 +176,13 @@ def _product(T: Operator, x: np.ndarray) -> np.ndarray:
 
 def _channels(matrix: Any) -> tuple[Any, ...]:
     """The checked matrices of 1 or 3 channels."""
-    if (isinstance(matrix, (list, tuple)) and any(_is_matrix(part) for part in matrix)) or (
-        isinstance(matrix, np.ndarray) and matrix.ndim == 3
-    ):
+    if _is_matrix(matrix):
+        parts = [matrix]
+    elif isinstance(matrix, (list, tuple)) and any(_is_matrix(part) for part in matrix):
         parts = list(matrix)
     else:
-        parts = [matrix]
+        array = checks.real("matrix", matrix)
+        parts = list(array) if array.ndim == 3 else [array]
     if len(parts) not in (1, 3):
         raise InputError(f"matrix has {len(parts)} channels; it must be one matrix, or three for RGB")
     names = ["matrix"] if len(parts) == 1 else [f"matrix[{channel}]" for channel in range(3)]
@@ -192,14 +198,14 @@ def _is_matrix(part: Any) -> bool:
 
 
 def _checked(name: str, part: Any) -> Any:
+    if len(np.shape(part)) != 2:
+        raise InputError(f"{name} has shape {np.shape(part)}; it must be (M, N)")
     if scipy.sparse.issparse(part):
         result = checks.csr(name, part)
     elif hasattr(part, "matvec"):
         result = scipy.sparse.linalg.aslinearoperator(part)
     else:
         result = checks.finite(name, checks.real(name, part))
-        if result.ndim != 2:
-            raise InputError(f"{name} has shape {result.shape}; it must be (M, N)")
     if 0 in (result.shape or ()):
         raise InputError(f"{name} has shape {result.shape}; it must have at least one row and one column")
     return result

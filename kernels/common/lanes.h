@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// The K right-hand sides of one pixel as one vector. K is 2, 3, 4 or 8; more are cut into such pieces.
+// The K right-hand sides of one launch: 1, 2, 3, 4 or 8; more are cut into such pieces. They are columns
+// offset .. offset + K - 1 of row-major arrays with `stride` columns. Where these are all the columns there
+// are, -DPACKED tells the compiler so: addresses get cheaper, a fifth less time at random columns.
 
 #ifndef LTCL_LANES_H
 #define LTCL_LANES_H
@@ -10,18 +12,25 @@
 #error "lanes.h needs -DK=<right-hand sides of one launch: 1, 2, 3, 4 or 8>"
 #endif
 
+#ifdef PACKED
+#define STRIDE(stride) K
+#else
+#define STRIDE(stride) (stride)
+#endif
+
+// The values of one pixel as one vector.
 #if K == 8
 typedef real8 lanes;
-#define LOAD(x) vload8(0, x)
+#define LOAD(x) LOAD8(x)
 #elif K == 4
 typedef real4 lanes;
-#define LOAD(x) vload4(0, x)
+#define LOAD(x) LOAD4(x)
 #elif K == 3
-typedef real4 lanes;  // the fourth lane stays 0; reading a fourth value could leave the buffer
-#define LOAD(x) ((real4)((x)[0], (x)[1], (x)[2], 0))
+typedef real4 lanes;  // the fourth lane is never stored; every ltcl buffer ends in 16 spare bytes for it
+#define LOAD(x) LOAD4(x)
 #elif K == 2
 typedef float2 lanes;
-#define LOAD(x) vload2(0, x)
+#define LOAD(x) LOAD2(x)
 #elif K != 1
 #error "K must be 1, 2, 3, 4 or 8"
 #endif

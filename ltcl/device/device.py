@@ -18,6 +18,8 @@ from ltcl.device.description import Description
 from ltcl.device.kernels import Kernel
 from ltcl.errors import MemoryLimitError
 
+SPARE_BYTES = 16  # behind every array: kernels may read the last pixel in one wide load
+
 
 @dataclass
 class Profile:
@@ -81,14 +83,13 @@ class Device:
 
         shape = (shape,) if isinstance(shape, int) else tuple(shape)
         nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-        if nbytes > self.max_allocation:
+        if nbytes + SPARE_BYTES > self.max_allocation:
             raise MemoryLimitError(
                 f"a buffer of {checks.size(nbytes)} for an array {shape} is beyond the largest that "
                 f"{self.name} allows, {checks.size(self.max_allocation)}"
             )
         with failures.translated(f"allocating {checks.size(nbytes)} on {self.name}"):
-            # OpenCL has no empty buffers; four bytes stand in for one.
-            buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, max(nbytes, 4))
+            buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, nbytes + SPARE_BYTES)
         return Array(self, buffer, shape, np.dtype(dtype))
 
     def upload(self, values: Any, dtype: Any = np.float32) -> Array:

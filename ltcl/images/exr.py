@@ -11,6 +11,8 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
+import sys
+import threading
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +28,7 @@ _MAGIC = b"\x76\x2f\x31\x01"
 _TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000
 # Rows per chunk, by number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB.
 _ROWS = dict(enumerate((1, 1, 1, 16, 32, 16, 32, 32, 32, 256)))
+_alone = threading.Lock()
 
 
 class _Header(NamedTuple):
@@ -46,13 +49,16 @@ def read(path: Path) -> np.ndarray:
     _check(path.read_bytes())
     printed = io.StringIO()
     try:
-        # The package prints its trouble with pixels on sys.stdout, where a program's own results go.
-        with contextlib.redirect_stdout(printed):
+        # The package prints its trouble with pixels on sys.stdout, where a program's own results go. One
+        # thread at a time: two that swap sys.stdout in turns would leave it swapped.
+        with _alone, contextlib.redirect_stdout(printed):
             file = OpenEXR.File(str(path), separate_channels=True)
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError, MemoryError) as error:
         reason = " ".join((printed.getvalue() or str(error)).split())
         raise FileError(f"is no readable EXR picture: {reason}") from None
+    if printed.getvalue():  # all was well, so this came from other threads
+        sys.stdout.write(printed.getvalue())
     return _picture(channels)
 
 

@@ -16,7 +16,7 @@ from ltcl.errors import FileError
 
 PNG = b"\x89PNG\r\n\x1a\n"
 MOST_PIXELS = 1 << 30  # OpenCV's own limit
-# Deflate reaches 1032 bytes for one, and a byte holds 8 pixels at best; twice that and more is a lie.
+# Deflate reaches 1032 bytes for one, and a byte holds 8 pixels at best; eight times that is a lie.
 PIXELS_PER_BYTE = 1 << 16
 
 

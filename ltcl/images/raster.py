@@ -23,7 +23,31 @@ BITS: dict[str, tuple[int, ...]] = {  # per channel that can be written, the def
     ".bmp": (8,),
 }
 _STORED = ("uint8", "uint16", "float32", "float64")
-_quiet = threading.Lock()
+
+
+class _Silence:
+    """Keeps OpenCV off stderr while any thread decodes (its level is a global); ours is the one message."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._level = 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._level = cv2.utils.logging.getLogLevel()
+                cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                cv2.utils.logging.setLogLevel(self._level)
+
+
+_silence = _Silence()
 
 
 def read(path: Path) -> np.ndarray:
@@ -75,16 +99,11 @@ def write(path: Path, codes: np.ndarray) -> None:
 
 
 def _decode(data: bytes) -> np.ndarray:
-    # OpenCV reports broken files on stderr as well; ours is the one message. The level is a global of OpenCV.
-    with _quiet:
-        level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        try:
+    try:
+        with _silence:
             stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error as error:
-            raise FileError(f"cannot be decoded: {' '.join(error.err.split())}") from None
-        finally:
-            cv2.utils.logging.setLogLevel(level)
+    except cv2.error as error:
+        raise FileError(f"cannot be decoded: {' '.join(error.err.split())}") from None
     if stored is None:
         raise FileError(f"is no picture of a known kind, or a damaged one (it begins with {data[:8]!r})")
     return stored

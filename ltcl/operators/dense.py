@@ -90,7 +90,7 @@ class Dense(RowOperator):
         self, x: Array, out: Array, scale: float, add: Array | None, offset: int, width: int
     ) -> None:
         lanes = self.defines["LANES"]
-        kernel = self.device.kernel("dense", "dense_rmatvec", K=width, **self.defines)
+        kernel = self.kernel("dense_rmatvec", width, x.columns)
         items = -(-self.shape[1] // lanes)
         for slab in self.slabs:
             adds, added = (0, out) if add is None else (1, add)

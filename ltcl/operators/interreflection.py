@@ -44,32 +44,33 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
 def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Pattern | None) -> Operator:
     """R = T F^-1 - I, computed in float64 and rounded once."""
     lit = F > 0
-    inverse = np.divide(1.0, F, out=np.zeros(len(F)), where=lit)
+    # Divided, not multiplied by 1 / F: x / x is 1 to the bit, so that F = diag(T) leaves R no diagonal.
+    divisor = np.where(lit, F, np.inf)
     if isinstance(matrix, np.ndarray):
-        return Dense(device, _dense_R(matrix, inverse, lit))
+        return Dense(device, _dense_R(matrix, divisor, lit))
     if isinstance(matrix, scipy.sparse.csr_array):
-        return CSR(device, _sparse_R(matrix, inverse, lit), pattern)
-    return Shifted(ScaledColumns(Host(device, matrix), inverse))
+        return CSR(device, _sparse_R(matrix, divisor, lit), pattern)
+    return Shifted(ScaledColumns(Host(device, matrix), 1.0 / divisor))
 
 
-def _dense_R(T: np.ndarray, inverse: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    n = len(inverse)
+def _dense_R(T: np.ndarray, divisor: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    n = len(divisor)
     checks.fits_host(f"R of {n} x {n}", 4 * n * n)
     R = np.empty((n, n), np.float32)
     rows = max(1, (1 << 24) // (8 * n))  # float64 only a block at a time
     for start in range(0, n, rows):
-        block = T[start : start + rows] * inverse
+        block = T[start : start + rows] / divisor
         here = np.arange(len(block))
         block[here, start + here] -= lit[start : start + rows]
         R[start : start + rows] = block
     return R
 
 
-def _sparse_R(T: Any, inverse: np.ndarray, lit: np.ndarray) -> scipy.sparse.csr_array:
+def _sparse_R(T: Any, divisor: np.ndarray, lit: np.ndarray) -> scipy.sparse.csr_array:
     """T F^-1 - I that keeps T's pattern, or drops its whole diagonal, so that channels stay alike."""
     row = np.repeat(np.arange(T.shape[0]), np.diff(T.indptr))
     on_diagonal = T.indices == row
-    data = T.data * inverse[T.indices]
+    data = T.data / divisor[T.indices]
     data[on_diagonal] -= lit[row[on_diagonal]]
     if np.count_nonzero(on_diagonal) < T.shape[0]:  # some F was given where T stores nothing
         missing = lit.copy()

@@ -64,12 +64,16 @@ class RowOperator(Operator):
         """Bytes of the matrix on the device."""
         return sum(slab.nbytes for slab in self.slabs)
 
-    def variants(self, width: int) -> dict[str, Launch]:
-        """The ways to run a product with `width` right-hand sides here, the default first."""
+    def kernel(self, name: str, width: int, columns: int) -> Kernel:
+        """The kernel `name` for `width` of `columns` right-hand sides."""
+        packed = {"PACKED": 1} if width == columns else {}
+        return self.device.kernel(self.file, name, K=width, **packed, **self.defines)
+
+    def variants(self, width: int, columns: int) -> dict[str, Launch]:
+        """The ways to run a product with `width` of `columns` right-hand sides here, the default first."""
 
         def launch(suffix: str, group: int) -> Launch:
-            name = f"{self.file}_matvec{suffix}"
-            return Launch(self.device.kernel(self.file, name, K=width, **self.defines), group)
+            return Launch(self.kernel(f"{self.file}_matvec{suffix}", width, columns), group)
 
         if self.device.is_cpu:
             return {"stream": launch("_stream", 0), "item": launch("", 0)}
@@ -89,7 +93,7 @@ class RowOperator(Operator):
         return self._fastest[key]
 
     def _measure(self, x: Array, width: int) -> Launch:
-        variants = self.variants(width)
+        variants = self.variants(width, x.columns)
         slab = max(self.slabs, key=lambda slab: slab.nbytes)
         if slab.nbytes < _WORTH_TIMING:
             return next(iter(variants.values()))

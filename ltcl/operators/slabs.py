@@ -7,6 +7,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Device
+from ltcl.device.device import SPARE_BYTES
 from ltcl.errors import MemoryLimitError
 
 
@@ -41,4 +42,4 @@ def cut(row_bytes: np.ndarray, limit: int, what: str) -> list[tuple[int, int]]:
 
 def largest(device: Device) -> int:
     """Bytes of the largest buffer, and never so many that a 32-bit count of values overflows."""
-    return min(device.max_allocation, 4 * ((1 << 31) - 1))
+    return min(device.max_allocation - SPARE_BYTES, 4 * ((1 << 31) - 1))

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ltcl import theory
+from ltcl import checks, theory
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError
 from ltcl.solvers.stopping import Monitor, System
@@ -28,8 +28,13 @@ class Chebyshev:
     bounds: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.bounds is not None and not (len(self.bounds) == 2 and 0 < self.bounds[0] <= self.bounds[1]):
-            raise InputError(f"bounds is {self.bounds!r}; it must be (lower, upper) with 0 < lower <= upper")
+        if self.bounds is None:
+            return
+        try:
+            lower, upper = self.bounds
+        except (TypeError, ValueError):
+            raise InputError(f"bounds is {self.bounds!r}; it must be (lower, upper)") from None
+        checks.number("bounds[1]", upper, least=checks.number("bounds[0]", lower, above=0.0))
 
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""

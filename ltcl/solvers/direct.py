@@ -13,7 +13,7 @@ import scipy.linalg
 from ltcl import checks
 from ltcl.operators import Operator
 
-(_getrf,) = scipy.linalg.get_lapack_funcs(("getrf",), dtype=np.float64)
+_getrf, _gecon = scipy.linalg.get_lapack_funcs(("getrf", "gecon"), dtype=np.float64)
 _factors: weakref.WeakKeyDictionary[Operator, Factors] = weakref.WeakKeyDictionary()
 
 
@@ -46,7 +46,8 @@ def _factorize(S: Operator) -> Factors:
         dense = S.to_dense()
         with np.errstate(all="ignore"):
             lu, pivots, info = _getrf(dense)
-        if info != 0:
-            raise np.linalg.LinAlgError("S is singular")
+            rcond, _ = _gecon(lu, np.linalg.norm(dense, 1))
+        if info != 0 or rcond < np.finfo(np.float64).eps:
+            raise np.linalg.LinAlgError("S is singular to working precision")
         _factors[S] = Factors(dense, (lu, pivots))
     return _factors[S]

@@ -57,6 +57,7 @@ def solve(
     x0 : like b, optional
         Start; zero when not given.
     callback : callable(iteration, relative residual), optional
+        Called with every entry of `residuals`, as it is found.
     throw : bool
         Raise where the tolerance is not met; otherwise look at ``.converged``.
     **options
@@ -83,18 +84,16 @@ def solve(
     start = time.perf_counter()
     checks.one_of("method", method, METHODS)
     b_host = checks.finite("b", checks.real("b", b))
-    S = as_operator(S)
-    rule = _rule(S, b_host, rtol, atol, maxiter, callback)
+    shape = S.shape if hasattr(S, "shape") else checks.real("S", S).shape
+    rule = _rule(shape, b_host, rtol, atol, maxiter, callback)
     guess = _guess(x0, b_host)
-    reason, fallback = "", None
-    if method == "auto":
-        method, reason = auto.choose(S, rtol)
-        if options:
-            raise InputTypeError(
-                f"unknown option {next(iter(options))!r}; options belong to a named method, not to 'auto'"
-            )
-        fallback = Direct() if method != Direct.name and S.shape[0] <= auto.LARGEST_DIRECT else None
     chosen = _method(method, options)
+    S = as_operator(S)
+    reason, fallback = "", None
+    if chosen is None:
+        method, reason = auto.choose(S, rtol)
+        chosen = _method(method, {})
+        fallback = Direct() if method != Direct.name and S.shape[0] <= auto.LARGEST_DIRECT else None
     solution = _run(chosen, S, b_host, guess, rule)
     if fallback is not None and not solution.converged:
         reason += (
@@ -107,12 +106,17 @@ def solve(
     return solution
 
 
-def _rule(S: Operator, b: np.ndarray, rtol: float, atol: float, maxiter: int | None, callback: Any) -> Rule:
-    rows, columns = S.shape
-    if rows != columns:
-        raise InputError(f"S has shape {S.shape}; it must be square")
+def _rule(
+    shape: tuple[int, ...], b: np.ndarray, rtol: float, atol: float, maxiter: int | None, callback: Any
+) -> Rule:
+    if len(shape) != 2 or shape[0] != shape[1]:
+        raise InputError(f"S has shape {shape}; it must be square, (N, N)")
+    rows = shape[0]
     if b.ndim not in (1, 2) or b.shape[0] != rows or b.size == 0:
         raise InputError(f"b has shape {b.shape}; it must be ({rows},) or ({rows}, k)")
+    largest = float(np.max(np.abs(b)))
+    if largest > float(np.finfo(np.float32).max):
+        raise InputError(f"b reaches {largest:.3g}; it must be within float32, at most 3.4e+38")
     rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
     atol = checks.number("atol", atol, least=0.0)
     if rtol == 0.0 and atol == 0.0:
@@ -127,7 +131,11 @@ def _guess(x0: Any, b: np.ndarray) -> np.ndarray | None:
 
 
 def _method(name: str, options: dict[str, Any]) -> Any:
-    """The method with its options; an unknown option is named, with those there are."""
+    """The method with its options, None of "auto"; an unknown option is named, with those there are."""
+    if name == "auto":
+        if options:
+            raise InputTypeError(f"unknown option {next(iter(options))!r}; name a method to give it options")
+        return None
     kind = Direct if name == Direct.name else ITERATIVE[name]
     known = [field.name for field in dataclasses.fields(kind)]
     for option in options:
@@ -140,14 +148,15 @@ def _method(name: str, options: dict[str, Any]) -> Any:
 def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
     if isinstance(method, Direct):
         return _run_direct(method, S, b, rule)
-    system = System(S, S.device.upload(b))
-    monitor = Monitor(system, rule)
-    x, r = _start(system, guess)
+    unit = _unit(b)
+    system = System(S, S.device.upload(b / unit))
+    monitor = Monitor(system, dataclasses.replace(rule, atol=rule.atol / unit))
+    x, r = _start(system, None if guess is None else guess / unit)
     method.iterate(system, x, r, monitor)
     best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
     assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
     return Solution(
-        best.get(),
+        (best.get() * unit).astype(np.float32),
         monitor.status,
         monitor.iterations,
         system.products,
@@ -155,6 +164,12 @@ def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule
         0.0,
         method.name,
     )
+
+
+def _unit(b: np.ndarray) -> np.ndarray:
+    """A power of two for each column, near its largest value: in such units norms stay inside float32."""
+    largest = np.max(np.abs(b, dtype=np.float64), axis=0)
+    return np.exp2(np.floor(np.log2(np.where(largest > 0.0, largest, 1.0))))
 
 
 def _start(system: System, guess: np.ndarray | None) -> tuple[Array, Array]:
@@ -167,12 +182,16 @@ def _start(system: System, guess: np.ndarray | None) -> tuple[Array, Array]:
 
 
 def _run_direct(method: Direct, S: Operator, b: np.ndarray, rule: Rule) -> Solution:
+    b = b.astype(np.float64)
     try:
-        x, residual = method.solve(S, b.astype(np.float64))
+        x, residual = method.solve(S, b)
     except np.linalg.LinAlgError:
         return Solution(np.zeros(b.shape), Status.BREAKDOWN, 0, 0, (1.0,), 0.0, method.name)
     norms = np.linalg.norm(b, axis=0)
     left = np.linalg.norm(residual, axis=0)
     relative = float(np.max(left / np.where(norms > 0, norms, 1.0)))
     met = np.all(left <= np.maximum(rule.rtol * norms, rule.atol))
+    if rule.callback is not None:
+        rule.callback(0, 1.0)
+        rule.callback(1, relative)
     return Solution(x, Status.CONVERGED if met else Status.STAGNATED, 1, 0, (1.0, relative), 0.0, method.name)

@@ -19,6 +19,8 @@ from ltcl.solvers.result import Status
 _GROWTH = 100.0  # times the best residual: past all transient growth of a nearly self-adjoint system
 _RISES = 20  # residuals in a row, each above the one before
 _PATIENCE = 25  # steps without a new best residual
+_DRIFT = 2.0**-20  # relative residual, below which one kept by recursion in float32 may be far off
+_ROUNDING = 2.0**-23  # relative residual that is rounding alone, were it computed as 0
 
 
 class System:
@@ -41,10 +43,10 @@ class System:
 
 @dataclass(frozen=True)
 class Rule:
-    """The tolerance of a solve."""
+    """The tolerance of a solve; `atol` is one number or one per column."""
 
     rtol: float
-    atol: float
+    atol: float | np.ndarray
     maxiter: int
     callback: Callable[[int, float], object] | None = None
 
@@ -54,7 +56,8 @@ class Monitor:
     """Watches a solve: decides when it ends, keeps the history and the best iterate.
 
     A method calls `done(x, r)` once an iteration, with the residual `r` of `x`. A method that keeps its
-    residual by recursion passes ``recursive=True``, and it is recomputed before convergence is claimed.
+    residual by recursion passes ``recursive=True``, and it is recomputed before convergence is claimed and
+    wherever rounding may have parted the two. Tolerances below the rounding of float32 are never claimed.
     """
 
     system: System
@@ -67,6 +70,8 @@ class Monitor:
         norms = vectors.norm(self.system.b)
         self._scale = np.where(norms > 0, norms, 1.0)
         self._target = np.maximum(self.rule.rtol * norms, self.rule.atol)
+        self._reachable = bool(np.all(self._target >= _ROUNDING * norms))
+        self._trusted = np.maximum(self._target, _DRIFT * norms)
         self._lowest = np.inf
         self._since_lowest = 0
         self._rises = 0
@@ -79,10 +84,10 @@ class Monitor:
     def done(self, x: Array, r: Array, *, recursive: bool = False) -> bool:
         """Whether the solve ends with the iterate `x`; sets `status` when it does."""
         norms = vectors.norm(r)
-        if recursive and np.all(norms <= self._target):
+        if recursive and np.all(norms <= self._trusted):
             norms = vectors.norm(self.system.residual(x, r.like()))
         self._record(x, float(np.max(norms / self._scale, initial=0.0)))
-        if np.all(norms <= self._target):
+        if self._reachable and np.all(norms <= self._target):
             self.status = Status.CONVERGED
         else:
             self.status = self._trouble()

@@ -31,13 +31,14 @@ from ltcl.store.record import Matrix, Record
 
 KEEPS_FIRST_BOUNCE = True
 RGB_LAYOUT = "ltcl-rgb-csr-1"
+_SPARSE_PARTS = {"format", "indptr", "indices", "offsets"}
 _EXTRAS = ("grid", "camera_grid", "first_bounce")
 
 
 def read(path: Path) -> Record:
     """Read a transport from an archive; messages come without the file's name."""
     with Archive(path) as archive:
-        matrices = _sparse(archive) if {"format", "shape"} <= set(archive.names) else _dense(archive)
+        matrices = _dense(archive) if _SPARSE_PARTS.isdisjoint(archive.names) else _sparse(archive)
         bounce = None
         if "first_bounce" in archive.names:
             bounce = arrays.as_floats("first_bounce", archive.numbers("first_bounce"))

@@ -17,7 +17,6 @@ from ltcl.store import formats
 from ltcl.store.record import Record
 from tests.store.helpers import as_dense, dense, refusal, same, sparse
 
-GIVEN = Path("/work/shared/data/transport-dihedral/transport.npz")
 CSR = {"format": np.array(b"csr"), "shape": np.array([2, 3])}
 
 
@@ -156,6 +155,8 @@ def test_unreadable_neighbours_of_the_only_matrix_do_not_matter(tmp_path):
         (csr_parts(data=np.array([1, 1j, 2])), "real numbers"),
         (csr_parts(format=np.array(b"csc")), "indptr has 3 entries from 0; it must have 4"),
         (CSR | {"data": np.ones(3)}, "array 'indices' is missing"),
+        ({"data": np.ones((3, 3)), "indices": [0, 1, 2], "indptr": [0, 3]}, "array 'format' is missing"),
+        ({"data": np.ones((3, 3)), "offsets": [0, 1, 2], "format": "dia"}, "array 'shape' is missing"),
         (
             CSR | {"format": "coo", "data": [1.0], "row": [2], "col": [0]},
             "row holds 2..2; indices must be in 0..1",
@@ -256,12 +257,12 @@ def test_an_archive_without_arrays_is_refused(tmp_path):
     assert "no array of numbers" in refusal(tmp_path / "T.npz", FileError)
 
 
-@pytest.mark.skipif(not GIVEN.exists(), reason="the path-traced transport is not here")
-def test_a_transport_traced_by_others_is_read():
-    record = formats.read(GIVEN)
+def test_a_transport_traced_by_others_is_read(shared_data):
+    given = shared_data / "transport-dihedral" / "transport.npz"
+    record = formats.read(given)
     assert (record.shape, record.grid, record.first_bounce) == ((4096, 4096), (64, 64), None)
     T = as_dense(record.matrices[0])
     assert T.dtype == np.float32
     assert np.isfinite(T).all()
     assert np.median(T.diagonal()) > 10 * np.median(T)  # direct light stands on the diagonal
-    assert "'bounces' (5, 7, 64, 64)" in refusal(GIVEN.with_name("bounces.npz"), FileError)
+    assert "'bounces' (5, 7, 64, 64)" in refusal(given.with_name("bounces.npz"), FileError)

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Plots: how solves converge, and the contact sheet of the demo.
+
+Every function takes data and returns a matplotlib `Figure`; `save` writes it whole or not at all. Figures are
+drawn by Agg without pyplot, so nothing here needs a screen or touches global state. matplotlib is imported
+by the first plot, not with this module.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.errors import InputError
+from ltcl.files import replace_file
+from ltcl.images import from_srgb, resize, to_srgb
+from ltcl.solvers import Solution
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_DPI = 100
+_PAPER, _INK, _FAINT, _GRID = "#15171b", "#f1efea", "#9aa1ab", "#2b2f36"
+_COLOURS = {"chebyshev": "#5cc8ff", "jacobi": "#ff5d5d", "neumann": "#ffb347", "direct": "#8bd17c"}
+_OTHERS = ("#c792ea", "#f78fb3", "#7fdbca", "#d6deeb")
+_LOWEST = 1e-8  # of a residual worth drawing: float32 products end above
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A picture with a label on its left shoulder and a note on its right.
+
+    `image` is linear, (h, w, 3), or (h, w, 4) with the coverage last; values beyond 0 and 1 are cut off.
+    """
+
+    label: str
+    note: str
+    image: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What `contact_sheet` shows: rows of panels, the middle one with the convergence plot at its end."""
+
+    title: str
+    subtitle: str
+    large: Sequence[Panel]
+    medium: Sequence[Panel]
+    small: Sequence[Panel]
+    solutions: Mapping[str, Solution]
+    rtol: float
+    plot_title: str = "Convergence"
+
+
+def convergence(solutions: Mapping[str, Solution], rtol: float, title: str = "Convergence") -> Figure:
+    """Relative residual of several solves of one system against the products they took.
+
+    Parameters
+    ----------
+    solutions : mapping of name to Solution
+        Made with ``throw=False``, so that a divergence shows as well. A direct solve becomes a level line.
+    rtol : float
+        Drawn as a dashed line.
+    title : str
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    InputError
+        No solution, or a tolerance outside (0, 1).
+
+    Examples
+    --------
+    >>> import ltcl
+    >>> S, b = [[1.0, 0.5], [0.5, 1.0]], [1.0, 0.0]
+    >>> figure = convergence({m: ltcl.solve(S, b, m) for m in ("jacobi", "chebyshev")}, rtol=1e-2)
+    >>> [text.get_text() for text in figure.axes[0].texts]
+    ['tolerance', 'jacobi', 'chebyshev']
+    """
+    figure = _figure(900, 560)
+    _heading(figure, 34, 26, title, 17)
+    _draw_convergence(figure.add_axes((0.09, 0.13, 0.73, 0.72)), solutions, rtol)
+    return figure
+
+
+def contact_sheet(sheet: Sheet, width: int = 1600) -> Figure:
+    """All that a demo has to show on one dark page, `width` pixels wide.
+
+    Returns
+    -------
+    Figure
+        Its height follows from the shapes of the panels.
+    """
+    margin, gap = 40, 26
+    inner = width - 2 * margin
+    rows = [
+        _Row(sheet.large, (inner - 2 * gap) // 3, 132),
+        _Row(sheet.medium, round(0.236 * inner), 0),
+        _Row(sheet.small, (inner - (len(sheet.small) - 1) * gap) // max(1, len(sheet.small)), 0),
+    ]
+    tops = [rows[0].top]
+    for row in rows[:2]:
+        tops.append(tops[-1] + row.height + 74)
+    figure = _figure(width, tops[-1] + rows[-1].height + 30)
+    _heading(figure, margin, 30, sheet.title, 25)
+    _text(figure, margin, 77, sheet.subtitle, size=14.5, color=_FAINT)
+    for row, top in zip(rows, tops, strict=True):
+        for place, panel in enumerate(row.panels):
+            _draw_panel(figure, panel, margin + place * (row.width + gap), top, row)
+    left = margin + len(sheet.medium) * (rows[1].width + gap)
+    _draw_plot(figure, sheet, (left, tops[1], width - margin - left, rows[1].height))
+    return figure
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure; an earlier file at `path` is replaced whole or not at all.
+
+    Raises
+    ------
+    InputError
+        An extension that matplotlib cannot write.
+    FileError
+        The file cannot be written.
+    """
+    known = figure.canvas.get_supported_filetypes()
+    extension = os.path.splitext(path)[1].lstrip(".").lower()
+    if extension not in known:
+        raise InputError(
+            f"{path}: extension {extension or 'missing'!r} is unknown; plots are {', '.join(sorted(known))}"
+        )
+    with replace_file(path) as temporary:
+        figure.savefig(temporary, dpi=_DPI, facecolor=figure.get_facecolor())
+
+
+@dataclass(frozen=True)
+class _Row:
+    """Panels side by side, `width` pixels each, the first pixel row of their pictures at `top`."""
+
+    panels: Sequence[Panel]
+    width: int
+    top: int
+
+    @property
+    def height(self) -> int:
+        shapes = [panel.image.shape for panel in self.panels]
+        return round(max((self.width * shape[0] / shape[1] for shape in shapes), default=0))
+
+
+def _figure(width: int, height: int) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor=_PAPER)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _text(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:
+    """Text whose top is `y` pixels below the top of the figure; sizes in points, 1.4 pixels each."""
+    width, height = figure.get_size_inches() * _DPI
+    figure.text(x / width, 1 - y / height, text, fontsize=size, **{"va": "top", "color": _INK, **style})
+
+
+def _heading(figure: Figure, x: float, y: float, text: str, size: float) -> None:
+    _text(figure, x, y, text, size=size, fontweight="bold")
+
+
+def _axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
+    """Axes in pixels: left, top, width, height, from the top left corner of the figure."""
+    width, height = figure.get_size_inches() * _DPI
+    left, top, w, h = box
+    return figure.add_axes((left / width, 1 - (top + h) / height, w / width, h / height))
+
+
+def _draw_panel(figure: Figure, panel: Panel, left: int, top: int, row: _Row) -> None:
+    height = round(row.width * panel.image.shape[0] / panel.image.shape[1])
+    size = 16 if row.width > 400 else 12.5
+    line = top - 10
+    _text(figure, left, line, panel.label, size=size, fontweight="bold", va="bottom")
+    _text(figure, left + row.width, line, panel.note, size=size, color=_FAINT, va="bottom", ha="right")
+    axes = _axes(figure, (left, top, row.width, height))
+    axes.imshow(_display(panel.image, (height, row.width)), interpolation="none", aspect="auto")
+    axes.axis("off")
+
+
+def _display(image: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """8-bit sRGB of a linear picture on `grid` pixels, laid over the colour of the page by its coverage."""
+    picture, coverage = (image[..., :3], image[..., 3:]) if image.shape[-1] == 4 else (image, 1.0)
+    paper = from_srgb(np.array([int(_PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)]))
+    over = np.clip(picture, 0, 1) * coverage + paper * (1.0 - coverage)
+    return np.rint(255 * to_srgb(np.clip(resize(over, grid), 0, 1))).astype(np.uint8)
+
+
+def _draw_plot(figure: Figure, sheet: Sheet, box: tuple[int, int, int, int]) -> None:
+    left, top, width, height = box
+    _text(figure, left + 70, top - 10, sheet.plot_title, size=12.5, fontweight="bold", va="bottom")
+    axes = _axes(figure, (left + 70, top, width - 70 - 118, height - 50))
+    _draw_convergence(axes, sheet.solutions, sheet.rtol)
+
+
+def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float) -> None:
+    checks.number("rtol", rtol, above=0.0, below=1.0)
+    if not solutions:
+        raise InputError("solutions is empty; there must be at least one to draw")
+    _dress(axes)
+    axes.axhline(rtol, color=_FAINT, lw=1.2, ls=(0, (4, 4)))
+    products = max([1, *(solution.products for solution in solutions.values())])
+    axes.set_xlim(0, products)
+    axes.text(0.99 * products, rtol, "tolerance", color=_FAINT, fontsize=11, va="bottom", ha="right")
+    others, ends = iter(_OTHERS * len(solutions)), []
+    for k, (name, solution) in enumerate(solutions.items()):
+        colour = _COLOURS.get(name) or next(others)
+        x, y = _curve(solution, products)
+        # A second curve on top of a first one must leave it visible.
+        axes.plot(x, y, color=colour, lw=2.6, ls="-" if k % 2 == 0 else (0, (3, 2.5)), clip_on=False)
+        ends.append((name, colour, float(y[-1])))
+    axes.set_ylim(*_limits(axes))
+    for name, colour, y in _apart(ends, axes.get_ylim()):
+        axes.text(1.025 * products, y, name, color=colour, fontsize=12, va="center", fontweight="bold")
+
+
+def _dress(axes: Axes) -> None:
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    axes.set_facecolor(_PAPER)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(10, numticks=8))
+    axes.minorticks_off()
+    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    axes.grid(color=_GRID, lw=1)
+    axes.tick_params(colors=_FAINT, labelsize=11, length=0, pad=7)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.set_xlabel("products with S", color=_FAINT, fontsize=12, labelpad=6)
+    axes.set_ylabel("relative residual", color=_FAINT, fontsize=12, labelpad=6)
+
+
+def _curve(solution: Solution, products: int) -> tuple[np.ndarray, np.ndarray]:
+    """Products and residuals of a solve; a direct one is a level line across."""
+    if solution.method == "direct":
+        return np.array([0, products]), np.full(2, max(solution.residual, _LOWEST))
+    y = np.array([value for value in solution.residuals if np.isfinite(value)] or [1.0])
+    return np.linspace(0, max(solution.products, 1), len(y)), np.maximum(y, _LOWEST)
+
+
+def _limits(axes: Axes) -> tuple[float, float]:
+    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.get_lines()])
+    return values.min() / 2, max(2.0, 2 * values.max())
+
+
+def _apart(
+    ends: Sequence[tuple[str, str, float]], limits: tuple[float, float]
+) -> list[tuple[str, str, float]]:
+    """Heights of the labels at the ends of curves, moved up just enough not to touch."""
+    low, high = np.log(limits)
+    step, taken, placed = 0.075 * (high - low), -np.inf, []
+    for name, colour, y in sorted(ends, key=lambda end: end[2]):
+        taken = max(float(np.log(y)), taken + step)
+        placed.append((name, colour, float(np.exp(taken))))
+    return placed

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What happened, as plain data: the `report.json` beside every result, and what ``--json`` prints."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import math
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ltcl import __version__
+from ltcl.device import Device
+from ltcl.files import replace_file
+from ltcl.solvers import Solution
+
+
+def plain(value: Any) -> Any:
+    """`value` in the types that JSON knows; numbers that are not finite become None.
+
+    >>> plain({"rho": np.float32(0.5), "products": float("inf"), "grid": (4, 5), "at": Path("a")})
+    {'rho': 0.5, 'products': None, 'grid': [4, 5], 'at': 'a'}
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, (bool, int, str)) else str(value)
+
+
+def dumps(value: Any) -> str:
+    """`value` as a JSON document that any parser takes: no NaN, no Infinity."""
+    return json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def write(path: str | os.PathLike[str], value: Any) -> None:
+    """Write `value` as a JSON file, whole or not at all."""
+    with replace_file(path) as temporary:
+        temporary.write_text(dumps(value) + "\n", encoding="utf-8")
+
+
+def solution(solved: Solution | tuple[Solution, ...]) -> list[dict[str, Any]]:
+    """What there is to tell of a solve, one entry per colour channel; the solution itself is left out."""
+    return [
+        {
+            "method": one.method,
+            "status": one.status.name.lower(),
+            "iterations": one.iterations,
+            "products": one.products,
+            "residual": one.residual,
+            "residuals": list(one.residuals),
+            "seconds": one.seconds,
+            "reason": one.reason,
+        }
+        for one in (solved if isinstance(solved, tuple) else (solved,))
+    ]
+
+
+def device(opened: Device) -> dict[str, Any]:
+    """Which device worked."""
+    return {
+        "index": opened.description.index,
+        "name": opened.name,
+        "kind": opened.kind,
+        "driver": opened.driver,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions that a result can depend on."""
+    found = {"ltcl": __version__, "python": platform.python_version(), "system": platform.platform()}
+    return found | {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "pyopencl")}

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Fixtures of all tests. That CI skips nothing silently is the work of `.ci/no_silent_skips.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import ltcl
+from ltcl.device import Device
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+SMALL = 4096  # bytes: a 53 x 53 matrix takes several slabs, its vectors still fit
+
+
+@pytest.fixture(scope="session", autouse=True)
+def private_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """What ltcl remembers during a test run is of no use to anybody else."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LTCL_CACHE", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def device(private_cache: Path) -> Device:
+    """The device that ltcl opens here; without one, tests fail rather than skip."""
+    return ltcl.open_device()
+
+
+@pytest.fixture
+def small_device(device: Device) -> Device:
+    """The same hardware with buffers of 4 KiB at most, so that matrices are cut into slabs."""
+    small = Device(device.description)
+    small.max_allocation = SMALL
+    return small
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Captures that are not part of the project; they lie beside the checkout, where they exist."""
+    if not DATA.is_dir():
+        pytest.skip(f"../shared/data is absent ({DATA})")
+    return DATA

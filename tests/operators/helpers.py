@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the tests of every operator share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ltcl.device import Array
+from ltcl.operators import Operator
+from ltcl.operators.rows import Launch, RowOperator
+from tests import gallery, reference
+
+COLUMNS = (None, 1, 2, 3, 5, 8, 11)  # None: (N,), not (N, 1)
+EPILOGUES = {"plain": (1.0, None), "scaled": (-0.75, None), "added": (0.5, "other"), "onto itself": (-1.0, "out")}
+# How a product may be launched: end of the kernel's name and items that share a row.
+LAUNCHES = {"item": ("", 0), "stream": ("_stream", 0), "group32": ("_group", 32), "group64": ("_group", 64)} | {
+    "group128": ("_group", 128)
+}
+Twin = Callable[..., np.ndarray]
+
+
+def meets_twin(A: Operator, matrix: np.ndarray, twin: Twin | None = None, *, transpose: bool = False) -> None:
+    """Assert that products of A, or of A^T, are those of `matrix` to rounding.
+
+    For every number of right-hand sides and every epilogue, into an array of NaN where nothing is added.
+    """
+    matrix = matrix.T if transpose else matrix
+    twin = twin or (lambda *arguments: reference.dense_matvec(matrix, *arguments))
+    apply = A.apply_transpose if transpose else A.apply
+    for k in COLUMNS:
+        x = gallery.vectors(matrix.shape[1], k)
+        for scale, kind in EPILOGUES.values():
+            add, out = _operands(A, gallery.vectors(matrix.shape[0], k, 2), kind)
+            expected_add = None if add is None else add.get()
+            assert apply(A.device.upload(x), out, scale=scale, add=add) is out
+            expected = twin(x, scale, expected_add)
+            close(out.get(), expected, reference.product_error(matrix, x, scale, expected_add))
+
+
+def _operands(A: Operator, values: np.ndarray, kind: str | None) -> tuple[Array | None, Array]:
+    if kind == "out":
+        out = A.device.upload(values)
+        return out, out
+    garbage = A.device.upload(np.full_like(values, np.nan))
+    return (A.device.upload(values) if kind else None), garbage
+
+
+def close(found: np.ndarray, expected: np.ndarray, error: np.ndarray) -> None:
+    """Assert |found - expected| <= error, value by value."""
+    assert found.shape == expected.shape
+    np.testing.assert_array_less(np.abs(found - expected), error + np.finfo(np.float32).tiny)
+
+
+def same_bits(a: np.ndarray, b: np.ndarray) -> None:
+    assert a.dtype == b.dtype
+    np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32))
+
+
+def force(monkeypatch: pytest.MonkeyPatch, A: RowOperator, name: str) -> None:
+    """Let A run all its products as `name` says; small operators take the first variant unasked."""
+    suffix, group = LAUNCHES[name]
+
+    def variants(width: int) -> dict[str, Launch]:
+        kernel = A.device.kernel(A.file, f"{A.file}_matvec{suffix}", K=width, **A.defines)
+        return {name: Launch(kernel, group)}
+
+    monkeypatch.setattr(A, "variants", variants)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""NumPy twins, in float64, of every OpenCL kernel, and how far float32 may stray from them.
+
+A twin is named after its kernel; the `_stream` and `_group` variants of a kernel have the same twin.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+UNIT = 2.0**-24  # largest relative error of rounding to float32
+_LEAVES = 4096  # work-items among which the dot product spreads its rows, where there are that many
+
+
+def csr_matvec(
+    pointers: np.ndarray,
+    columns: np.ndarray,
+    values: np.ndarray,
+    x: np.ndarray,
+    scale: float = 1.0,
+    add: np.ndarray | None = None,
+) -> np.ndarray:
+    """out = scale * (A x) + add, row by row; x is (N,) or (N, k)."""
+    x, values = np.float64(x), np.float64(values)
+    rows = zip(pointers[:-1], pointers[1:], strict=True)
+    out = scale * np.array([values[start:stop] @ x[columns[start:stop]] for start, stop in rows])
+    return out if add is None else out + add
+
+
+def dense_matvec(
+    matrix: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
+) -> np.ndarray:
+    """out = scale * (A x) + add."""
+    out = scale * (np.float64(matrix) @ np.float64(x))
+    return out if add is None else out + add
+
+
+def dense_rmatvec(
+    matrix: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
+) -> np.ndarray:
+    """out = scale * (A^T x) + add."""
+    return dense_matvec(matrix.T, x, scale, add)
+
+
+def vector_fill(count: int, value: float) -> np.ndarray:
+    return np.full(count, np.float64(value))
+
+
+def vector_axpby(a: float, x: np.ndarray, b: float, y: np.ndarray) -> np.ndarray:
+    return a * np.float64(x) + b * np.float64(y)
+
+
+def vector_scale_rows(d: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """diag(d) x with d (N,), x (N,) or (N, k)."""
+    return (np.float64(d) * np.float64(x).T).T
+
+
+def vector_dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """<x_c, y_c> of every column c, (k,)."""
+    return np.atleast_1d(np.sum(np.float64(x) * np.float64(y), axis=0))
+
+
+def vector_triad(a: float, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    return vector_axpby(a, b, 1.0, c)
+
+
+def gamma(roundings: float) -> float:
+    """Relative error of that many roundings in a row.
+
+    Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., lemma 3.1.
+    """
+    return roundings * UNIT / (1.0 - roundings * UNIT)
+
+
+def product_error(
+    matrix: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
+) -> np.ndarray:
+    """Largest error of float32 in each value of out = scale * (A x) + add, in whatever order it sums.
+
+    A sum of n products passes through n roundings at most, `scale` and `add` bring two each and a composed
+    operator a few more: gamma_(n + 8) (|scale| |A| |x| + |add|), Higham, section 3.5.
+    """
+    magnitude = abs(scale) * (np.abs(np.float64(matrix)) @ np.abs(np.float64(x)))
+    if add is not None:
+        magnitude = magnitude + np.abs(add)
+    return gamma(matrix.shape[1] + 8) * magnitude
+
+
+def dot_error(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Largest error of float32 in `vector_dot` by trees, (k,).
+
+    Each work-item sums its rows in turn, then two trees add up the items and the groups: the number of
+    roundings a product passes through grows with rows / 4096, not with rows.
+    """
+    roundings = np.ceil(len(x) / _LEAVES) + 2 * np.log2(_LEAVES) + 2
+    return gamma(roundings) * vector_dot(np.abs(x), np.abs(y))

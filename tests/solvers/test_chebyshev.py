@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Chebyshev with the free bounds: every albedo below one, in no more products than theory says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl import theory
+from ltcl.errors import ConvergenceError, InputError
+from ltcl.operators import Dense, IdentityPlus
+from ltcl.solvers import Status
+from tests.problems import enclosure, lambertian, residual
+
+random = np.random.default_rng(8)
+
+
+@pytest.mark.parametrize("rtol", [1e-2, 1e-4])
+@pytest.mark.parametrize("rho", [0.5, 1.5, 4.0, 9.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_closed_room_takes_no_more_products_than_the_bound(device, seed, rho, rtol):
+    """S is symmetric with spectrum in [1 / (1 + m), 1 + rho], so the bound on the residual is strict."""
+    scene = enclosure(40, rho / (1 + rho), seed)
+    S, b = IdentityPlus(Dense(device, scene.R)), random.normal(size=(scene.n, 3))
+    s = ltcl.solve(S, b, "chebyshev", rtol=rtol)
+    assert residual(scene.S, s.x, b) <= rtol * (1 + 1e-3)
+    assert s.products <= theory.chebyshev_products(0.5, 1 + rho, rtol) + 1  # one for rounding at the edge
+    if rho == 4.0 and rtol == 1e-2:
+        assert s.products <= 8
+
+
+@pytest.mark.parametrize("rho", [1.5, 4.0, 9.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_so_does_any_diffuse_scene(device, seed, rho):
+    scene = lambertian(40, rho, seed)
+    S = IdentityPlus(Dense(device, scene.R))
+    b = scene.S @ random.uniform(0.0, 1.0, scene.n)
+    s = ltcl.solve(S, b, "chebyshev", rtol=1e-2)
+    assert residual(scene.S, s.x, b) <= 1e-2 * (1 + 1e-3)
+    assert s.products <= theory.chebyshev_products(*theory.free_bounds(S), 1e-2) + 1
+
+
+def test_the_forward_dual_has_bounds_of_its_own(device):
+    """I - A of a closed room of albedo m has its spectrum in [1 - m, 1 + m]."""
+    scene = enclosure(30, 0.8)
+    forward, b = IdentityPlus(Dense(device, scene.A), sign=-1), random.uniform(0.0, 1.0, scene.n)
+    assert theory.free_bounds(forward) == pytest.approx((0.2, 1.8), rel=1e-5)
+    s = ltcl.solve(forward, b, "chebyshev", rtol=1e-4)
+    np.testing.assert_allclose(s.x, scene.S @ b, rtol=1e-3)
+
+
+def test_true_bounds_help(device):
+    scene = enclosure(30, 0.9)
+    S, b = IdentityPlus(Dense(device, scene.R)), random.normal(size=scene.n)
+    spectrum = np.linalg.eigvalsh(scene.S)
+    b -= b.mean()  # nothing of the dominant eigenvector, whose eigenvalue is ten times the next
+    free = ltcl.solve(S, b, "chebyshev", rtol=1e-3)
+    tight = ltcl.solve(S, b, "chebyshev", rtol=1e-3, bounds=(spectrum[0], spectrum[-2]))
+    assert tight.products < free.products
+    assert tight.products <= theory.chebyshev_products(spectrum[0], spectrum[-2], 1e-3) + 1
+
+
+def test_one_point_spectrum_is_met_at_once(device):
+    s = ltcl.solve(np.eye(5) * 3.0, np.ones(5), "chebyshev", bounds=(3.0, 3.0), rtol=1e-5)
+    assert s.iterations == 1
+    np.testing.assert_allclose(s.x, 1 / 3, rtol=1e-6)
+
+
+def test_bounds_that_leave_out_the_spectrum_are_noticed(device):
+    scene = enclosure(30, 0.8)
+    with pytest.raises(ConvergenceError) as caught:
+        ltcl.solve(IdentityPlus(Dense(device, scene.R)), np.ones(30), "chebyshev", bounds=(0.5, 1.0))
+    assert caught.value.solution.status is Status.DIVERGED
+
+
+@pytest.mark.parametrize(
+    "bounds", [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0,), 3.0, "ab", (0.5, np.inf), (np.nan, 1.0), (1.0, "b")]
+)
+def test_unusable_bounds_are_refused(bounds):
+    with pytest.raises(InputError, match="bounds"):
+        ltcl.solve(np.eye(3), np.ones(3), "chebyshev", bounds=bounds)

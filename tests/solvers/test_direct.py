@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The reference: float64, factors kept as long as their operator, singular systems named as such."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl.errors import ConvergenceError
+from ltcl.operators import Dense, IdentityPlus, as_operator
+from ltcl.solvers import Status, direct
+from tests.problems import lambertian, residual
+
+random = np.random.default_rng(9)
+SINGULAR = {
+    "to the bit": np.array([[1.0, 2.0], [2.0, 4.0]]),
+    "a zero row": np.diag([1.0, 0.0, 1.0]),
+    "to rounding": np.arange(36.0).reshape(6, 6),
+}
+
+
+@pytest.mark.parametrize("rho", [0.5, 4.0, 50.0])
+def test_it_is_exact(device, rho):
+    scene = lambertian(60, rho)
+    R = scene.R.astype(np.float32).astype(np.float64)  # what the device holds
+    b = random.uniform(0.0, 1.0, (60, 4))
+    s = ltcl.solve(IdentityPlus(Dense(device, R)), b, "direct", rtol=1e-12)
+    assert s.x.dtype == np.float64
+    assert residual(np.eye(60) + R, s.x, b) <= 1e-12
+    assert (s.iterations, s.products) == (1, 0)
+
+
+@pytest.mark.parametrize("matrix", SINGULAR.values(), ids=SINGULAR.keys())
+@pytest.mark.parametrize("method", ["direct", "auto"])
+def test_a_singular_system_breaks_down(device, method, matrix):
+    b = random.uniform(0.5, 1.0, len(matrix))
+    with pytest.raises(ConvergenceError, match="the system is singular") as caught:
+        ltcl.solve(as_operator(matrix, device), b, method)
+    assert caught.value.solution.status is Status.BREAKDOWN
+    assert caught.value.solution.x.shape == b.shape
+    assert not ltcl.solve(as_operator(matrix, device), b, method, throw=False).converged
+
+
+def test_factors_live_as_long_as_their_operator(device):
+    S = as_operator(np.eye(3) + 0.1, device)
+    ltcl.solve(S, np.ones(3), "direct")
+    assert direct._factorize(S) is direct._factorize(S)
+    gc.collect()
+    before = len(direct._factors)
+    del S
+    gc.collect()
+    assert len(direct._factors) == before - 1
+
+
+def test_a_tolerance_below_float64_is_not_claimed(device):
+    s = ltcl.solve(as_operator(lambertian(60, 4.0).S, device), np.ones(60), "direct", rtol=1e-30, throw=False)
+    assert s.status is Status.STAGNATED

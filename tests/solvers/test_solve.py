@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`solve`: every method on every operator, and the bad input that all methods refuse alike."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+from scipy.sparse.linalg import aslinearoperator
+
+import ltcl
+from ltcl.errors import InputError, InputTypeError, LtclError
+from ltcl.operators import CSR, Dense, Host, IdentityPlus, as_operator
+from tests.problems import lambertian, residual
+
+METHODS = ("jacobi", "neumann", "chebyshev", "direct", "auto")
+OPERATORS = {
+    "dense": lambda device, S: Dense(device, S),
+    "csr": lambda device, S: CSR(device, scipy.sparse.csr_array(S)),
+    "host": lambda device, S: Host(device, aslinearoperator(S)),
+    "identity plus dense": lambda device, S: IdentityPlus(Dense(device, S - np.eye(len(S)))),
+    "identity plus csr": lambda device, S: IdentityPlus(CSR(device, scipy.sparse.csr_array(S - np.eye(len(S))))),
+    "identity minus": lambda device, S: IdentityPlus(Dense(device, np.eye(len(S)) - S), sign=-1),
+    "identity minus host": lambda device, S: IdentityPlus(
+        Host(device, aslinearoperator(np.eye(len(S)) - S)), sign=-1
+    ),
+}
+SCENE = lambertian(43, rho=0.6, density=0.7)
+DUALS = {"inverse": SCENE.S, "forward": np.eye(SCENE.n) - SCENE.A}
+random = np.random.default_rng(1)
+
+
+@pytest.mark.parametrize("columns", [(), (1,), (5,)])
+@pytest.mark.parametrize("dual", DUALS)
+@pytest.mark.parametrize("operator", OPERATORS)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_on_every_operator(device, method, operator, dual, columns):
+    """S^-1 removes all bounces and (I - A)^-1 adds them: the same call (eq. 4 and 7)."""
+    S, b = DUALS[dual], random.uniform(0.0, 1.0, (SCENE.n, *columns))
+    s = ltcl.solve(OPERATORS[operator](device, S), b, method, rtol=1e-4)
+    assert s.converged
+    assert s.x.shape == b.shape
+    assert residual(S, s.x, b) <= 1e-4 * (1 + 1e-3)  # confirmed in float64; the slack is float32 rounding of S
+    exact = np.linalg.solve(S, b)
+    assert np.linalg.norm(s.x - exact) <= 1e-4 * np.linalg.cond(S) * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_dual_undoes_the_solve(device, method):
+    l_d = random.uniform(0.0, 1.0, SCENE.n)
+    l_out = ltcl.solve(as_operator(DUALS["forward"], device), l_d, method, rtol=1e-5).x
+    back = ltcl.solve(as_operator(DUALS["inverse"], device), l_out, method, rtol=1e-5).x
+    np.testing.assert_allclose(l_out, SCENE.S @ l_d, rtol=0, atol=1e-4 * np.abs(l_out).max())
+    np.testing.assert_allclose(back, l_d, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("scale", [1e-30, 1e-25, 1.0, 1e25])
+def test_units_of_light_do_not_matter(device, method, scale):
+    """Squares of these values leave float32; each column keeps its own tolerance."""
+    b = random.uniform(0.5, 1.0, (SCENE.n, 3)) * (1.0, 1e-5, 1e5) * scale
+    s = ltcl.solve(as_operator(SCENE.S, device), b, method, rtol=1e-4)
+    assert residual(SCENE.S, s.x.astype(np.float64) / scale, b / scale) <= 1e-4 * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1.0, 1e20])
+@pytest.mark.parametrize("method", METHODS)
+def test_atol_is_absolute(device, method, scale):
+    b = random.uniform(0.5, 1.0, SCENE.n) * scale
+    s = ltcl.solve(as_operator(SCENE.S, device), b, method, rtol=0.0, atol=1e-3 * scale)
+    left = b / scale - SCENE.S @ (s.x.astype(np.float64) / scale)
+    assert np.linalg.norm(left) <= 1e-3 * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_light_needs_no_iteration(device, method):
+    s = ltcl.solve(as_operator(SCENE.S, device), np.zeros((SCENE.n, 2)), method)
+    assert s.converged
+    assert not s.x.any()
+    assert s.residual == 0.0
+    assert method in ("direct", "auto") or s.iterations == 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_dark_column_does_not_disturb_the_others(device, method):
+    b = random.uniform(0.5, 1.0, (SCENE.n, 3)) * (1.0, 0.0, 1.0)
+    s = ltcl.solve(as_operator(SCENE.S, device), b, method, rtol=1e-4)
+    assert not s.x[:, 1].any()
+    assert residual(SCENE.S, s.x, b) <= 1e-4 * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("method", ["jacobi", "neumann", "chebyshev"])
+def test_a_start_at_the_solution_ends_there(device, method):
+    b = random.uniform(0.0, 1.0, (SCENE.n, 5))
+    exact = np.linalg.solve(SCENE.S, b)
+    s = ltcl.solve(as_operator(SCENE.S, device), b, method, x0=exact, rtol=1e-4)
+    assert s.converged
+    assert s.iterations == 0
+    np.testing.assert_array_equal(s.x, exact.astype(np.float32))
+
+
+@pytest.mark.parametrize("method", ["jacobi", "neumann", "chebyshev"])
+def test_any_start_leads_to_the_solution(device, method):
+    b = random.uniform(0.0, 1.0, SCENE.n)
+    s = ltcl.solve(as_operator(SCENE.S, device), b, method, x0=random.normal(size=SCENE.n), rtol=1e-4)
+    assert residual(SCENE.S, s.x, b) <= 1e-4 * (1 + 1e-3)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_callback_sees_the_history(device, method):
+    seen = []
+    b = random.uniform(0.0, 1.0, SCENE.n)
+    s = ltcl.solve(as_operator(SCENE.S, device), b, method, callback=lambda *step: seen.append(step))
+    assert [iteration for iteration, _ in seen] == list(range(s.iterations + 1))
+    assert tuple(value for _, value in seen) == s.residuals
+    assert seen[0][1] == pytest.approx(1.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("b", [[1, 2, 3], (1.0, 2.0, 3.0), np.arange(3, dtype=np.uint8), np.ones(3, bool)])
+@pytest.mark.parametrize("method", METHODS)
+def test_any_real_numbers_will_do(device, method, b):
+    S = [[1.0, 0.2, 0.0], [0.1, 1.0, 0.2], [0.0, 0.1, 1.0]]
+    s = ltcl.solve(as_operator(S, device), b, method, rtol=1e-4)
+    np.testing.assert_allclose(s.x, np.linalg.solve(S, np.array(b, float)), atol=1e-3)
+
+
+def test_a_solution_speaks(device):
+    b = random.uniform(0.0, 1.0, SCENE.n)
+    s = ltcl.solve(as_operator(SCENE.S, device), b, "jacobi")
+    assert s.method == "jacobi"
+    assert s.seconds > 0.0
+    assert str(s).startswith(f"jacobi: converged after {s.iterations} iterations, {s.products} products")
+    assert "\n" not in str(s)
+
+
+# Bad input: (arguments, error, what the message must name and say).
+
+N = 4
+BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
+    "S is not square": ({"S": np.ones((N, 3))}, InputError, r"S has shape \(4, 3\); it must be square"),
+    "S is a vector": ({"S": np.ones(N)}, InputError, r"S has shape \(4,\); it must be square"),
+    "S is complex": ({"S": np.eye(N) * 1j}, InputTypeError, "matrix holds complex128"),
+    "S has NaN": ({"S": np.full((N, N), np.nan)}, InputError, "matrix has 16 NaN or infinite value"),
+    "b is short": ({"b": np.ones(3)}, InputError, r"b has shape \(3,\); it must be \(4,\) or \(4, k\)"),
+    "b is a picture": ({"b": np.ones((N, 1, 1))}, InputError, r"b has shape \(4, 1, 1\)"),
+    "b is empty": ({"b": np.ones((N, 0))}, InputError, r"b has shape \(4, 0\)"),
+    "b is a number": ({"b": 1.0}, InputError, r"b has shape \(\)"),
+    "b has NaN": ({"b": [1, 2, np.nan, 4]}, InputError, "b has 1 NaN or infinite value"),
+    "b has Inf": ({"b": [1, 2, 3, np.inf]}, InputError, "b has 1 NaN or infinite value"),
+    "b is text": ({"b": "light"}, InputTypeError, "b holds <U5; it must hold real numbers"),
+    "b is beyond float32": ({"b": np.full(N, 1e39)}, InputError, "b reaches 1e\\+39"),
+    "rtol is zero": ({"rtol": 0.0}, InputError, "rtol and atol are both 0"),
+    "rtol is negative": ({"rtol": -0.1}, InputError, "rtol is -0.1; it must be .*at least 0"),
+    "rtol is one": ({"rtol": 1.0}, InputError, "rtol is 1.0; it must be .*below 1"),
+    "rtol is NaN": ({"rtol": np.nan}, InputError, "rtol is nan"),
+    "rtol is text": ({"rtol": "small"}, InputError, "rtol is 'small'"),
+    "atol is negative": ({"atol": -1.0}, InputError, "atol is -1.0"),
+    "maxiter is zero": ({"maxiter": 0}, InputError, "maxiter is 0; it must be a whole number of at least 1"),
+    "maxiter is a fraction": ({"maxiter": 2.5}, InputError, "maxiter is 2.5"),
+    "x0 is short": ({"x0": np.ones(3)}, InputError, r"x0 has shape \(3,\); it must be \(4,\)"),
+    "x0 has NaN": ({"x0": [np.nan] * N}, InputError, "x0 has 4 NaN or infinite value"),
+    "unknown option": ({"samples": 3}, InputTypeError, "unknown option 'samples'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("method", METHODS)
+def test_bad_input_is_refused_by_name(device, method, case):
+    change, error, says = BAD[case]
+    arguments: dict[str, Any] = {"S": np.eye(N), "b": np.ones(N), "method": method} | change
+    with pytest.raises(error, match=says) as caught:
+        ltcl.solve(**arguments)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("method", ["gauss", "", None, 3])
+def test_an_unknown_method_is_refused_with_those_there_are(method):
+    with pytest.raises(InputError, match="method is .*; it must be one of jacobi, neumann, chebyshev, direct, auto"):
+        ltcl.solve(np.eye(N), np.ones(N), method)
+
+
+def test_bad_input_is_refused_before_the_matrix_goes_to_a_device(monkeypatch):
+    """`as_operator` is what uploads."""
+    module = importlib.import_module("ltcl.solvers.solve")  # the package's attribute of this name is the function
+    monkeypatch.setattr(module, "as_operator", lambda S: pytest.fail("uploaded"))
+    for change, error, says in BAD.values():
+        if "matrix" in says:  # checked by the operator itself
+            continue
+        for method in METHODS:
+            with pytest.raises(error, match=says):
+                ltcl.solve(**({"S": np.eye(N), "b": np.ones(N), "method": method} | change))

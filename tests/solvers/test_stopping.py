@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One stopping rule: what is claimed was computed from x itself, and no failure comes back quietly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl.errors import ConvergenceError, LtclError
+from ltcl.operators import Dense, IdentityPlus
+from ltcl.solvers import Status
+from tests.problems import lambertian, residual
+
+ITERATIVE = ("jacobi", "neumann", "chebyshev")
+random = np.random.default_rng(10)
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+@pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
+@pytest.mark.parametrize("rho", [0.1, 0.9])
+def test_converged_is_true_of_x(device, method, rtol, rho):
+    scene = lambertian(64, rho, seed=11)
+    b = random.uniform(0.0, 1.0, (64, 5)) * np.logspace(-4, 4, 5)
+    s = ltcl.solve(IdentityPlus(Dense(device, scene.R)), b, method, rtol=rtol)
+    assert s.converged
+    assert residual(scene.S, s.x, b) <= rtol * (1 + 1e-3) + 2**-22
+    assert s.residual <= rtol
+    assert all(value > rtol for value in s.residuals[:-1])
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_maxiter_ends_it_with_the_best_iterate(device, method):
+    scene = lambertian(64, 0.9, seed=12)
+    S, b = IdentityPlus(Dense(device, scene.R)), random.uniform(0.0, 1.0, 64)
+    with pytest.raises(ConvergenceError, match="maxiter was reached") as caught:
+        ltcl.solve(S, b, method, rtol=1e-6, maxiter=3)
+    s = caught.value.solution
+    assert s.status is Status.MAXITER
+    assert s.iterations == 3
+    assert len(s.residuals) == 4
+    assert residual(scene.S, s.x, b) == pytest.approx(min(s.residuals), rel=1e-2)
+    assert isinstance(caught.value, (LtclError, ArithmeticError))
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_below_the_floor_of_float32_it_stagnates(device, method):
+    scene = lambertian(64, 0.5, seed=13)
+    b = random.uniform(0.0, 1.0, 64)
+    s = ltcl.solve(IdentityPlus(Dense(device, scene.R)), b, method, rtol=1e-10, throw=False)
+    assert s.status is Status.STAGNATED
+    assert s.iterations < 200
+    assert residual(scene.S, s.x, b) < 1e-5
+    with pytest.raises(ConvergenceError, match="loosen rtol or try method='direct'"):
+        ltcl.solve(IdentityPlus(Dense(device, scene.R)), b, method, rtol=1e-10)
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_overflow_is_divergence(device, method):
+    """Products that leave float32 give Inf or NaN, which no comparison may take for small."""
+    S = np.eye(8) + np.full((8, 8), 1e30)
+    s = ltcl.solve(S, np.ones(8), method, throw=False)
+    assert s.status is Status.DIVERGED
+    assert np.isfinite(s.x).all()
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_an_error_in_the_callback_reaches_the_user(device, method):
+    def stop(iteration: int, value: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ltcl.solve(np.eye(4) + 0.1, np.ones(4), method, callback=stop)
