@@ -33,7 +33,7 @@ def relight(T: Transport, pattern: Any) -> np.ndarray:
     --------
     >>> import ltcl, numpy
     >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
-    >>> ltcl.relight(T, numpy.array([[1.0, 1.0]])).round(2).tolist()
-    [[0.6, 0.6]]
+    >>> print(ltcl.relight(T, numpy.array([[1.0, 1.0]])))
+    [[0.6 0.6]]
     """
     return T @ pattern

@@ -77,7 +77,7 @@ def separate(
 
     Examples
     --------
-    >>> import ltcl
+    >>> import ltcl, numpy
     >>> scene = ltcl.scenes.dihedral(4, albedo=0.5)
     >>> T = scene.transport(first_bounce=scene.first_bounce)
     >>> b = ltcl.separate(T, T @ numpy.ones(T.grid), bounces=2)

@@ -94,7 +94,7 @@ def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., section 6.11).
 
     >>> chebyshev_products(0.5, 5.0, 1e-2)
-    8
+    9
     """
     if upper <= lower:
         return 1

@@ -38,7 +38,8 @@ class Solution:
     status : Status
     iterations : int
     products : int
-        Products with S, all included.
+        Products with S, those for checks included; not the one that finds the free bounds of an operator,
+        which is made once in its life.
     residuals : tuple of float
         ``||b - S x|| / ||b||`` before each iteration and at the end; the largest over right-hand sides.
     seconds : float

