@@ -59,12 +59,16 @@ class Analysis:
     channels: tuple[ChannelAnalysis, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, lists and dicts for JSON; infinite products are None."""
+        """Plain numbers, lists and dicts for JSON; infinite products and unknown norms are None."""
         report = dataclasses.asdict(self)
         for channel in report["channels"]:
-            channel["products"] = {
-                name: None if np.isinf(count) else count for name, count in channel["products"].items()
-            }
+            for values in (channel, channel["products"]):
+                nothing = [
+                    name
+                    for name, value in values.items()
+                    if isinstance(value, float) and not np.isfinite(value)
+                ]
+                values.update(dict.fromkeys(nothing))
         return report
 
 

@@ -54,7 +54,7 @@ def grid(name: str, value: Any, pixels: int | None = None) -> tuple[int, int]:
     try:
         h, w = (int(v) for v in value)
         whole = (h, w) == tuple(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # the last of infinity
         h = w = 0
         whole = False
     if not whole or h < 1 or w < 1:
@@ -109,11 +109,20 @@ def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
     A compressed matrix is checked as it stands, before SciPy touches it: SciPy itself accepts
     column indices beyond the matrix, and its conversions then read outside their arrays.
     """
+    if not scipy.sparse.issparse(matrix):
+        raise InputTypeError(
+            f"{name} is a {type(matrix).__name__}; it must be a scipy.sparse matrix or array"
+        )
+    if matrix.ndim != 2:
+        raise InputError(f"{name} has shape {matrix.shape}; it must be (M, N)")
+    real(name, np.zeros(0, matrix.dtype))
     if matrix.format in ("csr", "csc"):
         major, minor = matrix.shape if matrix.format == "csr" else matrix.shape[::-1]
         compressed(name, matrix.indptr, matrix.indices, matrix.data, (major, minor))
-    real(name, matrix.data if hasattr(matrix, "data") else np.zeros(0, matrix.dtype))
-    result = scipy.sparse.csr_array(matrix)
+        result = scipy.sparse.csr_array(matrix)
+    else:
+        result = scipy.sparse.csr_array(matrix)
+        compressed(name, result.indptr, result.indices, result.data, matrix.shape)
     if not result.has_canonical_format:
         result = result.copy()
         result.sum_duplicates()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -103,7 +103,7 @@ def contact_sheet(sheet: Sheet, width: int = 1600) -> Figure:
     margin, gap = 40, 26
     inner = width - 2 * margin
     rows = [
-        _Row(sheet.large, (inner - 2 * gap) // 3, 132),
+        _Row(sheet.large, (inner - 2 * gap) // 3, 164),
         _Row(sheet.medium, round(0.236 * inner), 0),
         _Row(sheet.small, (inner - (len(sheet.small) - 1) * gap) // max(1, len(sheet.small)), 0),
     ]
@@ -111,8 +111,8 @@ def contact_sheet(sheet: Sheet, width: int = 1600) -> Figure:
     for row in rows[:2]:
         tops.append(tops[-1] + row.height + 74)
     figure = _figure(width, tops[-1] + rows[-1].height + 30)
-    _heading(figure, margin, 30, sheet.title, 25)
-    _text(figure, margin, 77, sheet.subtitle, size=14.5, color=_FAINT)
+    _heading(figure, margin, 32, sheet.title, 26)
+    _text(figure, margin, 82, sheet.subtitle, size=15, color=_FAINT)
     for row, top in zip(rows, tops, strict=True):
         for place, panel in enumerate(row.panels):
             _draw_panel(figure, panel, margin + place * (row.width + gap), top, row)
@@ -183,10 +183,20 @@ def _axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
 
 def _draw_panel(figure: Figure, panel: Panel, left: int, top: int, row: _Row) -> None:
     height = round(row.width * panel.image.shape[0] / panel.image.shape[1])
-    size = 16 if row.width > 400 else 12.5
+    size = 17 if row.width > 400 else 13.5
     line = top - 10
     _text(figure, left, line, panel.label, size=size, fontweight="bold", va="bottom")
-    _text(figure, left + row.width, line, panel.note, size=size, color=_FAINT, va="bottom", ha="right")
+    # Pictures rarely fill their corners: the note keeps away from the next panel's label.
+    _text(
+        figure,
+        left + 0.96 * row.width,
+        line,
+        panel.note,
+        size=size - 1,
+        color=_FAINT,
+        va="bottom",
+        ha="right",
+    )
     axes = _axes(figure, (left, top, row.width, height))
     axes.imshow(_display(panel.image, (height, row.width)), interpolation="none", aspect="auto")
     axes.axis("off")
@@ -202,7 +212,7 @@ def _display(image: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
 
 def _draw_plot(figure: Figure, sheet: Sheet, box: tuple[int, int, int, int]) -> None:
     left, top, width, height = box
-    _text(figure, left + 70, top - 10, sheet.plot_title, size=12.5, fontweight="bold", va="bottom")
+    _text(figure, left + 70, top - 10, sheet.plot_title, size=13.5, fontweight="bold", va="bottom")
     axes = _axes(figure, (left + 70, top, width - 70 - 118, height - 50))
     _draw_convergence(axes, sheet.solutions, sheet.rtol)
 
@@ -212,20 +222,24 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
     if not solutions:
         raise InputError("solutions is empty; there must be at least one to draw")
     _dress(axes)
-    axes.axhline(rtol, color=_FAINT, lw=1.2, ls=(0, (4, 4)))
     products = max([1, *(solution.products for solution in solutions.values())])
     axes.set_xlim(0, products)
+    curves = {name: _curve(solution, products) for name, solution in solutions.items()}
+    values = np.concatenate([y for _, y in curves.values()])
+    limits = min(float(values.min()), rtol) / 2, max(2.0, 2 * float(values.max()))
+    axes.set_ylim(*limits)
+    axes.plot([0, products], [rtol, rtol], color=_FAINT, lw=1.2, ls=(0, (4, 4)))
     axes.text(0.99 * products, rtol, "tolerance", color=_FAINT, fontsize=11, va="bottom", ha="right")
     others, ends = iter(_OTHERS * len(solutions)), []
-    for k, (name, solution) in enumerate(solutions.items()):
+    for name, (x, y) in curves.items():
         colour = _COLOURS.get(name) or next(others)
-        x, y = _curve(solution, products)
-        # A second curve on top of a first one must leave it visible.
-        axes.plot(x, y, color=colour, lw=2.6, ls="-" if k % 2 == 0 else (0, (3, 2.5)), clip_on=False)
-        ends.append((name, colour, float(y[-1])))
-    axes.set_ylim(*_limits(axes))
-    for name, colour, y in _apart(ends, axes.get_ylim()):
-        axes.text(1.025 * products, y, name, color=colour, fontsize=12, va="center", fontweight="bold")
+        # Neumann runs on top of Jacobi, which must stay visible.
+        axes.plot(x, y, color=colour, lw=2.6, ls=(0, (2, 2)) if name == "neumann" else "-", clip_on=False)
+        label = name if solutions[name].residual >= _LOWEST else f"{name} \u2193"
+        ends.append(_End(label, colour, float(x[-1]), float(y[-1])))
+    for end in _apart(ends, limits):
+        x = end.x + 0.025 * products
+        axes.text(x, end.y, end.name, color=end.colour, fontsize=12, va="center", fontweight="bold")
 
 
 def _dress(axes: Axes) -> None:
@@ -252,18 +266,21 @@ def _curve(solution: Solution, products: int) -> tuple[np.ndarray, np.ndarray]:
     return np.linspace(0, max(solution.products, 1), len(y)), np.maximum(y, _LOWEST)
 
 
-def _limits(axes: Axes) -> tuple[float, float]:
-    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.get_lines()])
-    return values.min() / 2, max(2.0, 2 * values.max())
+@dataclass(frozen=True)
+class _End:
+    """Where a curve ends and its name is written."""
+
+    name: str
+    colour: str
+    x: float
+    y: float
 
 
-def _apart(
-    ends: Sequence[tuple[str, str, float]], limits: tuple[float, float]
-) -> list[tuple[str, str, float]]:
-    """Heights of the labels at the ends of curves, moved up just enough not to touch."""
+def _apart(ends: Sequence[_End], limits: tuple[float, float]) -> list[_End]:
+    """The ends of curves from below, moved up just enough that their names do not touch."""
     low, high = np.log(limits)
-    step, taken, placed = 0.075 * (high - low), -np.inf, []
-    for name, colour, y in sorted(ends, key=lambda end: end[2]):
-        taken = max(float(np.log(y)), taken + step)
-        placed.append((name, colour, float(np.exp(taken))))
+    taken, placed = -np.inf, []
+    for end in sorted(ends, key=lambda end: end.y):
+        taken = max(float(np.log(end.y)), taken + 0.075 * (high - low))
+        placed.append(replace(end, y=float(np.exp(taken))))
     return placed

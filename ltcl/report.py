@@ -9,7 +9,6 @@ import json
 import math
 import os
 import platform
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,8 @@ from ltcl.solvers import Solution
 def plain(value: Any) -> Any:
     """`value` in the types that JSON knows; numbers that are not finite become None.
 
-    >>> plain({"rho": np.float32(0.5), "products": float("inf"), "grid": (4, 5), "at": Path("a")})
-    {'rho': 0.5, 'products': None, 'grid': [4, 5], 'at': 'a'}
+    >>> plain({"rho": np.float32(0.5), "products": float("inf"), "grid": (4, 5)})
+    {'rho': 0.5, 'products': None, 'grid': [4, 5]}
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)

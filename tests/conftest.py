@@ -10,9 +10,11 @@ import pytest
 
 import ltcl
 from ltcl.device import Device
+from ltcl.device.device import SPARE_BYTES
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SMALL = 4096  # bytes: a 53 x 53 matrix takes several slabs, its vectors still fit
+ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -65,7 +65,7 @@ def _some_empty() -> scipy.sparse.csr_array:
 
 
 SPARSE = {
-    "1x1": scipy.sparse.csr_array(np.float32([[0.5]])),
+    "1x1": scipy.sparse.csr_array(np.array([[0.5]], np.float32)),
     "53x7": sparse(53, 7),
     "7x53": sparse(7, 53),
     "129x129": sparse(129, 129, 0.1),
@@ -76,7 +76,7 @@ SPARSE = {
 }
 
 DENSE = {
-    "1x1": np.float32([[0.5]]),
+    "1x1": np.array([[0.5]], np.float32),
     "53x7": signed(53, 7),
     "7x53": signed(7, 53),
     "1x300": signed(1, 300),

@@ -6,6 +6,8 @@ A twin is named after its kernel; the `_stream` and `_group` variants of a kerne
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 UNIT = 2.0**-24  # largest relative error of rounding to float32
@@ -21,8 +23,8 @@ def csr_matvec(
     add: np.ndarray | None = None,
 ) -> np.ndarray:
     """out = scale * (A x) + add, row by row; x is (N,) or (N, k)."""
-    x, values = np.float64(x), np.float64(values)
-    rows = zip(pointers[:-1], pointers[1:], strict=True)
+    x, values = np.asarray(x, np.float64), np.asarray(values, np.float64)
+    rows = itertools.pairwise(pointers)
     out = scale * np.array([values[start:stop] @ x[columns[start:stop]] for start, stop in rows])
     return out if add is None else out + add
 
@@ -31,7 +33,7 @@ def dense_matvec(
     matrix: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
 ) -> np.ndarray:
     """out = scale * (A x) + add."""
-    out = scale * (np.float64(matrix) @ np.float64(x))
+    out = scale * (np.asarray(matrix, np.float64) @ np.asarray(x, np.float64))
     return out if add is None else out + add
 
 
@@ -47,17 +49,17 @@ def vector_fill(count: int, value: float) -> np.ndarray:
 
 
 def vector_axpby(a: float, x: np.ndarray, b: float, y: np.ndarray) -> np.ndarray:
-    return a * np.float64(x) + b * np.float64(y)
+    return a * np.asarray(x, np.float64) + b * np.asarray(y, np.float64)
 
 
 def vector_scale_rows(d: np.ndarray, x: np.ndarray) -> np.ndarray:
     """diag(d) x with d (N,), x (N,) or (N, k)."""
-    return (np.float64(d) * np.float64(x).T).T
+    return (np.asarray(d, np.float64) * np.asarray(x, np.float64).T).T
 
 
 def vector_dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """<x_c, y_c> of every column c, (k,)."""
-    return np.atleast_1d(np.sum(np.float64(x) * np.float64(y), axis=0))
+    return np.atleast_1d(np.sum(np.asarray(x, np.float64) * np.asarray(y, np.float64), axis=0))
 
 
 def vector_triad(a: float, b: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -80,7 +82,7 @@ def product_error(
     A sum of n products passes through n roundings at most, `scale` and `add` bring two each and a composed
     operator a few more: gamma_(n + 8) (|scale| |A| |x| + |add|), Higham, section 3.5.
     """
-    magnitude = abs(scale) * (np.abs(np.float64(matrix)) @ np.abs(np.float64(x)))
+    magnitude = abs(scale) * (np.abs(np.asarray(matrix, np.float64)) @ np.abs(np.asarray(x, np.float64)))
     if add is not None:
         magnitude = magnitude + np.abs(add)
     return gamma(matrix.shape[1] + 8) * magnitude

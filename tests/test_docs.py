@@ -11,11 +11,8 @@ import pytest
 
 import ltcl
 
-MODULES = ["ltcl"] + sorted(
-    module.name
-    for module in pkgutil.walk_packages(ltcl.__path__, "ltcl.")
-    if not module.name.endswith(".__main__")  # it runs the program
-)
+NAMES = [module.name for module in pkgutil.walk_packages(ltcl.__path__, "ltcl.")]
+MODULES = ["ltcl", *sorted(name for name in NAMES if not name.endswith(".__main__"))]  # that runs the program
 
 
 @pytest.mark.parametrize("name", MODULES)

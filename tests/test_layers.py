@@ -30,8 +30,9 @@ LAYERS: list[set[str]] = [
     {"operators", "layout", "first_bounces"},
     {"theory", "transport"},
     {"solvers"},
-    {"compensation", "separation", "relighting", "analysis", "scenes", "store", "acquisition"},
-    {"plots", "batch", "demo"},
+    {"compensation", "separation", "relighting", "analysis", "scenes", "store", "acquisition", "report"},
+    {"plots"},
+    {"batch", "demo"},
     {"cli"},
     {"__init__", "__main__"},
 ]

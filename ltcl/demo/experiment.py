@@ -105,7 +105,7 @@ def _look(seen: np.ndarray, wanted: np.ndarray) -> Look:
 def _bounced(T: Transport, wanted: np.ndarray) -> np.ndarray:
     """What is seen when the walls' colours are undone but no bounces: T F^-1 target = S target."""
     columns = wanted.reshape(-1, 3).T
-    seen = [S @ column for S, column in zip(T.systems, columns, strict=True)]
+    seen = [np.asarray(S @ column) for S, column in zip(T.systems, columns, strict=True)]
     return np.stack(seen, axis=-1).reshape(wanted.shape)
 
 

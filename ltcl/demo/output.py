@@ -2,7 +2,8 @@
 """The demo's folder: views of the corner, linear pictures on the walls' grid, plots, the report.
 
 Views are exposed to compare: each at the brightness at which it comes closest to the target, bounces at that
-of the uncompensated picture times the factor in their note. The files in ``linear/`` hold the values as they are.
+of the uncompensated picture times the factor in their note. The files in ``linear/`` hold
+the values as they are.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from ltcl import images, plots, report
 from ltcl.demo.experiment import ALBEDO, COLOURS, RTOL, Experiment
 from ltcl.scenes import Scene
 
-_VIEW = 900  # pixels along the longer side
+_VIEW = 800  # pixels along the longer side of a view
 
 
 def write_pictures(found: Experiment, folder: Path) -> None:
@@ -98,7 +99,7 @@ def _linear(found: Experiment) -> dict[str, np.ndarray]:
 
 def _panels(found: Experiment) -> dict[str, plots.Panel]:
     """Every picture as the viewer in front of the corner sees it, by the name of its file."""
-    coverage = found.scene.view(np.ones(found.scene.grid), size=_VIEW)[..., None]
+    coverage = found.scene.view(np.ones(found.scene.grid), size=_VIEW, supersample=2)[..., None]
     linear = _linear(found)
     panels = {}
     for name, (label, note, exposure) in _captions(found).items():
@@ -109,7 +110,7 @@ def _panels(found: Experiment) -> dict[str, plots.Panel]:
 
 def _view(scene: Scene, picture: np.ndarray, coverage: np.ndarray) -> np.ndarray:
     """(H, W, 4): the walls' light, and how much of each pixel they cover."""
-    view = scene.view(picture, size=_VIEW)
+    view = scene.view(picture, size=_VIEW, supersample=2)
     return np.concatenate([view / np.maximum(coverage, 1e-6), coverage], axis=-1)
 
 
@@ -123,7 +124,7 @@ def _captions(found: Experiment) -> dict[str, tuple[str, str, float]]:
     ):
         look = getattr(found, name)
         captions[name] = (label, f"{100 * look.error:.1f} % error", look.exposure)
-    captions["pattern"] = ("Pattern", "projected", 1.0)
+    captions["pattern"] = ("Pattern", "what is projected", 1.0)
     parts = [found.separation.direct, *found.separation.bounces]
     strength = [float(np.linalg.norm(part)) for part in parts]
     for k, part in enumerate(strength):

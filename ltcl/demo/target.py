@@ -55,8 +55,8 @@ def _columns(light: list[np.ndarray]) -> list[np.ndarray]:
 
 def _lost(T: Transport, columns: np.ndarray, light: list[np.ndarray], b: float) -> float:
     """``||S min(x + b y, 0)|| / ||picture + b mist||`` over all colours."""
-    lost = [S @ np.minimum(x @ (1.0, b), 0.0) for S, x in zip(T.systems, light, strict=True)]
-    return float(np.linalg.norm(lost) / np.linalg.norm(columns @ (1.0, b)))
+    lost = [np.asarray(S @ np.minimum(x @ (1.0, b), 0.0)) for S, x in zip(T.systems, light, strict=True)]
+    return float(np.linalg.norm(np.stack(lost)) / np.linalg.norm(columns @ (1.0, b)))
 
 
 def _sunset(height: int = 900) -> np.ndarray:

@@ -55,7 +55,7 @@ class Array:
 
         if values.shape != self.shape:
             raise InputError(f"values have shape {values.shape}; the array on the device has {self.shape}")
-        host = np.ascontiguousarray(values, dtype=self.dtype)
+        host = rounded(values, self.dtype)
         if host.size:
             with failures.translated(f"writing to {self.device.name}"):
                 cl.enqueue_copy(self.device.queue, self.buffer, host)
@@ -79,3 +79,13 @@ class Array:
     def like(self) -> Array:
         """An uninitialised array of the same shape and type."""
         return self.device.empty(self.shape, self.dtype)
+
+
+def rounded(values: Any, dtype: Any) -> np.ndarray:
+    """`values` as a contiguous array of `dtype`; numbers beyond its range are refused, not made infinite."""
+    try:
+        with np.errstate(over="raise"):
+            return np.ascontiguousarray(values, dtype=dtype)
+    except FloatingPointError as error:
+        name, most = np.dtype(dtype).name, np.finfo(dtype).max
+        raise InputError(f"a value is beyond {name}, the largest of which is {most:.3g}; rescale") from error

@@ -30,8 +30,7 @@ def folder() -> Path:
 def make_folder(name: str = "") -> Path:
     """Create the cache folder, or the folder `name` in it, readable by its owner only."""
     path = folder()
-    path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    path.chmod(0o700)
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)  # an existing folder keeps its mode: it is the user's
     if name:
         path = path / name
         path.mkdir(mode=0o700, exist_ok=True)

@@ -27,7 +27,7 @@ class Description:
     @property
     def rank(self) -> tuple:
         """Sort key: GPUs by compute units, CPUs by how new their driver is, the best first."""
-        newest = tuple(-number for number in _version(self.driver))
+        newest = tuple(-number for number in (*_version(self.driver), 0, 0, 0)[:4])
         return (KINDS.index(self.kind), -self.compute_units if self.kind == "gpu" else 0, newest, self.index)
 
 

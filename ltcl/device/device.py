@@ -13,7 +13,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import failures, kernels
-from ltcl.device.array import Array
+from ltcl.device.array import Array, rounded
 from ltcl.device.description import Description
 from ltcl.device.kernels import Kernel
 from ltcl.errors import MemoryLimitError
@@ -58,8 +58,7 @@ class Device:
         self.memory: int = checks.host_memory() if self.is_cpu else self.handle.global_mem_size
         self._programs: dict[tuple[str, tuple[tuple[str, Any], ...]], dict[str, Kernel]] = {}
         self._lock = threading.RLock()
-        self._profile: Profile | None = None
-        self._events: list[tuple[str, Any]] = []
+        self._events: list[tuple[str, Any]] | None = None  # of the launches being profiled
 
     def __repr__(self) -> str:
         return f"<ltcl device {self.description.index} {self.name}, {self.driver}>"
@@ -94,14 +93,16 @@ class Device:
 
     def upload(self, values: Any, dtype: Any = np.float32) -> Array:
         """A copy of `values` on the device, as `dtype`."""
-        host = np.ascontiguousarray(values, dtype=dtype)
+        host = rounded(values, dtype)
         return self.empty(host.shape, dtype).set(host)
 
     def require(self, nbytes: int, what: str) -> None:
         """Refuse, before anything is allocated, `what` that needs more bytes than the device has."""
-        if nbytes > self.memory:
+        # What a host has free changes while a program runs.
+        memory = min(self.memory, checks.host_memory()) if self.is_cpu else self.memory
+        if nbytes > memory:
             raise MemoryLimitError(
-                f"{what} needs {checks.size(nbytes)}, but {self.name} has {checks.size(self.memory)}; "
+                f"{what} needs {checks.size(nbytes)}, but {self.name} has {checks.size(memory)}; "
                 "threshold or compress it, or choose another device"
             )
 
@@ -121,21 +122,24 @@ class Device:
         """Count launches and device seconds of every kernel run inside the block."""
         import pyopencl as cl
 
-        plain, result = self.queue, Profile()
+        outer, result, events = (self.queue, self._events), Profile(), []
         self.finish()
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
-        self._profile, self._events = result, []
+        self._events = events
         try:
             yield result
         finally:
-            self.finish()
-            for name, event in self._events:
+            try:
+                self.finish()
+            finally:
+                self.queue, self._events = outer
+            for name, event in events:
                 result.launches[name] = result.launches.get(name, 0) + 1
                 spent = (event.profile.end - event.profile.start) * 1e-9
                 result.seconds[name] = result.seconds.get(name, 0.0) + spent
-            self.queue, self._profile, self._events = plain, None, []
+                self.record(name, event)  # of a profile around this one, too
 
     def record(self, name: str, event: Any) -> None:
         """Keep the event of a launch while `profile` is active."""
-        if self._profile is not None:
+        if self._events is not None:
             self._events.append((name, event))

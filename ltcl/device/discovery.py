@@ -16,7 +16,7 @@ from typing import Any
 from ltcl.device import trial
 from ltcl.device.description import KINDS, Description, describe
 from ltcl.device.device import Device
-from ltcl.errors import DeviceError
+from ltcl.errors import DeviceError, InputTypeError
 
 _FIXES = {
     "linux": "pip install 'pyopencl[pocl]' (any x86-64 CPU), apt install pocl-opencl-icd (any CPU), "
@@ -86,6 +86,8 @@ def open_device(select: str | Device | None = None) -> Device:
     """
     if isinstance(select, Device):
         return select
+    if not isinstance(select, str | None):
+        raise InputTypeError(f"device is {select!r}; it must be a Device, a name or an index like '0:1'")
     description = choose(list_devices(), select or os.environ.get("LTCL_DEVICE") or None)
     device = _opened.get(description.index)
     if device is None:

@@ -50,7 +50,15 @@ def _compile(device: Device, source: Source, options: list[str]) -> Any:
         # Asking about a program before it is built is pyopencl's documented way past its cache.
         warnings.filterwarnings("ignore", message="Pre-build attribute access")
         program.get_info(cl.program_info.NUM_DEVICES)
-    return program.build(options)
+    return _quietly(program, options)
+
+
+def _quietly(program: Any, options: list[str]) -> Any:
+    import pyopencl as cl
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", cl.CompilerWarning)  # Intel's compiler reports every success
+        return program.build(options)
 
 
 def _compile_and_keep(device: Device, source: Source, options: list[str]) -> Any:
@@ -71,7 +79,7 @@ def _from_binary(device: Device, source: Source, options: list[str]) -> Any:
 
     try:
         binary = _binary(device, source, options).read_bytes()
-        return cl.Program(device.context, [device.handle], [binary]).build(options)
+        return _quietly(cl.Program(device.context, [device.handle], [binary]), options)
     except OSError:
         return None
     except cl.Error as error:

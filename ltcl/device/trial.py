@@ -8,6 +8,8 @@ verdict is remembered until a driver, an OpenCL environment variable or pyopencl
 
 from __future__ import annotations
 
+import atexit
+import functools
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -16,6 +18,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 from ltcl.device import cache
@@ -37,8 +40,15 @@ _PREFIXES = (
 )
 
 
+@functools.cache
 def hide_fatal_drivers() -> list[str]:
-    """Hide drivers that kill their process; returns their `.icd` files. Call before OpenCL is first asked."""
+    """Hide drivers that kill their process; returns their `.icd` files. Call before OpenCL is first asked.
+
+    Done once: the loader reads its settings once, and hiding changes them.
+    """
+    # pyopencl's own caches hold pickles, and it cannot launch a kernel where they cannot be written.
+    os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
+    _let_pocl_cache()
     files = icd_files()
     key = _key(files)
     fatal = cache.recall(_FILE, key)
@@ -47,7 +57,7 @@ def hide_fatal_drivers() -> list[str]:
         cache.remember(_FILE, key, fatal)
     if fatal:
         log.warning("OpenCL drivers left out because they crash when loaded: %s", ", ".join(fatal))
-        _hide([file for file in files if str(file) not in fatal])
+        _hide([file for file in files if str(file) not in fatal], key)
     return fatal
 
 
@@ -99,16 +109,43 @@ def _only(file: Path) -> dict[str, str]:
 
 
 def _empty_folder() -> Path:
-    return cache.make_folder("none")
+    return _folder("none")
 
 
-def _hide(keep: list[Path]) -> None:
-    """Point this process's loader at `keep` only."""
+def _folder(name: str) -> Path:
+    """A folder in the cache, or a temporary one where the cache cannot be written."""
+    try:
+        return cache.make_folder(name)
+    except OSError:
+        return _temporary_folder()
+
+
+def _temporary_folder() -> Path:
+    folder = tempfile.mkdtemp(prefix="ltcl-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def _let_pocl_cache() -> None:
+    """PoCL offers no device at all where it cannot write its kernel cache: give it a temporary one there."""
+    if os.name != "posix" or "POCL_CACHE_DIR" in os.environ:
+        return
+    place = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/", ".cache"))
+    while not place.exists():
+        place = place.parent
+    if not (place.is_dir() and os.access(place, os.W_OK)):
+        os.environ["POCL_CACHE_DIR"] = str(_temporary_folder())
+
+
+def _hide(keep: list[Path], verdict: str) -> None:
+    """Point this process's loader at `keep` only.
+
+    Each verdict has a folder of its own: a child process starts from what its parent hid, and others may
+    read theirs at this moment.
+    """
     import pyopencl  # noqa: F401 - it sets PYOPENCL_HOME when imported; only then can that be taken back
 
-    folder = cache.make_folder("vendors")
-    for old in folder.glob("*.icd"):
-        old.unlink()
+    folder = _folder(f"vendors-{verdict[:16]}")
     bundled = [file for file in keep if file.parent == _home() / ".libs"]
     for file in keep:
         if file not in bundled:
@@ -121,12 +158,19 @@ def _hide(keep: list[Path]) -> None:
 def _key(files: list[Path]) -> str:
     facts = [f"pyopencl {importlib.metadata.version('pyopencl')}"]
     for file in files:
-        # The library named by the file may be replaced by an upgrade while the .icd stays the same.
-        for path in (file, Path(file.read_text(errors="replace").strip())):
-            try:
-                status = path.stat()
-                facts.append(f"{path} {status.st_mtime_ns} {status.st_size}")
-            except OSError:
-                facts.append(f"{path} not a path")
+        facts.append(_stamp(file))
+        try:
+            # The library named by the file may be replaced by an upgrade while the .icd stays the same.
+            facts.append(_stamp(Path(file.read_text(errors="replace").strip())))
+        except OSError:
+            facts.append(f"{file} cannot be read")
     facts += [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(_PREFIXES)]
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()
+
+
+def _stamp(path: Path) -> str:
+    try:
+        status = path.stat()
+        return f"{path} {status.st_mtime_ns} {status.st_size}"
+    except (OSError, ValueError):  # the name of a library to be searched for, or none at all
+        return f"{path} not a path"

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from ltcl.device import cache, sources
-from ltcl.errors import DeviceError
+from ltcl.errors import DeviceError, MemoryLimitError
 
 if TYPE_CHECKING:
     from ltcl.device.device import Device
@@ -43,7 +43,7 @@ def choose(device: Device, file: str, problem: str, variants: Mapping[str, Calla
         return names[0]
     key = "|".join((device.name, device.driver, sources.load(file).digest[:16], problem, ",".join(names)))
     known = cache.recall(_FILE, key)
-    if known in variants:
+    if isinstance(known, str) and known in variants:
         return known
     times = {name: _seconds(device, launch) for name, launch in variants.items()}
     best = min(times, key=times.__getitem__)
@@ -66,6 +66,6 @@ def _seconds(device: Device, launch: Callable[[], None]) -> float:
             device.finish()
             best = min(best, time.perf_counter() - start)
         return best
-    except DeviceError as error:
+    except (DeviceError, MemoryLimitError) as error:  # the latter where a group asks for too many registers
         log.info("a variant failed and is left out: %s", error)
         return float("inf")

@@ -121,16 +121,19 @@ class Operator(scipy.sparse.linalg.LinearOperator):
     # What SciPy asks for: NumPy in, NumPy out.
 
     def _matvec(self, x: np.ndarray) -> np.ndarray:
-        return self.apply(self.device.upload(np.ravel(x))).get()
+        return self.apply(self._upload(np.ravel(x))).get()
 
     def _matmat(self, X: np.ndarray) -> np.ndarray:
-        return self.apply(self.device.upload(X)).get()
+        return self.apply(self._upload(X)).get()
 
     def _rmatvec(self, x: np.ndarray) -> np.ndarray:
-        return self.apply_transpose(self.device.upload(np.ravel(x))).get()
+        return self.apply_transpose(self._upload(np.ravel(x))).get()
 
     def _rmatmat(self, X: np.ndarray) -> np.ndarray:
-        return self.apply_transpose(self.device.upload(X)).get()
+        return self.apply_transpose(self._upload(X)).get()
+
+    def _upload(self, x: np.ndarray) -> Array:
+        return self.device.upload(checks.real("x", x))
 
     def _transpose(self) -> Operator:  # pyright: ignore[reportIncompatibleMethodOverride]
         return Transposed(self)
@@ -150,6 +153,7 @@ class Operator(scipy.sparse.linalg.LinearOperator):
             raise InputError(
                 f"x has {x.columns} right-hand sides; one product takes {(1 << 31) // max(rows, columns)}"
             )
+        self._refuse_foreign(x, *(array for array in (out, add) if array is not None))
         wanted = (rows, *x.shape[1:])
         out = self.device.empty(wanted) if out is None else out
         for name, array in (("out", out), ("add", add)):
@@ -159,6 +163,15 @@ class Operator(scipy.sparse.linalg.LinearOperator):
             raise InputError("out is x; a product cannot be written over its own operand")
         self._product(x, out, float(scale), add, transpose)
         return out
+
+    def _refuse_foreign(self, *arrays: Array) -> None:
+        for array in arrays:
+            if array.dtype != np.float32:
+                raise InputError(f"an array holds {array.dtype}; operators take float32")
+            if array.device is not self.device:
+                raise InputError(
+                    f"an array is on another device, {array.device}; it must be on {self.device}"
+                )
 
 
 class Transposed(Operator):

@@ -77,7 +77,7 @@ class ScaledColumns(Operator):
     def __init__(self, A: Operator, d: np.ndarray) -> None:
         super().__init__(A.device, A.shape)
         self.A = A
-        self.d = checks.shape("d", checks.real("d", d), A.shape[1:])
+        self.d = checks.finite("d", checks.shape("d", checks.real("d", d), A.shape[1:]))
         self._d = A.device.upload(self.d)
         self.error = A.error * float(np.max(np.abs(self.d), initial=0.0))
 
@@ -105,13 +105,15 @@ class ScaledColumns(Operator):
 
 
 class Shifted(Operator):
-    """A - I: turns any square S into the R of S = I + R."""
+    """A - I: turns any square S into the R of S = I + R; or A - diag(d), 0 in d where a pixel is masked."""
 
-    def __init__(self, A: Operator) -> None:
+    def __init__(self, A: Operator, d: np.ndarray | None = None) -> None:
         if A.shape[0] != A.shape[1]:
             raise InputError(f"the operator has shape {A.shape}; A - I needs a square one")
         super().__init__(A.device, A.shape)
         self.A = A
+        self.d = np.ones(A.shape[0]) if d is None else checks.shape("d", checks.real("d", d), A.shape[:1])
+        self._d = None if d is None else A.device.upload(self.d)
         self.error = A.error
 
     @property
@@ -120,18 +122,19 @@ class Shifted(Operator):
         return self.A.nbytes
 
     def diagonal(self) -> np.ndarray:
-        """diag(A) - 1, (N,) float64."""
-        return self.A.diagonal() - 1.0
+        """diag(A) - d, (N,) float64."""
+        return self.A.diagonal() - self.d
 
     def to_dense(self) -> np.ndarray:
-        """A - I, (N, N) float64, on the host."""
+        """A - diag(d), (N, N) float64, on the host."""
         dense = self.A.to_dense()
-        dense[np.diag_indices_from(dense)] -= 1.0
+        dense[np.diag_indices_from(dense)] -= self.d
         return dense
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
         self.A._product(x, out, scale, add, transpose)
-        vectors.axpy(-scale, x, out)
+        kept = x if self._d is None else vectors.scale_rows(self._d, x, x.like())
+        vectors.axpy(-scale, kept, out)
 
 
 class Host(Operator):
@@ -142,6 +145,7 @@ class Host(Operator):
 
     def __init__(self, device: Device, operator: Any) -> None:
         self.operator = scipy.sparse.linalg.aslinearoperator(operator)
+        checks.real(type(operator).__name__, np.zeros(0, self.operator.dtype))
         super().__init__(device, self.operator.shape)
 
     def diagonal(self) -> np.ndarray:
@@ -155,10 +159,11 @@ class Host(Operator):
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
         host = x.get().astype(np.float64)
+        name = type(self.operator).__name__
         act = self.operator.T if transpose else self.operator
-        product = np.asarray(act @ host)
-        checks.finite(f"the product of {type(self.operator).__name__}", product)
-        if add is None:
-            out.set((scale * product).astype(np.float32))
-        else:
-            out.set((scale * product + add.get()).astype(np.float32))
+        try:
+            product = np.asarray(act @ host)
+        except NotImplementedError as error:  # what SciPy raises
+            raise InputError(f"{name} has no rmatvec, so products with its transpose are unknown") from error
+        checks.finite(f"the product of {name}", checks.real(f"the product of {name}", product))
+        out.set(scale * product if add is None else scale * product + add.get())

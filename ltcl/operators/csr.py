@@ -34,7 +34,8 @@ class Pattern:
         self.indptr = matrix.indptr.astype(np.int64)
         self.indices = matrix.indices
         row_bytes = np.maximum(4 * np.diff(self.indptr), 4)  # pointers weigh as much as one nonzero
-        self.cuts = slabs.cut(row_bytes, slabs.largest(device), "the sparse matrix")
+        # There is one pointer more than rows.
+        self.cuts = slabs.cut(row_bytes, slabs.largest(device) - 4, "the sparse matrix")
         self.slabs = [self._upload(start, stop) for start, stop in self.cuts]
 
     def _upload(self, start: int, stop: int) -> tuple[Array, Array]:
@@ -91,7 +92,7 @@ class CSR(RowOperator):
     def __init__(self, device: Device, matrix: Any, pattern: Pattern | None = None) -> None:
         matrix = checks.csr("matrix", matrix)
         super().__init__(device, matrix.shape)
-        shared = pattern is not None and pattern.matches(matrix)
+        shared = pattern is not None and pattern.device is device and pattern.matches(matrix)
         device.require(matrix.nnz * (4 if shared else 8), f"a sparse matrix of {matrix.nnz} nonzeros")
         self.pattern = pattern if pattern is not None and shared else Pattern(device, matrix)
         self.slabs = self.pattern.with_values(matrix.data)

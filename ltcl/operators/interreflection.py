@@ -50,7 +50,7 @@ def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Patter
         return Dense(device, _dense_R(matrix, divisor, lit))
     if isinstance(matrix, scipy.sparse.csr_array):
         return CSR(device, _sparse_R(matrix, divisor, lit), pattern)
-    return Shifted(ScaledColumns(Host(device, matrix), 1.0 / divisor))
+    return Shifted(ScaledColumns(Host(device, matrix), 1.0 / divisor), None if lit.all() else lit)
 
 
 def _dense_R(T: np.ndarray, divisor: np.ndarray, lit: np.ndarray) -> np.ndarray:

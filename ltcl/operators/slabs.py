@@ -41,5 +41,8 @@ def cut(row_bytes: np.ndarray, limit: int, what: str) -> list[tuple[int, int]]:
 
 
 def largest(device: Device) -> int:
-    """Bytes of the largest buffer, and never so many that a 32-bit count of values overflows."""
-    return min(device.max_allocation - SPARE_BYTES, 4 * ((1 << 31) - 1))
+    """Bytes of the largest buffer, and never so many that a 32-bit count of values overflows.
+
+    Kernels count on beyond the end of a row by a work-group or a stretch: room is left for that.
+    """
+    return min(device.max_allocation - SPARE_BYTES, 4 * ((1 << 31) - 4096))

@@ -16,9 +16,12 @@ from ltcl.device import Array, vectors
 from ltcl.operators import Operator
 from ltcl.solvers.result import Status
 
-_GROWTH = 100.0  # times the best residual: past all transient growth of a nearly self-adjoint system
-_RISES = 20  # residuals in a row, each above the one before
-_PATIENCE = 25  # steps without a new best residual
+# Residuals of Chebyshev swing under an envelope that falls, and come close to 0 by chance on the way; so what
+# counts is the start and the largest of a long window, not the best residual so far.
+_GROWTH = 100.0  # times the first residual: past all transient growth of a nearly self-adjoint system
+_RISES = 20  # residuals in a row, each above the one before, up to more than the first
+_WINDOW = 100  # steps whose largest residual must be below that of as many steps before
+_PATIENCE = 25  # steps without a new best residual once they are near rounding
 _DRIFT = 2.0**-20  # relative residual, below which one kept by recursion in float32 may be far off
 _ROUNDING = 2.0**-23  # relative residual that is rounding alone, were it computed as 0
 
@@ -106,9 +109,14 @@ class Monitor:
             self._since_lowest += 1
 
     def _trouble(self) -> Status | None:
-        residual = self.residuals[-1]
-        if not np.isfinite(residual) or residual > _GROWTH * self._lowest or self._rises >= _RISES:
+        first, residual = self.residuals[0], self.residuals[-1]
+        grown = residual > _GROWTH * first or (self._rises >= _RISES and residual > first)
+        if grown or not np.isfinite(residual):
             return Status.DIVERGED
-        if self._since_lowest >= _PATIENCE:
+        if (self._since_lowest >= _PATIENCE and self._lowest < _DRIFT) or self._stalled():
             return Status.STAGNATED
         return Status.MAXITER if self.iterations >= self.rule.maxiter else None
+
+    def _stalled(self) -> bool:
+        before, recent = self.residuals[-2 * _WINDOW : -_WINDOW], self.residuals[-_WINDOW:]
+        return len(before) == _WINDOW and max(recent) >= max(before)

@@ -14,11 +14,19 @@ from ltcl.operators.rows import Launch, RowOperator
 from tests import gallery, reference
 
 COLUMNS = (None, 1, 2, 3, 5, 8, 11)  # None: (N,), not (N, 1)
-EPILOGUES = {"plain": (1.0, None), "scaled": (-0.75, None), "added": (0.5, "other"), "onto itself": (-1.0, "out")}
-# How a product may be launched: end of the kernel's name and items that share a row.
-LAUNCHES = {"item": ("", 0), "stream": ("_stream", 0), "group32": ("_group", 32), "group64": ("_group", 64)} | {
-    "group128": ("_group", 128)
+EPILOGUES = {
+    "plain": (1.0, None),
+    "scaled": (-0.75, None),
+    "added": (0.5, "other"),
+    "onto itself": (-1.0, "out"),
 }
+# How a product may be launched: end of the kernel's name and items that share a row.
+LAUNCHES = {
+    "item": ("", 0),
+    "stream": ("_stream", 0),
+    "group32": ("_group", 32),
+    "group64": ("_group", 64),
+} | {"group128": ("_group", 128)}
 Twin = Callable[..., np.ndarray]
 
 
@@ -59,12 +67,18 @@ def same_bits(a: np.ndarray, b: np.ndarray) -> None:
     np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32))
 
 
+def norms_match(A: Operator, matrix: np.ndarray, rel: float) -> None:
+    norms = A.norms()
+    assert norms.one == pytest.approx(np.linalg.norm(matrix, 1), rel=rel)
+    assert norms.inf == pytest.approx(np.linalg.norm(matrix, np.inf), rel=rel)
+    assert norms.frobenius == pytest.approx(np.linalg.norm(matrix, "fro"), rel=rel)
+
+
 def force(monkeypatch: pytest.MonkeyPatch, A: RowOperator, name: str) -> None:
     """Let A run all its products as `name` says; small operators take the first variant unasked."""
     suffix, group = LAUNCHES[name]
 
-    def variants(width: int) -> dict[str, Launch]:
-        kernel = A.device.kernel(A.file, f"{A.file}_matvec{suffix}", K=width, **A.defines)
-        return {name: Launch(kernel, group)}
+    def variants(width: int, columns: int) -> dict[str, Launch]:
+        return {name: Launch(A.kernel(f"{A.file}_matvec{suffix}", width, columns), group)}
 
     monkeypatch.setattr(A, "variants", variants)

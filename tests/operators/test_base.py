@@ -10,7 +10,7 @@ import scipy.sparse.linalg
 
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.operators import CSR, Dense, Host, IdentityPlus, ScaledColumns, Shifted, as_operator, base
+from ltcl.operators import CSR, Dense, Host, IdentityPlus, Operator, ScaledColumns, Shifted, as_operator, base
 from tests import gallery, reference
 from tests.operators import helpers
 
@@ -27,8 +27,15 @@ OPERATORS = {
     "host": (lambda device: Host(device, scipy.sparse.linalg.aslinearoperator(TALL.astype(float))), TALL),
     "scaled columns": (lambda device: ScaledColumns(Dense(device, TALL), SCALES), TALL * SCALES),
     "I + R": (lambda device: IdentityPlus(Dense(device, SQUARE)), np.eye(53) + SQUARE),
-    "I - A": (lambda device: IdentityPlus(as_operator(scipy.sparse.csr_array(SQUARE), device), -1), np.eye(53) - SQUARE),
+    "I - A": (
+        lambda device: IdentityPlus(as_operator(scipy.sparse.csr_array(SQUARE), device), -1),
+        np.eye(53) - SQUARE,
+    ),
     "shifted": (lambda device: Shifted(Dense(device, SQUARE)), SQUARE - np.eye(53)),
+    "shifted where lit": (
+        lambda device: Shifted(Dense(device, SQUARE), np.arange(53) % 5 > 0),
+        SQUARE - np.diag(np.arange(53) % 5 > 0),
+    ),
     "I + transposed": (lambda device: IdentityPlus(Dense(device, SQUARE).T), np.eye(53) + SQUARE.T),
     "I + (A - I)": (lambda device: IdentityPlus(Shifted(Dense(device, SQUARE))), SQUARE),
 }
@@ -50,7 +57,7 @@ def test_adjoint(pair):
     """<A x, y> = <x, A^T y>: the two sums run over the same products, each in its own order."""
     A, matrix = pair
     x, y = gallery.vectors(A.shape[1], None, 3), gallery.vectors(A.shape[0], None, 4)
-    left, right = np.vdot(np.float64(A @ x), y), np.vdot(x, np.float64(A.T @ y))
+    left, right = np.vdot(np.asarray(A @ x, np.float64), y), np.vdot(x, np.float64(A.T @ y))
     terms = reference.product_error(matrix, x) @ np.abs(y) + reference.product_error(matrix.T, y) @ np.abs(x)
     assert abs(left - right) <= terms
 
@@ -108,7 +115,7 @@ def test_unfit_operands_are_refused(pair):
         with pytest.raises(InputError, match=part):
             bad()
     with pytest.raises(InputTypeError, match="real numbers"):
-        A @ np.full(columns, 1j)
+        A.matvec(np.full(columns, 1j))
 
 
 def test_product_over_its_own_operand_is_refused(device):
@@ -143,34 +150,39 @@ R = (0.5 / np.linalg.norm(gallery.signed(53, 53, 6), 2) * gallery.signed(53, 53,
 G = R @ R.T
 
 
+def solves(S: Operator, x: np.ndarray, b: np.ndarray) -> bool:
+    return bool(np.linalg.norm(S.to_dense() @ x - b) <= 1e-4 * np.linalg.norm(b))
+
+
 @pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
 def test_scipy_solvers_take_operators(device, form):
     b = gallery.vectors(53, None).astype(np.float64)
     S = IdentityPlus(as_operator(form(R), device))
     x, info = scipy.sparse.linalg.gmres(S, b, rtol=1e-5)
     assert info == 0
-    np.testing.assert_allclose(S.to_dense() @ x, b, atol=1e-4 * np.linalg.norm(b))
+    assert solves(S, x, b)
     S = IdentityPlus(as_operator(form(G), device))
     x, info = scipy.sparse.linalg.cg(S, b, rtol=1e-5)
     assert info == 0
-    np.testing.assert_allclose(S.to_dense() @ x, b, atol=1e-4 * np.linalg.norm(b))
+    assert solves(S, x, b)
     x = scipy.sparse.linalg.lsqr(S, b, atol=1e-6, btol=1e-6)[0]
-    np.testing.assert_allclose(S.to_dense() @ x, b, atol=1e-4 * np.linalg.norm(b))
+    assert solves(S, x, b)
 
 
 def test_scipy_finds_spectra_of_operators(device):
     A = Dense(device, G)
-    largest = np.linalg.eigvalsh(np.float64(G))[-1]
+    largest = np.linalg.eigvalsh(np.asarray(G, np.float64))[-1]
     found = scipy.sparse.linalg.eigs(A, k=1, return_eigenvectors=False, v0=np.ones(53))
     assert found[0] == pytest.approx(largest, rel=1e-4)
     singular = scipy.sparse.linalg.svds(Dense(device, TALL), k=2, return_singular_vectors=False, rng=0)
-    np.testing.assert_allclose(np.sort(singular), np.linalg.svd(TALL)[1][[1, 0]], rtol=1e-4)
+    assert sorted(np.asarray(singular)) == pytest.approx(sorted(np.linalg.svd(TALL)[1][:2]), rel=1e-4)
 
 
 def test_operators_add_and_multiply_as_scipys_do(device):
     A = Dense(device, SQUARE)
     x = gallery.vectors(53, None)
-    np.testing.assert_allclose((2 * A + A @ A) @ x, 2 * SQUARE @ x + SQUARE @ SQUARE @ x, atol=1e-3)
+    composed = scipy.sparse.linalg.aslinearoperator(2 * A + A @ A)
+    np.testing.assert_allclose(composed.matvec(x), 2 * SQUARE @ x + SQUARE @ SQUARE @ x, atol=1e-3)
 
 
 def test_as_operator_knows_what_scipy_users_hold(device):

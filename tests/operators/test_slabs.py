@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +20,7 @@ def test_slabs_cover_all_rows_within_the_limit_and_are_few(row_bytes, limit):
     pieces = slabs.cut(np.array(row_bytes, np.int64), limit, "A")
     assert pieces[0][0] == 0
     assert pieces[-1][1] == len(row_bytes)
-    assert all(a[1] == b[0] for a, b in zip(pieces, pieces[1:], strict=False))
+    assert all(a[1] == b[0] for a, b in itertools.pairwise(pieces))
     assert all(sum(row_bytes[start:stop]) <= limit for start, stop in pieces)
     # As few as possible: no slab has room for the first row of the next.
     assert all(sum(row_bytes[a : b + 1]) > limit for a, b in pieces[:-1])

@@ -75,7 +75,8 @@ def test_bounds_that_leave_out_the_spectrum_are_noticed(device):
 
 
 @pytest.mark.parametrize(
-    "bounds", [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0,), 3.0, "ab", (0.5, np.inf), (np.nan, 1.0), (1.0, "b")]
+    "bounds",
+    [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0,), 3.0, "ab", (0.5, np.inf), (np.nan, 1.0), (1.0, "b")],
 )
 def test_unusable_bounds_are_refused(bounds):
     with pytest.raises(InputError, match="bounds"):

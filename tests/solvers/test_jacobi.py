@@ -39,12 +39,14 @@ def test_k_steps_are_k_terms(device, method, matrix, sign, terms):
 
 
 @pytest.mark.parametrize("rho", [1.5, 4.0, 9.0])
-@pytest.mark.parametrize("make", [lambda rho: enclosure(30, rho / (1 + rho)), lambda rho: lambertian(30, rho)])
+@pytest.mark.parametrize(
+    "make", [lambda rho: enclosure(30, rho / (1 + rho)), lambda rho: lambertian(30, rho)]
+)
 def test_past_radius_one_it_diverges_and_says_so(device, make, rho):
     scene = make(rho)
     b = scene.S @ random.uniform(0.0, 1.0, scene.n)
     S = IdentityPlus(Dense(device, scene.R))
-    with pytest.raises(ConvergenceError, match="the residual grew.*chebyshev") as caught:
+    with pytest.raises(ConvergenceError, match=r"the residual grew.*chebyshev") as caught:
         ltcl.solve(S, b, "jacobi")
     s = caught.value.solution
     assert s.status is Status.DIVERGED

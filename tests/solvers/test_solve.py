@@ -22,7 +22,9 @@ OPERATORS = {
     "csr": lambda device, S: CSR(device, scipy.sparse.csr_array(S)),
     "host": lambda device, S: Host(device, aslinearoperator(S)),
     "identity plus dense": lambda device, S: IdentityPlus(Dense(device, S - np.eye(len(S)))),
-    "identity plus csr": lambda device, S: IdentityPlus(CSR(device, scipy.sparse.csr_array(S - np.eye(len(S))))),
+    "identity plus csr": lambda device, S: IdentityPlus(
+        CSR(device, scipy.sparse.csr_array(S - np.eye(len(S))))
+    ),
     "identity minus": lambda device, S: IdentityPlus(Dense(device, np.eye(len(S)) - S), sign=-1),
     "identity minus host": lambda device, S: IdentityPlus(
         Host(device, aslinearoperator(np.eye(len(S)) - S)), sign=-1
@@ -43,7 +45,9 @@ def test_every_method_on_every_operator(device, method, operator, dual, columns)
     s = ltcl.solve(OPERATORS[operator](device, S), b, method, rtol=1e-4)
     assert s.converged
     assert s.x.shape == b.shape
-    assert residual(S, s.x, b) <= 1e-4 * (1 + 1e-3)  # confirmed in float64; the slack is float32 rounding of S
+    assert residual(S, s.x, b) <= 1e-4 * (
+        1 + 1e-3
+    )  # confirmed in float64; the slack is float32 rounding of S
     exact = np.linalg.solve(S, b)
     assert np.linalg.norm(s.x - exact) <= 1e-4 * np.linalg.cond(S) * np.linalg.norm(exact)
 
@@ -178,13 +182,17 @@ def test_bad_input_is_refused_by_name(device, method, case):
 
 @pytest.mark.parametrize("method", ["gauss", "", None, 3])
 def test_an_unknown_method_is_refused_with_those_there_are(method):
-    with pytest.raises(InputError, match="method is .*; it must be one of jacobi, neumann, chebyshev, direct, auto"):
+    with pytest.raises(
+        InputError, match=r"method is .*; it must be one of jacobi, neumann, chebyshev, direct, auto"
+    ):
         ltcl.solve(np.eye(N), np.ones(N), method)
 
 
 def test_bad_input_is_refused_before_the_matrix_goes_to_a_device(monkeypatch):
     """`as_operator` is what uploads."""
-    module = importlib.import_module("ltcl.solvers.solve")  # the package's attribute of this name is the function
+    module = importlib.import_module(
+        "ltcl.solvers.solve"
+    )  # the package's attribute of this name is the function
     monkeypatch.setattr(module, "as_operator", lambda S: pytest.fail("uploaded"))
     for change, error, says in BAD.values():
         if "matrix" in says:  # checked by the operator itself

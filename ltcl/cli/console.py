@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What people and programs get to read: tables or one JSON document on stdout, progress on stderr."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from ltcl import report
+
+_PATIENCE = 2.0  # seconds without a terminal before progress is worth a line
+
+
+def answer(value: Any) -> None:
+    """Print the one JSON document of ``--json``."""
+    typer.echo(report.dumps(value))
+
+
+def note(text: str) -> None:
+    """Say something on stderr."""
+    typer.echo(f"ltcl: {text}", err=True)
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Print a table on stdout; columns of numbers stand right."""
+    # Without a terminal rich assumes 80 columns and folds file names.
+    console = Console() if sys.stdout.isatty() else Console(width=240)
+    shown = [[_cell(value) for value in row] for row in rows]
+    frame = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="bold")
+    for name, values in zip(columns, zip(*shown, strict=True), strict=False):
+        right = all(_is_number(value) for value in values)
+        frame.add_column(name, justify="right" if right else "left", overflow="fold")
+    for row in shown:
+        frame.add_row(*(Text(value) for value in row))
+    console.print(frame)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.4g}" if math.isfinite(value) else "diverges" if value > 0 else "-"
+    return str(value)
+
+
+def _is_number(text: str) -> bool:
+    return (
+        text in ("-", "diverges")
+        or text.replace(".", "").replace("-", "").replace("e", "").replace("%", "").strip().isdigit()
+    )
+
+
+class Steps:
+    """Progress through several items and the solves in each, on stderr.
+
+    On a terminal a bar; elsewhere a line an item, once the whole has taken longer than two seconds.
+
+    Parameters
+    ----------
+    items : int
+    solves : int
+        Of each item, for the length of the bar.
+    """
+
+    def __init__(self, items: int, solves: int = 1) -> None:
+        self._items, self._solves = items, solves
+        self._item = self._solve = 0
+        self._began = time.monotonic()
+        console = Console(stderr=True)
+        self._is_terminal = console.is_terminal
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[text]}"),
+        )
+        self._bar = Progress(*columns, console=console, transient=True, disable=not self._is_terminal)
+        self._task = self._bar.add_task("", total=items * solves, text="")
+
+    def __enter__(self) -> Steps:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def item(self, name: str) -> None:
+        """Begin the next item."""
+        self._item, self._solve = self._item + 1, 0
+        counted = f"{self._item}/{self._items} {name}" if self._items > 1 else name
+        done = (self._item - 1) * self._solves
+        self._bar.update(self._task, description=counted, completed=done, text="")
+        if not self._is_terminal and time.monotonic() - self._began > _PATIENCE:
+            note(counted)
+
+    def solve(self, rtol: float) -> Callable[[int, float], None]:
+        """A `callback` for the solves of this item: moves the bar by the digits gained."""
+
+        def report_residual(iteration: int, residual: float) -> None:
+            self._solve += iteration == 0
+            gained = math.log(max(residual, 1e-30)) / math.log(rtol) if 0 < rtol < 1 else 0.0
+            done = (self._item - 1) * self._solves + min(
+                self._solve - 1 + min(max(gained, 0.0), 1.0), self._solves
+            )
+            self._bar.update(self._task, completed=done, text=f"residual {residual:.1e}")
+
+        return report_residual

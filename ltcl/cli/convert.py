@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`ltcl convert`: a transport file from any known format to any other; needs no device."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ltcl import checks
+from ltcl.cli import console, info, options
+from ltcl.store import formats
+
+_IN = Annotated[Path, typer.Argument(metavar="IN", help="Light transport: .npz, .npy or .mtx.")]
+_OUT = Annotated[Path, typer.Argument(metavar="OUT", help="The new file; its extension names the format.")]
+
+
+def run(
+    source: _IN,
+    target: _OUT,
+    grid: options.Grid = None,
+    camera_grid: options.CameraGrid = None,
+    json: options.Json = False,
+) -> None:
+    """Write a transport in another format; OUT is replaced whole or not at all. Needs no device."""
+    formats.find(target)  # refused before a long read
+    record = formats.read(source)
+    with formats.about(source):
+        rows, columns = record.shape
+        if grid is not None:
+            record = dataclasses.replace(record, grid=checks.grid("grid", grid, columns))
+        if camera_grid is not None:
+            record = dataclasses.replace(record, camera_grid=checks.grid("camera_grid", camera_grid, rows))
+    formats.write(target, record)
+    if record.grid is not None and target.suffix.lower() == ".npy":
+        grid_text = "x".join(map(str, record.grid))
+        console.note(f"{target}: .npy does not keep the grid; give --grid {grid_text} wherever you use it")
+    facts = info.describe(target, record)
+    if json:
+        console.answer({"source": source, **facts})
+    else:
+        typer.echo(f"{target}: {facts['stored']}, {checks.size(target.stat().st_size)} on disk")

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`ltcl devices`: what OpenCL offers here, and which of it ltcl would take."""
+
+from __future__ import annotations
+
+import os
+
+from ltcl import checks
+from ltcl.cli import console, options
+from ltcl.device import discovery
+
+
+def run(json: options.Json = False) -> None:
+    """List the OpenCL devices, the best first; the arrow marks the one that would be chosen."""
+    devices = discovery.list_devices()
+    chosen = discovery.choose(devices, os.environ.get("LTCL_DEVICE") or None)
+    if json:
+        console.answer([_facts(device) | {"chosen": device is chosen} for device in devices])
+        return
+    rows = [
+        (
+            "->" if device is chosen else "",
+            device.index,
+            device.name,
+            device.kind,
+            device.driver,
+            device.compute_units,
+            checks.size(device.memory),
+            checks.size(device.max_allocation),
+        )
+        for device in devices
+    ]
+    console.table(("", "index", "name", "kind", "driver", "units", "memory", "largest buffer"), rows)
+
+
+def _facts(device: discovery.Description) -> dict:
+    names = ("index", "name", "kind", "driver", "compute_units", "memory", "max_allocation")
+    return {name: getattr(device, name) for name in names}

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The program `ltcl`: its commands, and what becomes of errors.
+
+Exit codes: 0 done; 1 refused or failed, with one line on stderr; 2 wrong usage; 130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from ltcl import __version__
+from ltcl.cli import analyze, compensate, convert, demo, devices, doctor, info, relight, separate
+from ltcl.errors import LtclError
+
+
+class _Commands(TyperGroup):
+    """Turns what a command raises on purpose into one line and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except LtclError as error:
+            raise _failed(str(error), 1) from error
+        except MemoryError as error:
+            raise _failed("the host has no memory left", 1) from error
+        except KeyboardInterrupt:
+            raise _failed("interrupted", 130) from None
+
+
+def _failed(message: str, code: int) -> typer.Exit:
+    typer.echo(f"ltcl: error: {' '.join(as_options(message).split())}", err=True)
+    return typer.Exit(code)
+
+
+# How the library's messages name arguments that are options here.
+_ARGUMENT = re.compile(
+    r"\b(grid|camera_grid|on_dark|first_bounce|method|rtol)=(?:'([\w-]+)'|\((\w+), (\w+)\)|([\d.e-]+))"
+)
+
+
+def as_options(message: str) -> str:
+    """A message of the library in the words of the command line.
+
+    >>> as_options("give grid=(h, w), perhaps grid=(64, 64); or on_dark='mask'")
+    'give --grid HxW, perhaps --grid 64x64; or --on-dark mask'
+    """
+
+    def option(found: re.Match[str]) -> str:
+        name, word, rows, columns, number = found.groups()
+        value = word or number or f"{rows}x{columns}".replace("hxw", "HxW")
+        return f"--{name.replace('_', '-')} {value}"
+
+    return _ARGUMENT.sub(option, message)
+
+
+class _Log(logging.Handler):
+    """Warnings of the library as lines on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        typer.echo(f"ltcl: {record.levelname.lower()}: {record.getMessage()}", err=True)
+
+
+app = typer.Typer(
+    cls=_Commands,
+    name="ltcl",
+    help="Inverse light transport on any OpenCL device.",
+    epilog="Start with: ltcl demo",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for command in (devices, doctor, demo, info, analyze, convert, compensate, separate, relight):
+    app.command(command.__name__.rpartition(".")[2])(command.run)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"ltcl {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
+    ] = False,
+) -> None:
+    logger = logging.getLogger("ltcl")
+    if not any(isinstance(handler, _Log) for handler in logger.handlers):
+        logger.addHandler(_Log(logging.WARNING))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program with `arguments`, those of the command line when not given; returns its exit code.
+
+    Examples
+    --------
+    >>> main(["--version"]).real  # doctest: +ELLIPSIS
+    ltcl ...
+    0
+    """
+    try:
+        app(args=None if arguments is None else list(arguments), prog_name="ltcl")
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except KeyboardInterrupt:  # before a command began, or while one was cleaning up
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Options and arguments that several commands share, each defined once."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from ltcl.solvers import METHODS
+
+
+def _grid(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"\s*(\d+)\s*[xX,]\s*(\d+)\s*", text)
+    if found is None or 0 in (grid := (int(found[1]), int(found[2]))):
+        raise typer.BadParameter(f"{text!r} is no grid; write height x width, for instance 48x64")
+    return grid
+
+
+def _method(name: str) -> str:
+    if name not in METHODS:
+        raise typer.BadParameter(f"{name!r} is no method; choose one of {', '.join(METHODS)}")
+    return name
+
+
+Matrix = Annotated[Path, typer.Argument(metavar="TRANSPORT", help="Light transport: .npz, .npy or .mtx.")]
+Matrices = Annotated[
+    list[Path], typer.Argument(metavar="FILE...", help="Light transports: .npz, .npy or .mtx.")
+]
+Pictures = Annotated[
+    list[Path], typer.Argument(metavar="PICTURE...", help="Pictures: .png, .jpg, .tif, .bmp or .exr.")
+]
+Out = Annotated[
+    Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results; filled only on success.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
+Device = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="gpu, cpu, an index of 'ltcl devices', or part of a name. Default: LTCL_DEVICE, else the best.",
+        show_default=False,
+    ),
+]
+Method = Annotated[str, typer.Option(callback=_method, metavar="NAME", help=f"One of {', '.join(METHODS)}.")]
+Rtol = Annotated[float, typer.Option(metavar="FRACTION", help="Relative residual at which a solve is done.")]
+Grid = Annotated[
+    tuple | None,
+    typer.Option(
+        parser=_grid,
+        metavar="HxW",
+        help="Projector pixels, height x width, where the file does not tell.",
+        show_default=False,
+    ),
+]
+CameraGrid = Annotated[
+    tuple | None,
+    typer.Option(
+        parser=_grid, metavar="HxW", help="Camera pixels, if not those of the projector.", show_default=False
+    ),
+]
+FirstBounce = Annotated[
+    Literal["diagonal", "exact"] | None,
+    typer.Option(
+        help="Where the direct light comes from: the diagonal of T, or 1 / diag(T^-1), slower and free of "
+        "returned light. Default: the file's, else diagonal.",
+        show_default=False,
+    ),
+]
+OnDark = Annotated[
+    Literal["raise", "mask"],
+    typer.Option(help="Projector pixels without direct light: refuse, or leave unlit."),
+]
+Resize = Annotated[bool, typer.Option("--resize", help="Scale pictures of another size to the grid.")]
+Encoding = Annotated[
+    Literal["auto", "srgb", "linear"],
+    typer.Option(help="What picture files hold; auto: integers sRGB, floats linear."),
+]

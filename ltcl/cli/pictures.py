@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Pictures in and out: read on a transport's grid, written exactly as EXR and for the eye as PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ltcl.errors import InputError
+
+Grid = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """How picture files become linear pictures on a `grid`: what they hold, whether to scale them."""
+
+    grid: Grid
+    whose: str
+    encoding: Literal["auto", "srgb", "linear"]
+    resize: bool
+
+    def read(self, path: Path) -> np.ndarray:
+        """The picture in `path`, linear float32, (h, w) or (h, w, 3) on the grid.
+
+        Raises
+        ------
+        InputError
+            It has another size and may not be scaled.
+        """
+        from ltcl import images
+
+        picture = images.read(path, encoding=self.encoding)
+        if picture.shape[:2] == self.grid:
+            return picture
+        if self.resize:
+            return images.resize(picture, self.grid)
+        has, wants = ("{} x {}".format(*size) for size in (picture.shape[:2], self.grid))
+        raise InputError(
+            f"{path}: is {has} pixels, but {self.whose} has {wants}; give --resize to scale the picture"
+        )
+
+    def read_all(self, paths: Sequence[Path]) -> dict[str, np.ndarray]:
+        """All pictures by the name that their results get; a bad one is known before the first solve."""
+        return {name: self.read(path) for name, path in names(paths).items()}
+
+
+def names(paths: Sequence[Path]) -> dict[str, Path]:
+    """A name for the results of each file: its stem, with a number where two files share one.
+
+    >>> list(names([Path("a/sky.png"), Path("b/sky.exr"), Path("sea.png")]))
+    ['sky', 'sky_2', 'sea']
+    """
+    found: dict[str, Path] = {}
+    for path in paths:
+        name, number = path.stem, 1
+        while name.lower() in {taken.lower() for taken in found}:  # some file systems ignore case
+            number += 1
+            name = f"{path.stem}_{number}"
+        found[name] = path
+    return found
+
+
+def write(folder: Path, name: str, picture: np.ndarray, scale: float = 1.0) -> dict[str, Any]:
+    """Write ``name.exr`` with the values as they are and ``name.png`` with value / scale in sRGB.
+
+    Returns
+    -------
+    dict
+        Names and scale, for the report.
+    """
+    from ltcl import images
+
+    images.write(folder / f"{name}.exr", picture)
+    images.write(folder / f"{name}.png", picture / scale)
+    return {"exr": f"{name}.exr", "png": f"{name}.png", "png_scale": scale}
+
+
+def brightness(picture: np.ndarray) -> float:
+    """The value to be shown as white: all but the brightest thousandth stay below; 1 for black pictures."""
+    value = float(np.quantile(picture, 0.999, method="higher"))
+    return value if value > 0 else 1.0

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`ltcl separate`: each bounce of light of a picture as a picture of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from ltcl import report
+from ltcl.cli import console, options, pictures, transports
+from ltcl.files import fill_folder
+from ltcl.separation import Separation
+
+_BOUNCES = Annotated[int, typer.Option(metavar="N", min=0, help="Indirect bounces to tell apart.")]
+
+
+def run(
+    transport: options.Matrix,
+    picture: options.Pictures,
+    out: options.Out,
+    bounces: _BOUNCES = 4,
+    grid: options.Grid = None,
+    method: options.Method = "auto",
+    rtol: options.Rtol = 1e-3,
+    first_bounce: options.FirstBounce = None,
+    on_dark: options.OnDark = "raise",
+    resize: options.Resize = False,
+    encoding: options.Encoding = "auto",
+    device: options.Device = None,
+    json: options.Json = False,
+) -> None:
+    """Split PICTURE, taken of the scene under projector light, into direct light and bounces.
+
+    Writes direct, indirect, bounce_1, bounce_2, ... and the rest exactly as .exr (measured ones may be a
+    little negative) and for the eye as .png, each at its own brightness, which report.json tells. Several
+    pictures get a folder each.
+    """
+    from ltcl.separation import separate
+
+    T = transports.load(transport, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
+    seen = pictures.Reader(T.grid, "the camera", encoding, resize).read_all(picture)
+    text = transports.heading("separate", transport, T, bounces=bounces, method=method, rtol=rtol)
+    entries = text["pictures"] = []
+    with console.Steps(len(seen), T.channels * (bounces + 1)) as steps, fill_folder(out) as folder:
+        for (name, image), file in zip(seen.items(), picture, strict=True):
+            steps.item(file.name)
+            done = separate(T, image, bounces, method=method, rtol=rtol, callback=steps.solve(rtol))
+            # Several pictures get a folder each.
+            place = f"{name}/" if len(seen) > 1 else ""
+            entries.append({"file": str(file), "parts": _write(folder, place, done, image)})
+        report.write(folder / "report.json", text)
+    if json:
+        console.answer({"folder": out, **text})
+    else:
+        _show(out, entries)
+
+
+def _write(folder: Path, place: str, done: Separation, image: np.ndarray) -> list[dict[str, Any]]:
+    """All parts of one picture as files; for the report their share of the light and their solves."""
+    parts = {"direct": done.direct, "indirect": done.indirect}
+    parts |= {f"bounce_{k}": part for k, part in enumerate(done.bounces, 1)}
+    parts["rest"] = done.rest
+    solved = {"direct": done.solutions[0]}
+    solved |= {f"bounce_{k}": solution for k, solution in enumerate(done.solutions[1:], 1)}
+    whole = float(np.sum(np.broadcast_to(image.reshape(*image.shape[:2], -1), (*image.shape[:2], 3))))
+    return [
+        {
+            "part": name,
+            **pictures.write(folder, place + name, part, pictures.brightness(part)),
+            "share": _light(part) / whole if whole else None,
+            "lowest": float(part.min()),
+            "channels": report.solution(solved[name]) if name in solved else [],
+        }
+        for name, part in parts.items()
+    ]
+
+
+def _light(part: np.ndarray) -> float:
+    """The sum over pixels and three colours."""
+    return float(np.sum(part, dtype=np.float64)) * (1 if part.ndim == 3 else 3)
+
+
+def _show(out: Path, entries: list[dict[str, Any]]) -> None:
+    console.table(
+        ("picture", "part", "share of light", "products", "residual", "white in png", "file"),
+        [
+            (
+                entry["file"],
+                part["part"],
+                None if part["share"] is None else f"{100 * part['share']:.2f} %",
+                sum(channel["products"] for channel in part["channels"]) if part["channels"] else None,
+                max((channel["residual"] for channel in part["channels"]), default=None),
+                part["png_scale"],
+                out / part["exr"],
+            )
+            for entry in entries
+            for part in entry["parts"]
+        ],
+    )

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: BSD-3-Clause
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl import images, scenes, store
+
+from .conftest import Program
+
+
+def test_pattern_pushed_through_the_transport_is_the_picture(
+    program: Program, transport: Path, picture: Path, tmp_path: Path
+) -> None:
+    outcome = program("compensate", transport, picture, "--out", tmp_path / "out", "--rtol", "1e-4", "--json")
+    assert outcome.code == 0, outcome.err
+    (entry,) = outcome.json["pictures"]
+    assert entry["clipped"] == 0
+    pattern = images.read(tmp_path / "out" / entry["pattern"]["exr"])
+    desired = images.read(picture)
+    difference = np.linalg.norm(ltcl.load(transport) @ pattern - desired)
+    assert difference < 2e-4 * np.linalg.norm(desired)
+    shown = images.read(tmp_path / "out" / entry["pattern"]["png"])
+    assert (
+        np.abs(shown - np.stack([pattern] * 3, axis=-1) if shown.ndim == 3 else shown - pattern).max() < 0.01
+    )
+
+
+def test_report_tells_what_happened(
+    program: Program, transport: Path, picture: Path, large_picture: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    arguments = [
+        "--resize",
+        "--out",
+        out,
+        "--method",
+        "chebyshev",
+        "--gain",
+        "0.5",
+        "--first-bounce",
+        "exact",
+    ]
+    assert program("compensate", transport, picture, large_picture, *arguments).code == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["versions"]["ltcl"] == ltcl.__version__
+    assert report["options"]["gain"] == 0.5
+    assert [entry["file"] for entry in report["pictures"]] == [str(picture), str(large_picture)]
+    for entry in report["pictures"]:
+        assert {channel["method"] for channel in entry["channels"]} == {"chebyshev"}
+        assert all(channel["products"] == len(channel["residuals"]) - 1 for channel in entry["channels"])
+        assert all(
+            (out / entry[part][kind]).is_file()
+            for part in ("pattern", "appearance")
+            for kind in ("exr", "png")
+        )
+
+
+def test_colour(program: Program, colour_transport: Path, large_picture: Path, tmp_path: Path) -> None:
+    outcome = program(
+        "compensate",
+        colour_transport,
+        large_picture,
+        "--out",
+        tmp_path / "out",
+        "--resize",
+        "--high",
+        "9",
+        "--json",
+    )
+    (entry,) = outcome.json["pictures"]
+    assert len(entry["channels"]) == 3
+    assert images.read(tmp_path / "out" / entry["pattern"]["exr"]).shape == (4, 12, 3)
+    assert entry["pattern"]["png_scale"] == 9
+
+
+def test_background_is_taken_off(program: Program, transport: Path, picture: Path, tmp_path: Path) -> None:
+    lamp = tmp_path / "lamp.exr"
+    images.write(lamp, np.full((5, 10), 0.05, np.float32))
+    out = tmp_path / "out"
+    arguments = ["--background", lamp, "--rtol", "1e-4", "--out", out]
+    assert program("compensate", transport, picture, *arguments).code == 0
+    pattern = images.read(out / "sky_pattern.exr")
+    seen = ltcl.load(transport) @ pattern + 0.05
+    np.testing.assert_allclose(seen, images.read(picture), rtol=2e-3)
+
+
+def test_pictures_of_one_name_do_not_collide(
+    program: Program, transport: Path, picture: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / picture.name
+    copy.write_bytes(picture.read_bytes())
+    out = tmp_path / "out"
+    assert program("compensate", transport, picture, copy, "--out", out).code == 0
+    assert {"sky_pattern.exr", "sky_2_pattern.exr"} <= {path.name for path in out.iterdir()}
+
+
+def test_clipping_comes_with_advice(program: Program, transport: Path, tmp_path: Path) -> None:
+    bright = tmp_path / "bright.exr"
+    images.write(bright, np.full((5, 10), 2.0, np.float32))
+    outcome = program("compensate", transport, bright, "--out", tmp_path / "out")
+    assert outcome.code == 0
+    assert "try --gain 0." in outcome.err
+
+
+def test_divergence_is_one_line_and_touches_nothing(
+    program: Program, large_picture: Path, tmp_path: Path
+) -> None:
+    closed = tmp_path / "closed.npz"
+    store.save(closed, scenes.box(3, albedo=0.8).transport())
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "report.json").write_text("old")
+    outcome = program("compensate", closed, large_picture, "--resize", "--out", out, "--method", "jacobi")
+    outcome.refused("jacobi: diverged", "--method chebyshev")
+    assert (out / "report.json").read_text() == "old"
+    assert len(list(out.iterdir())) == 1
+
+
+def test_earlier_results_give_way_to_new_ones(
+    program: Program, transport: Path, picture: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "report.json").write_text("old")
+    (out / "mine.txt").write_text("mine")
+    assert program("compensate", transport, picture, "--out", out).code == 0
+    assert json.loads((out / "report.json").read_text())["command"] == "compensate"
+    assert (out / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["{transport}", "{large}"], ["20 x 30", "5 x 10", "--resize"]),
+        (["{transport}", "nowhere.png"], ["nowhere.png: no such file"]),
+        (["{transport}", "sky.xyz"], ["extension .xyz is unknown"]),
+        (["nowhere.npz", "{picture}"], ["nowhere.npz: no such file"]),
+        (["{transport}", "{picture}", "--device", "nonsense"], ["device is 'nonsense'"]),
+        (["{transport}", "{picture}", "--grid", "7x7"], ["h * w must be 50"]),
+        (["{transport}", "{picture}", "--gain", "0"], ["gain is 0.0", "above 0"]),
+        (["{transport}", "{picture}", "--low", "1", "--high", "0"], ["bounds[1] is 0.0", "above 1"]),
+        (["{transport}", "{picture}", "--rtol", "nan"], ["rtol is nan"]),
+        (["{transport}", "{picture}", "--background", "{large}"], ["20 x 30", "--resize"]),
+    ],
+)
+def test_refusals_leave_no_folder(
+    program: Program,
+    transport: Path,
+    picture: Path,
+    large_picture: Path,
+    tmp_path: Path,
+    arguments: list[str],
+    parts: list[str],
+) -> None:
+    names = {"transport": transport, "picture": picture, "large": large_picture}
+    filled = [argument.format(**names) for argument in arguments]
+    program("compensate", *filled, "--out", tmp_path / "out").refused(*parts)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rectangular_transport_is_refused(program: Program, picture: Path, tmp_path: Path) -> None:
+    path = tmp_path / "T.npz"
+    np.savez(path, T=np.ones((6, 50)), grid=(5, 10), camera_grid=(2, 3))
+    program("compensate", path, picture, "--out", tmp_path / "out").refused("6 x 50", "square")
+
+
+def test_out_that_is_a_file_is_refused(
+    program: Program, transport: Path, picture: Path, tmp_path: Path
+) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    program("compensate", transport, picture, "--out", taken).refused("is a file")
+    assert taken.read_text() == "mine"

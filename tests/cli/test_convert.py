@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: BSD-3-Clause
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from ltcl.store import formats
+
+from .conftest import Program
+
+
+@pytest.mark.parametrize("extension", [".npz", ".npy"])
+def test_values_survive(program: Program, transport: Path, tmp_path: Path, extension: str) -> None:
+    there, back = tmp_path / f"there{extension}", tmp_path / "back.npz"
+    assert program("convert", transport, there).code == 0
+    assert program("convert", there, back, "--grid", "5x10").code == 0
+    before, after = formats.read(transport), formats.read(back)
+    assert after.grid == (5, 10)
+    np.testing.assert_array_equal(np.asarray(before.matrices[0]), np.asarray(after.matrices[0]))
+
+
+def test_sparse_to_matrix_market(program: Program, tmp_path: Path) -> None:
+    source, target = tmp_path / "T.npz", tmp_path / "T.mtx"
+    T = scipy.sparse.csr_array(np.diag([1.0, 2.0, 3.0, 4.0]))
+    scipy.sparse.save_npz(source, T)
+    facts = program("convert", source, target, "--grid", "2x2", "--json").json
+    assert (facts["file"], facts["entries"]) == (str(target), 4)
+    assert formats.read(target).grid == (2, 2)
+
+
+def test_losing_the_grid_is_said(program: Program, transport: Path, tmp_path: Path) -> None:
+    outcome = program("convert", transport, tmp_path / "T.npy")
+    assert "--grid 5x10" in outcome.err
+
+
+def test_refusals_leave_the_old_file(program: Program, transport: Path, tmp_path: Path) -> None:
+    target = tmp_path / "T.npz"
+    target.write_text("old")
+    program("convert", transport, tmp_path / "T.xyz").refused("extension .xyz is unknown")
+    program("convert", tmp_path / "nowhere.npy", target).refused("no such file")
+    program("convert", transport, target, "--grid", "6x10").refused("h * w must be 50")
+    assert target.read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["T.npz"]

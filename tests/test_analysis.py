@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`analyze` foretells what `solve` then does."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import scipy.sparse
+from scipy.sparse.linalg import aslinearoperator
+
+import ltcl
+from ltcl.errors import InputError
+from tests.problems import enclosure, lambertian
+
+GRID = (5, 8)
+
+
+def transport(scene, device, form=np.asarray):
+    return ltcl.Transport(form(scene.T), GRID, first_bounce=scene.F, device=device)
+
+
+@pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
+def test_norms_and_radius_are_those_of_numpy(device, form):
+    scene = lambertian(40, 1.7)
+    (channel,) = ltcl.analyze(transport(scene, device, form)).channels
+    assert channel.norm_one == pytest.approx(np.linalg.norm(scene.R, 1), rel=1e-5)
+    assert channel.norm_inf == pytest.approx(np.linalg.norm(scene.R, np.inf), rel=1e-5)
+    assert channel.norm_frobenius == pytest.approx(np.linalg.norm(scene.R), rel=1e-5)
+    assert channel.spectral_radius == pytest.approx(1.7, rel=2e-3)
+    assert channel.albedo == pytest.approx(1.7 / 2.7, rel=2e-3)
+    assert channel.first_bounce == pytest.approx((scene.F.min(), np.median(scene.F), scene.F.max()))
+    assert channel.bounds == pytest.approx((0.5, scene.S.sum(axis=1).max()), rel=1e-5)
+
+
+@pytest.mark.parametrize("albedo", [0.2, 0.45, 0.62])
+def test_a_closed_box_with_its_true_first_bounce(device, albedo):
+    """Eq. 14; form factors are good to 1e-3."""
+    scene = ltcl.scenes.box(3, albedo=albedo)
+    T = scene.transport(first_bounce=scene.first_bounce, device=device)
+    (channel,) = ltcl.analyze(T).channels
+    assert channel.spectral_radius == pytest.approx(albedo / (1 - albedo), rel=5e-3)
+    assert math.isinf(channel.products["jacobi"]) == (albedo > 0.5)
+
+
+@pytest.mark.parametrize("rtol", [1e-2, 1e-4])
+@pytest.mark.parametrize("albedo", [0.1, 0.3, 0.45, 0.48])
+def test_the_forecast_of_the_series_is_met(device, albedo, rtol):
+    scene = enclosure(40, albedo)
+    T = transport(scene, device)
+    forecast = ltcl.analyze(T, rtol=rtol).channels[0].products
+    even = np.ones(40)  # the dominant eigenvector
+    some = scene.S @ np.random.default_rng(0).uniform(0.2, 1.0, 40)
+    for b, least in ((even, 1), (some, 2)):
+        for method, extra in (("jacobi", 0), ("neumann", 1)):  # the series confirms its residual
+            products = ltcl.solve(T.interreflection, b, method, rtol=rtol).products - extra
+            assert forecast[method] - least <= products <= forecast[method] + 1
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.62, 0.9])
+def test_chebyshev_needs_no_more_than_its_forecast(device, albedo):
+    scene = enclosure(40, albedo)
+    T = transport(scene, device)
+    forecast = ltcl.analyze(T).channels[0].products["chebyshev"]
+    s = ltcl.solve(T.interreflection, np.random.default_rng(0).normal(size=40), "chebyshev")
+    assert s.products <= forecast + 1
+
+
+def test_colour_masks_and_json(device):
+    matrices = [lambertian(40, rho).T for rho in (0.3, 0.6, 1.2)]
+    for matrix in matrices:
+        matrix[:, 3] = 0.0
+    a = ltcl.analyze(ltcl.Transport(matrices, GRID, device=device, on_dark="mask"), rtol=1e-3)
+    assert (a.shape, a.grid, a.rtol, a.masked) == ((40, 40), GRID, 1e-3, 1)
+    assert a.nbytes == 3 * 40 * 40 * 4
+    assert len(a.channels) == 3
+    assert min(channel.first_bounce[0] for channel in a.channels) > 0.0  # of lit pixels
+    report = json.loads(json.dumps(a.to_dict(), allow_nan=False))
+    assert [channel["products"]["jacobi"] is None for channel in report["channels"]] == [False, False, True]
+
+
+def test_an_operator_that_hides_its_entries_has_no_norms(device):
+    scene = lambertian(40, 0.5)
+    a = ltcl.analyze(transport(scene, device, aslinearoperator))
+    assert math.isnan(a.channels[0].norm_inf)
+    assert a.channels[0].spectral_radius == pytest.approx(0.5, rel=2e-3)
+    json.dumps(a.to_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize("rtol", [0.0, -1.0, 1.0, np.nan, "x", None])
+def test_a_bad_tolerance_is_refused(device, rtol):
+    with pytest.raises(InputError, match=r"rtol is .*; it must be a finite number above 0 and below 1"):
+        ltcl.analyze(transport(lambertian(40, 0.5), device), rtol=rtol)

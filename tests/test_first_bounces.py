@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""F from T, in closed form where nothing sees itself; what it leaves of T; pixels that it leaves dark."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse.linalg import aslinearoperator
+
+import ltcl
+from ltcl.errors import InputError
+from ltcl.operators import CSR
+from tests.problems import Scene, lambertian
+
+GRID = (4, 6)
+N = 24
+random = np.random.default_rng(30)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.01, 20.0), st.floats(0.1, 1.0))
+def test_exact_is_exact_where_nothing_sees_itself(seed, rho, density):
+    """(T^-1)_ii = (1 - A_ii) / F_i with A_ii = 0; diag(T) holds returned light and so is larger."""
+    scene = lambertian(N, rho, seed, density)
+    for matrix in (scene.T, scipy.sparse.csr_array(scene.T)):
+        exact, diagonal = (
+            ltcl.Transport(matrix, GRID, first_bounce=how).first_bounce for how in ("exact", "diagonal")
+        )
+        np.testing.assert_allclose(exact, scene.F, rtol=1e-9 * (1 + rho))
+        np.testing.assert_array_equal(diagonal, np.diag(scene.T))
+        assert np.all(diagonal >= exact * (1 - 1e-9 * (1 + rho)))
+
+
+def test_colour_has_one_F_a_channel():
+    scenes = [lambertian(N, rho) for rho in (0.5, 1.0, 2.0)]
+    T = ltcl.Transport([scene.T for scene in scenes], GRID, first_bounce="exact")
+    np.testing.assert_allclose(T.first_bounce, [scene.F for scene in scenes], rtol=1e-9)
+    for given_F in (scenes[0].F, [scene.F for scene in scenes]):
+        T = ltcl.Transport([scene.T for scene in scenes], GRID, first_bounce=given_F)
+        np.testing.assert_array_equal(T.first_bounce, np.broadcast_to(given_F, (3, N)))
+
+
+# What F leaves of T: R = T F^-1 - I.
+
+
+@pytest.mark.parametrize("form", [np.asarray, np.float32, scipy.sparse.csr_array])
+@pytest.mark.parametrize("first_bounce", ["diagonal", "exact"])
+def test_S_F_is_T(device, form, first_bounce):
+    """R is rounded once: no junk on the diagonal, none beside it."""
+    scene = lambertian(N, 0.9)
+    T = ltcl.Transport(form(scene.T), GRID, first_bounce, device=device)
+    (S,) = T.systems
+    assert np.all(np.abs(S.to_dense() * T.first_bounce - scene.T) <= 2.0**-22 * scene.T)
+    if first_bounce == "diagonal":
+        assert not S.R.diagonal().any()
+
+
+@pytest.mark.parametrize("gain", [1.0, 49.0, 0.1])
+def test_a_sparse_R_stores_nothing_where_F_took_all(device, gain):
+    """x * (1 / x) is not always 1; junk of 1e-16 must not keep a diagonal alive."""
+    T = ltcl.Transport(scipy.sparse.csr_array(lambertian(N, 0.9).T * gain), GRID, device=device)
+    (S,) = T.systems
+    assert isinstance(S.R, CSR)
+    assert S.R.nnz == N * (N - 1)
+
+
+# Dark pixels.
+
+DARK = [2, 9, 23]
+LIT = np.setdiff1d(np.arange(N), DARK)
+
+
+def darkened(scene: Scene, how: str) -> np.ndarray:
+    """T whose projector pixels DARK light nothing, whose camera pixels DARK see nothing, or both."""
+    T = scene.T
+    if "column" in how:
+        T[:, DARK] = 0.0
+    if "row" in how:
+        T[DARK] = 0.0
+    if "negative" in how:
+        T[DARK, DARK] = -1e-3
+    return T
+
+
+HOW = ["column", "row", "column and row", "negative"]
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_dark_pixels_are_refused_with_a_list(how):
+    T = darkened(lambertian(N, 0.8), how)
+    says = (
+        r"first_bounce is zero or negative at 3 of 24 pixels \(row, column\): \(0, 2\), \(1, 3\), \(3, 5\); "
+        "it must be positive; give on_dark='mask' to leave these pixels unlit"
+    )
+    with pytest.raises(InputError, match=says) as caught:
+        ltcl.Transport(T, GRID)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_long_list_is_cut():
+    F = np.where(np.arange(N) < 11, 0.0, 1.0)
+    with pytest.raises(InputError, match=r"11 of 24 pixels.*\(1, 1\) and 3 more; it must be positive"):
+        ltcl.Transport(np.eye(N), GRID, first_bounce=F)
+
+
+@pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
+@pytest.mark.parametrize("first_bounce", ["diagonal", "exact"])
+@pytest.mark.parametrize("how", HOW[:3])
+def test_masked_pixels_stay_unlit_and_the_others_are_right(device, how, first_bounce, form):
+    T64 = darkened(lambertian(N, 0.8), how)
+    T = ltcl.Transport(form(T64), GRID, first_bounce, device=device, on_dark="mask")
+    np.testing.assert_array_equal(np.flatnonzero(T.masked), DARK)
+    assert not T.first_bounce[DARK].any()
+
+    p = random.uniform(0.1, 0.9, N)
+    p[DARK] = 0.0
+    np.testing.assert_allclose((T @ p.reshape(GRID)).ravel(), T64 @ p, rtol=1e-6)
+    desired = T64 @ p
+    desired[DARK] = 0.5  # what is wanted there cannot matter
+    c = ltcl.compensate(T, desired.reshape(GRID), rtol=1e-5)
+    np.testing.assert_allclose(c.pattern.ravel(), p, rtol=0, atol=1e-3)
+    assert not c.pattern.ravel()[DARK].any()
+    assert c.clipped == 0.0
+    np.testing.assert_allclose(c.appearance.ravel()[LIT], desired[LIT], rtol=1e-3)
+
+
+def test_a_pixel_dark_in_one_channel_is_masked_in_all(device):
+    matrices = [lambertian(N, 0.5).T, darkened(lambertian(N, 0.5), "column"), lambertian(N, 0.5).T]
+    T = ltcl.Transport(matrices, GRID, device=device, on_dark="mask")
+    np.testing.assert_array_equal(np.flatnonzero(T.masked), DARK)
+    assert not T.first_bounce[:, DARK].any()
+    assert not ltcl.compensate(T, np.full(GRID, 0.1)).pattern.reshape(N, 3)[DARK].any()
+
+
+@pytest.mark.parametrize(
+    ("matrix", "F", "says"),
+    [
+        (np.zeros((N, N)), "diagonal", "zero or negative at every pixel; there is nothing left to light"),
+        (aslinearoperator(np.eye(N)), np.arange(N), "a LinearOperator cannot be masked here"),
+    ],
+)
+def test_what_cannot_be_masked_is_refused(matrix, F, says):
+    with pytest.raises(InputError, match=says):
+        ltcl.Transport(matrix, GRID, first_bounce=F, on_dark="mask")

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`separate`: each bounce is A^k F p where F is true, and nothing of the picture is lost whatever F is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import ltcl
+from ltcl.errors import ConvergenceError, InputError, InputTypeError
+from ltcl.solvers import Status
+from tests.problems import lambertian
+
+GRID = (4, 7)
+N = 28
+SCENES = [lambertian(N, rho, seed=60 + channel) for channel, rho in enumerate((0.8, 2.0, 0.3))]
+SCENE = SCENES[0]
+random = np.random.default_rng(61)
+
+
+def transport(device, scene=SCENE, **arguments):
+    return ltcl.Transport(scene.T, GRID, **({"first_bounce": scene.F, "device": device} | arguments))
+
+
+def close(found: np.ndarray, wanted: np.ndarray, tolerance: Any) -> bool:
+    return bool(np.linalg.norm(np.asarray(found, float).ravel() - np.ravel(wanted)) <= tolerance)
+
+
+@pytest.mark.parametrize("first_bounce", ["given", "exact"])
+@pytest.mark.parametrize("method", ["auto", "jacobi", "neumann", "chebyshev", "direct"])
+def test_the_bounces_are_powers_of_A(device, method, first_bounce):
+    """Eq. 27 against A^k F p in float64. A solve is off by rtol |b|, the next by 1 + m times as much."""
+    p, rtol = random.uniform(0.0, 1.0, N), 1e-4
+    T = transport(device, first_bounce=SCENE.F if first_bounce == "given" else "exact")
+    image = SCENE.T @ p
+    b = ltcl.separate(T, image.reshape(GRID), bounces=5, method=method, rtol=rtol)
+    assert b.bounces.shape == (5, *GRID)
+    for k, found in enumerate([b.direct, *b.bounces]):
+        assert close(found, SCENE.bounce(k, p), 2 * (k + 1) * rtol * np.linalg.norm(image))
+    assert close(b.indirect, image - SCENE.F * p, 2 * rtol * np.linalg.norm(image))
+    later = image - sum(SCENE.bounce(k, p) for k in range(6))
+    assert close(b.rest, later, 12 * rtol * np.linalg.norm(image))
+
+
+@pytest.mark.parametrize("rho", [1.5, 4.0])
+def test_where_the_series_diverges_bounces_come_all_the_same(device, rho):
+    scene, p = lambertian(N, rho, seed=62), random.uniform(0.0, 1.0, N)
+    b = ltcl.separate(transport(device, scene), (scene.T @ p).reshape(GRID), method="chebyshev", rtol=1e-5)
+    for k, found in enumerate([b.direct, *b.bounces]):
+        assert close(found, scene.bounce(k, p), 1e-3 * np.linalg.norm(scene.T @ p))
+    with pytest.raises(ConvergenceError) as caught:
+        ltcl.separate(transport(device, scene), (scene.T @ p).reshape(GRID), method="jacobi")
+    assert caught.value.solution.status is Status.DIVERGED
+
+
+@pytest.fixture(scope="module")
+def transports(device):
+    return {
+        "exact": transport(device),
+        "diagonal": transport(device, first_bounce="diagonal"),
+        "colour": ltcl.Transport([scene.T for scene in SCENES], GRID, device=device),
+    }
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.sampled_from(["exact", "diagonal", "colour"]),
+    st.sampled_from([GRID, (*GRID, 3), (2, *GRID), (3, *GRID, 3), (N,)]),
+    st.integers(0, 6),
+    st.floats(1e-5, 0.5),
+    st.sampled_from(["chebyshev", "direct"]),
+    st.integers(0, 1000),
+)
+def test_nothing_of_the_picture_is_lost(transports, name, shape, bounces, rtol, method, seed):
+    """Direct, bounces and rest sum to the picture to rounding, for any tolerance and any first bounce."""
+    image = np.random.default_rng(seed).normal(size=shape)
+    b = ltcl.separate(transports[name], image, bounces, method=method, rtol=rtol)
+    wanted = image if shape[-1] == 3 or name != "colour" else np.repeat(image[..., None], 3, axis=-1)
+    assert b.direct.shape == b.indirect.shape == b.rest.shape == wanted.shape
+    assert b.bounces.shape == (bounces, *wanted.shape)
+    parts = [b.direct, *b.bounces, b.rest]
+    assert all(part.dtype == np.float32 for part in parts)
+    size = sum(np.abs(part, dtype=np.float64) for part in parts)
+    assert np.all(np.abs(np.sum(parts, axis=0, dtype=np.float64) - wanted) <= 2.0**-23 * size)
+    assert np.all(np.abs(b.direct.astype(float) + b.indirect - wanted) <= 2.0**-22 * size)
+
+
+def test_negative_values_are_not_clipped(device):
+    """A picture that no pattern makes has bounces below zero; so has noise."""
+    image = random.normal(size=N)
+    b = ltcl.separate(transport(device), image, bounces=3, rtol=1e-6, method="direct")
+    left = image
+    for found in [b.direct, *b.bounces]:
+        wanted = left - SCENE.A @ left
+        left = left - wanted
+        assert wanted.min() < 0
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-5)
+
+
+def test_frames_and_colours_are_separated_one_by_one(device):
+    T = transport(device)
+    images = random.uniform(0.0, 1.0, (2, *GRID, 3))
+    together = ltcl.separate(T, images, bounces=2, rtol=1e-5)
+    for frame in range(2):
+        for colour in range(3):
+            alone = ltcl.separate(T, images[frame, ..., colour], bounces=2, rtol=1e-5)
+            np.testing.assert_allclose(together.direct[frame, ..., colour], alone.direct, atol=1e-4)
+            np.testing.assert_allclose(together.bounces[:, frame, ..., colour], alone.bounces, atol=1e-4)
+
+
+def test_each_channel_has_its_own_bounces(device):
+    T = ltcl.Transport([scene.T for scene in SCENES], GRID, "exact", device=device)
+    p = random.uniform(0.0, 1.0, N)
+    image = np.stack([scene.T @ p for scene in SCENES], axis=-1).reshape(*GRID, 3)
+    b = ltcl.separate(T, image, bounces=2, rtol=1e-6)
+    for k, found in enumerate([b.direct, *b.bounces]):
+        wanted = np.stack([scene.bounce(k, p) for scene in SCENES], axis=-1)
+        assert close(found, wanted, 1e-4 * np.linalg.norm(image))
+    assert [isinstance(channels, tuple) and len(channels) for channels in b.solutions] == [3, 3, 3]
+
+
+def test_no_bounces_is_direct_and_rest(device):
+    image = random.uniform(0.0, 1.0, GRID)
+    b = ltcl.separate(transport(device), image, bounces=0)
+    assert b.bounces.shape == (0, *GRID)
+    np.testing.assert_array_equal(b.rest, b.indirect)
+    (solution,) = b.solutions
+    assert isinstance(solution, ltcl.Solution)
+    assert solution.converged
+
+
+def test_a_dark_picture_has_dark_bounces(device):
+    b = ltcl.separate(transport(device), np.zeros(GRID), method="chebyshev")
+    assert not np.stack([b.direct, *b.bounces, b.rest]).any()
+
+
+FINE = np.ones(GRID)
+BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
+    "image of another size": (
+        {"image": np.ones((7, 4))},
+        InputError,
+        r"image has shape \(7, 4\); .*\(4, 7\)",
+    ),
+    "image has NaN": ({"image": FINE * np.nan}, InputError, "image has 28 NaN or infinite value"),
+    "bounces negative": (
+        {"bounces": -1},
+        InputError,
+        "bounces is -1; it must be a whole number of at least 0",
+    ),
+    "bounces a fraction": ({"bounces": 1.5}, InputError, "bounces is 1.5; it must be"),
+    "bounces a flag": ({"bounces": True}, InputError, "bounces is True; it must be"),
+    "unknown method": ({"method": "magic"}, InputError, "method is 'magic'; it must be one of"),
+    "unknown option": ({"omega": 1}, InputTypeError, "unknown option 'omega'"),
+    "rtol": ({"rtol": 2.0}, InputError, "rtol is 2.0; it must be"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_refused_by_name(device, case):
+    change, error, says = BAD[case]
+    with pytest.raises(error, match=says) as caught:
+        ltcl.separate(transport(device), **{"image": FINE, **change})
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Bounds and forecasts against eigenvalues in float64 and closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.sparse
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial.chebyshev import Chebyshev
+
+from ltcl import theory
+from ltcl.operators import CSR, Dense, IdentityPlus, as_operator
+from tests.problems import enclosure, lambertian
+
+random = np.random.default_rng(40)
+
+
+@pytest.mark.parametrize("albedo", [0.1, 0.45, 0.5, 0.62, 0.9])
+def test_a_closed_room_has_the_radius_of_eq_14(device, albedo):
+    """rho(R) = ||R||_inf = m / (1 - m) where every row of form factors sums to one."""
+    R = Dense(device, enclosure(40, albedo).R)
+    rho = theory.spectral_radius(R)
+    assert rho.value == pytest.approx(albedo / (1 - albedo), rel=1e-3)
+    assert rho.albedo == pytest.approx(albedo, rel=1e-3)
+    assert R.norms().inf == pytest.approx(albedo / (1 - albedo), rel=1e-5)
+    assert rho.products < 20
+
+
+@pytest.mark.parametrize("density", [1.0, 0.3, 0.1])
+@pytest.mark.parametrize("rho", [0.01, 0.9, 30.0])
+def test_the_radius_is_that_of_the_eigenvalues(device, rho, density):
+    R = lambertian(50, rho, seed=41, density=density).R
+    wanted = np.abs(np.linalg.eigvals(R)).max()
+    found = theory.spectral_radius(as_operator(R, device), rtol=1e-3)
+    assert found.value == pytest.approx(wanted, rel=5e-3)
+    assert found.change < 1e-3
+
+
+def test_two_walls_that_only_see_each_other(device):
+    """A of a dihedral has -rho beside rho; its mean growth is rho all the same."""
+    A = np.zeros((20, 20))
+    A[:10, 10:] = random.random((10, 10))
+    A[10:, :10] = 0.1 * A[:10, 10:].T
+    wanted = np.abs(np.linalg.eigvals(A)).max()
+    assert theory.spectral_radius(Dense(device, A)).value == pytest.approx(wanted, rel=1e-3)
+
+
+@pytest.mark.parametrize("R", [np.zeros((5, 5)), np.triu(np.ones((5, 5)), 1)], ids=["zero", "nilpotent"])
+def test_light_that_never_returns_has_radius_zero(device, R):
+    found = theory.spectral_radius(as_operator(R, device))
+    assert (found.value, found.albedo) == (0.0, 0.0)
+    assert found.products <= 6
+
+
+def test_one_pixel(device):
+    assert theory.spectral_radius(as_operator([[0.3]], device)).value == pytest.approx(0.3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.01, 50.0), st.floats(0.05, 1.0), st.integers(2, 30))
+def test_free_bounds_hold_the_spectrum_of_any_diffuse_scene(device, seed, rho, density, n):
+    scene = lambertian(n, rho, seed, density)
+    spectrum = np.linalg.eigvals(scene.S)
+    assert np.abs(spectrum.imag).max() < 1e-6 * (1 + rho)  # self-adjoint in the area / albedo product
+    lower, upper = theory.free_bounds(IdentityPlus(Dense(device, scene.R)))
+    room = 1e-5 * (1 + rho)
+    assert lower - room <= spectrum.real.min()
+    assert spectrum.real.max() <= upper + room
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.8])
+def test_free_bounds_of_the_forward_dual(device, albedo):
+    scene = enclosure(30, albedo)
+    spectrum = np.linalg.eigvalsh(np.eye(30) - scene.A)
+    lower, upper = theory.free_bounds(IdentityPlus(CSR(device, scipy.sparse.csr_array(scene.A)), sign=-1))
+    assert lower <= spectrum[0] * (1 + 1e-5)
+    assert spectrum[-1] <= upper
+
+
+@pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
+@pytest.mark.parametrize("rho", [0.0, 1e-3, 0.3, 0.77, 0.99, 1.0, 4.0])
+def test_the_series_takes_the_first_power_below_the_tolerance(rho, rtol):
+    if rho >= 1.0:
+        assert theory.series_products(rho, rtol) == math.inf
+        return
+    k = theory.series_products(rho, rtol)
+    assert k >= 1
+    assert rho**k <= rtol * (1 + 1e-12)
+    assert k == 1 or rho ** (k - 1) > rtol * (1 - 1e-12)
+
+
+@pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
+@pytest.mark.parametrize(("lower", "upper"), [(0.5, 1.5), (0.5, 2.0), (0.5, 5.0), (0.5, 50.0), (0.2, 1.8)])
+def test_chebyshev_takes_the_first_degree_below_the_tolerance(lower, upper, rtol):
+    """The best polynomial of degree k with p(0) = 1 has maximum 1 / T_k(centre / radius) on the interval."""
+    k = theory.chebyshev_products(lower, upper, rtol)
+    centre = (upper + lower) / (upper - lower)
+    assert 1 / Chebyshev.basis(k)(centre) <= rtol * (1 + 1e-9)
+    assert k == 1 or 1 / Chebyshev.basis(k - 1)(centre) > rtol * (1 - 1e-9)
+
+
+def test_a_spectrum_of_one_point_takes_one_product():
+    assert theory.chebyshev_products(2.0, 2.0, 1e-9) == 1
