@@ -132,7 +132,11 @@ def test_a_pixel_dark_in_one_channel_is_masked_in_all(device):
     T = ltcl.Transport(matrices, GRID, device=device, on_dark="mask")
     np.testing.assert_array_equal(np.flatnonzero(T.masked), DARK)
     assert not T.first_bounce[:, DARK].any()
-    assert not ltcl.compensate(T, np.full(GRID, 0.1)).pattern.reshape(N, 3)[DARK].any()
+    dim = ltcl.compensate(T, np.full(GRID, 0.1), bounds=(0.2, 1.0)).pattern.reshape(N, 3)
+    assert not dim[DARK].any()
+    assert dim[LIT].min() >= np.float32(0.2)
+    with pytest.raises(InputError, match=r"at 3 of 24 pixels \(row, column\): \(0, 2\), \(1, 3\), \(3, 5\)"):
+        ltcl.Transport(matrices, GRID)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -53,10 +54,7 @@ def _cell(value: Any) -> str:
 
 
 def _is_number(text: str) -> bool:
-    return (
-        text in ("-", "diverges")
-        or text.replace(".", "").replace("-", "").replace("e", "").replace("%", "").strip().isdigit()
-    )
+    return text in ("-", "diverges") or re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?( %)?", text) is not None
 
 
 class Steps:
@@ -87,11 +85,13 @@ class Steps:
         self._task = self._bar.add_task("", total=items * solves, text="")
 
     def __enter__(self) -> Steps:
-        self._bar.start()
+        if self._is_terminal:
+            self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        if self._is_terminal:
+            self._bar.stop()
 
     def item(self, name: str) -> None:
         """Begin the next item."""
@@ -105,12 +105,18 @@ class Steps:
     def solve(self, rtol: float) -> Callable[[int, float], None]:
         """A `callback` for the solves of this item: moves the bar by the digits gained."""
 
-        def report_residual(iteration: int, residual: float) -> None:
+        def step(iteration: int, residual: float) -> None:
             self._solve += iteration == 0
-            gained = math.log(max(residual, 1e-30)) / math.log(rtol) if 0 < rtol < 1 else 0.0
             done = (self._item - 1) * self._solves + min(
-                self._solve - 1 + min(max(gained, 0.0), 1.0), self._solves
+                self._solve - 1 + _gained(residual, rtol), self._solves
             )
             self._bar.update(self._task, completed=done, text=f"residual {residual:.1e}")
 
-        return report_residual
+        return step
+
+
+def _gained(residual: float, rtol: float) -> float:
+    """Share of the digits that a solve to `rtol` must gain; 0 for a residual that has grown."""
+    if not 0 < rtol < 1 or not math.isfinite(residual):
+        return 0.0
+    return min(max(math.log(max(residual, 1e-30)) / math.log(rtol), 0.0), 1.0)

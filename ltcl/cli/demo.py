@@ -18,7 +18,7 @@ _SIZE = Annotated[
 
 def run(
     out: options.Out = Path("ltcl-demo"),
-    size: _SIZE = 40,
+    size: _SIZE = 36,
     device: options.Device = None,
     json: options.Json = False,
 ) -> None:

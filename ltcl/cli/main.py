@@ -105,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Examples
     --------
-    >>> main(["--version"]).real  # doctest: +ELLIPSIS
+    >>> main(["--version"])  # doctest: +ELLIPSIS
     ltcl ...
     0
     """

@@ -42,7 +42,7 @@ class Demo:
 
 def run(
     out: str | os.PathLike[str] = "ltcl-demo",
-    size: int = 40,
+    size: int = 36,
     *,
     device: Any = None,
     progress: Callable[[str], object] | None = None,

@@ -67,6 +67,7 @@ def report_of(found: Experiment, seconds: dict[str, float]) -> dict[str, Any]:
                 "colours_only": found.colours_only.error,
                 "compensated": found.compensated.error,
             },
+            "exposure_of_views": {name: exposure for name, (_, _, exposure) in _captions(found).items()},
             "compensation": {
                 "gain": compensation.gain,
                 "clipped": compensation.clipped,

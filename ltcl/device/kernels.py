@@ -24,9 +24,12 @@ class Kernel:
     """
 
     def __init__(self, device: Device, built: Any, name: str, types: tuple[type | None, ...]) -> None:
+        import pyopencl as cl
+
         self.device = device
         self.name = name
         self._kernel = built
+        self._errors = cl.Error
         # Untyped Python scalars are refused by pyopencl with CL_INVALID_VALUE: their types are set once.
         self._kernel.set_scalar_arg_dtypes(list(types))
         # Arguments live in the cl_kernel until the launch: one thread at a time.
@@ -41,8 +44,12 @@ class Kernel:
         if local is not None:
             size = tuple(-(-n // g) * g for n, g in zip(size, local, strict=True))
         raw = [getattr(argument, "buffer", argument) for argument in arguments]
-        with self._lock, failures.translated(f"running {self.name} on {self.device.name}"):
-            event = self._kernel(self.device.queue, size, local, *raw)
+        # No context manager here: a launch is microseconds, and a solve makes dozens.
+        try:
+            with self._lock:
+                event = self._kernel(self.device.queue, size, local, *raw)
+        except self._errors as error:
+            raise failures.explain(f"running {self.name} on {self.device.name}", error) from error
         self.device.record(self.name, event)
 
     def largest_group(self) -> int:

@@ -77,7 +77,8 @@ def survives(environment: dict[str, str]) -> bool:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **environment}
     try:
         child = subprocess.run(  # noqa: S603 - our own script with our own interpreter
-            [sys.executable, str(_SCRIPT)],
+            # -P: the script's folder must not be searched, its array.py is not the standard library's.
+            [sys.executable, "-P", str(_SCRIPT)],
             env=environment,
             capture_output=True,
             timeout=_SECONDS,
@@ -86,6 +87,8 @@ def survives(environment: dict[str, str]) -> bool:
     except subprocess.TimeoutExpired:
         return False
     # An ordinary Python error (no platform, one refused device) exits with 1: no harm to this process.
+    if child.returncode == 1:
+        log.info("the trial of the OpenCL drivers ended early: %s", child.stderr.decode(errors="replace"))
     return child.returncode in (0, 1)
 
 
@@ -149,7 +152,7 @@ def _hide(keep: list[Path], verdict: str) -> None:
     bundled = [file for file in keep if file.parent == _home() / ".libs"]
     for file in keep:
         if file not in bundled:
-            shutil.copyfile(file, folder / file.name)
+            shutil.copy2(file, folder / file.name)  # with its time, which is part of the key
     os.environ["OCL_ICD_VENDORS"] = str(folder)
     if not bundled:
         os.environ["PYOPENCL_HOME"] = ""

@@ -166,7 +166,7 @@ def test_refusals_leave_no_folder(
 def test_rectangular_transport_is_refused(program: Program, picture: Path, tmp_path: Path) -> None:
     path = tmp_path / "T.npz"
     np.savez(path, T=np.ones((6, 50)), grid=(5, 10), camera_grid=(2, 3))
-    program("compensate", path, picture, "--out", tmp_path / "out").refused("6 x 50", "square")
+    program("compensate", path, picture, "--out", tmp_path / "out").refused("2 x 3", "can only relight")
 
 
 def test_out_that_is_a_file_is_refused(

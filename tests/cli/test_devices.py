@@ -33,5 +33,5 @@ def test_unknown_ltcl_device_names_those_there_are(
 
 
 def test_without_devices_the_fix_is_told(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(devices.discovery, "list_devices", lambda: [])
+    monkeypatch.setattr(devices.discovery, "list_devices", list)
     program("devices").refused("no OpenCL device", "install")

@@ -15,7 +15,7 @@ from ltcl.cli.main import as_options
 
 from .conftest import Program
 
-COMMANDS = "devices doctor demo info analyze convert compensate separate relight".split()
+COMMANDS = ["devices", "doctor", "demo", "info", "analyze", "convert", "compensate", "separate", "relight"]
 
 
 def test_version(program: Program) -> None:

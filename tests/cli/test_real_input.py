@@ -51,15 +51,23 @@ def test_compensate_then_relight_gives_the_picture_back(
     assert np.linalg.norm(seen - wanted) < 0.01 * np.linalg.norm(wanted)
 
 
+# F is 0.93 % too bright on the diagonal, 0.26 % off in the exact form (PAPER.md); the photo has 0.15 % noise.
+@pytest.mark.parametrize(("first_bounce", "limit"), [("diagonal", 0.011), ("exact", 0.0045)])
 def test_separate_finds_the_true_bounces(
-    program: Program, real: Path, bounces: dict[str, np.ndarray], tmp_path: Path, device: Device
+    program: Program,
+    real: Path,
+    bounces: dict[str, np.ndarray],
+    tmp_path: Path,
+    device: Device,
+    first_bounce: str,
+    limit: float,
 ) -> None:
     images.write(tmp_path / "photo.exr", bounces["bounces"].sum(axis=0))
     out = tmp_path / "out"
-    assert program("separate", real, tmp_path / "photo.exr", "--bounces", "3", "--out", out).code == 0
+    arguments = ["--bounces", "3", "--first-bounce", first_bounce, "--out", out]
+    assert program("separate", real, tmp_path / "photo.exr", *arguments).code == 0
     inside = bounces["mask"].astype(bool)
+    light = np.linalg.norm(bounces["bounces"][0][inside])
     for name, truth in zip(("direct", "bounce_1", "bounce_2", "bounce_3"), bounces["bounces"], strict=False):
         found = images.read(out / f"{name}.exr")
-        error = np.linalg.norm((found - truth)[inside]) / np.linalg.norm(truth[inside])
-        # diag(T) is about 1 % too bright, and every further bounce inherits that once more.
-        assert error < 0.05, name
+        assert np.linalg.norm((found - truth)[inside]) < limit * light, name

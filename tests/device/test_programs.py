@@ -30,8 +30,9 @@ def test_messages_name_file_line_and_defines(device, own_kernels):
     text = str(error.value)
     assert text.startswith(f"kernels/own.cl does not compile on {device.name} ({device.driver}) with")
     assert "-DK=3 -DLANES=8" in text.splitlines()[0]
-    assert re.search(r"part\.h\W+2\b", text), text
     assert "nonsense" in text
+    if device.kind != "simulator":  # Oclgrind blots the #line marks out
+        assert re.search(r"part\.h\W+2\b", text), text
 
 
 @pytest.mark.parametrize(("file", "name"), [("csr", "csr_matvec"), ("dense", "dense_matvec")])

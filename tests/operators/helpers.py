@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ltcl.device import Array
+from ltcl.device import Array, Device
 from ltcl.operators import Operator
 from ltcl.operators.rows import Launch, RowOperator
 from tests import gallery, reference
@@ -65,6 +65,18 @@ def close(found: np.ndarray, expected: np.ndarray, error: np.ndarray) -> None:
 def same_bits(a: np.ndarray, b: np.ndarray) -> None:
     assert a.dtype == b.dtype
     np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32))
+
+
+def same_rows(device: Device, a: np.ndarray, b: np.ndarray, error: np.ndarray) -> None:
+    """Assert that rows do not depend on the slab they are in: to the bit, where the driver allows that.
+
+    Intel's compiler works on several rows at once, and contracts a * b + c to another rounding in those
+    that are left over at the end of a slab.
+    """
+    if "Intel" in device.driver:
+        close(a, b, 2 * error)
+    else:
+        same_bits(a, b)
 
 
 def norms_match(A: Operator, matrix: np.ndarray, rel: float) -> None:

@@ -41,6 +41,19 @@ def test_so_does_any_diffuse_scene(device, seed, rho):
     assert s.products <= theory.chebyshev_products(*theory.free_bounds(S), 1e-2) + 1
 
 
+@pytest.mark.parametrize("rtol", [1e-2, 1e-5])
+@pytest.mark.parametrize("rho", [50.0, 200.0])
+@pytest.mark.parametrize("seed", range(8))
+def test_residuals_that_swing_are_not_taken_for_trouble(device, seed, rho, rtol):
+    """Up to an albedo of 0.995; a residual close to 0 by chance is neither a floor nor a start of growth."""
+    scene = lambertian(60, rho, seed, density=0.3)
+    S = IdentityPlus(Dense(device, scene.R))
+    b = scene.S @ random.uniform(0.0, 1.0, scene.n)
+    s = ltcl.solve(S, b, "chebyshev", rtol=rtol)
+    # The bound holds in the area / albedo norm, whose weights differ by 3 at most.
+    assert s.products <= theory.chebyshev_products(*theory.free_bounds(S), rtol / np.sqrt(3)) + 1
+
+
 def test_the_forward_dual_has_bounds_of_its_own(device):
     """I - A of a closed room of albedo m has its spectrum in [1 - m, 1 + m]."""
     scene = enclosure(30, 0.8)

@@ -15,10 +15,11 @@ from ltcl.solvers import Status, direct
 from tests.problems import lambertian, residual
 
 random = np.random.default_rng(9)
+whole = np.random.default_rng(0).integers(-9, 9, (6, 6)).astype(float)  # float32 holds these to the bit
 SINGULAR = {
     "to the bit": np.array([[1.0, 2.0], [2.0, 4.0]]),
     "a zero row": np.diag([1.0, 0.0, 1.0]),
-    "to rounding": np.arange(36.0).reshape(6, 6),
+    "to rounding": np.vstack([whole[:5], whole[0] + whole[1] - whole[2]]),  # the last pivot is 1e-15, not 0
 }
 
 

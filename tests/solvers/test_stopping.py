@@ -8,9 +8,9 @@ import pytest
 
 import ltcl
 from ltcl.errors import ConvergenceError, LtclError
-from ltcl.operators import Dense, IdentityPlus
+from ltcl.operators import Dense, IdentityPlus, as_operator
 from ltcl.solvers import Status
-from tests.problems import lambertian, residual
+from tests.problems import enclosure, lambertian, residual
 
 ITERATIVE = ("jacobi", "neumann", "chebyshev")
 random = np.random.default_rng(10)
@@ -55,11 +55,20 @@ def test_below_the_floor_of_float32_it_stagnates(device, method):
         ltcl.solve(IdentityPlus(Dense(device, scene.R)), b, method, rtol=1e-10)
 
 
+def test_between_falling_and_growing_it_stagnates(device):
+    """In a closed room of albedo 1/2, rho(R) = 1: even light swings for ever (fig. 5c)."""
+    scene = enclosure(30, 0.5)
+    s = ltcl.solve(IdentityPlus(Dense(device, scene.R)), np.ones(30), "jacobi", throw=False)
+    assert s.status is Status.STAGNATED
+    np.testing.assert_allclose(s.residuals, 1.0, rtol=1e-3)
+
+
+@pytest.mark.parametrize("signs", [1.0, (-1.0) ** np.arange(8)], ids=["Inf", "NaN"])
 @pytest.mark.parametrize("method", ITERATIVE)
-def test_overflow_is_divergence(device, method):
-    """Products that leave float32 give Inf or NaN, which no comparison may take for small."""
-    S = np.eye(8) + np.full((8, 8), 1e30)
-    s = ltcl.solve(S, np.ones(8), method, throw=False)
+def test_overflow_is_divergence(device, method, signs):
+    """Products that leave float32 give Inf, or Inf - Inf, which no comparison may take for small."""
+    S = np.eye(8) + 3e38 * signs * np.ones((8, 8))
+    s = ltcl.solve(as_operator(S, device), np.full(8, 1.9), method, throw=False)
     assert s.status is Status.DIVERGED
     assert np.isfinite(s.x).all()
 

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: BSD-3-Clause
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from ltcl.cli import console
+
+
+def test_table_shows_names_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "a/[bold]very" + 40 * "y" + " long[/bold] name.npz"
+    console.table(("file", "rho"), [(name, 0.123456), ("b", None), ("c", float("inf"))])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].startswith(name)
+    assert [line.split()[-1] for line in lines] == ["rho", "0.1235", "-", "diverges"]
+
+
+def test_numbers_stand_right_and_words_left(capsys: pytest.CaptureFixture[str]) -> None:
+    console.table(("n", "word"), [(5, "a"), (123, "bcd")])
+    assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
+        "  n   word",
+        "  5   a",
+        "123   bcd",
+    ]
+
+
+def test_answer_is_strict_json(capsys: pytest.CaptureFixture[str]) -> None:
+    console.answer({"rho": np.float32(0.5), "products": float("inf"), "name": "Größe"})
+    out = capsys.readouterr().out
+    assert json.loads(out) == {"rho": 0.5, "products": None, "name": "Größe"}
+    assert "Größe" in out
+
+
+def test_without_a_terminal_short_runs_are_silent(capsys: pytest.CaptureFixture[str]) -> None:
+    with console.Steps(2) as steps:
+        steps.item("a.png")
+        steps.item("b.png")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_without_a_terminal_long_runs_say_where_they_are(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "_PATIENCE", -1.0)
+    with console.Steps(2) as steps:
+        steps.item("a.png")
+        steps.item("b.png")
+    assert capsys.readouterr().err == "ltcl: 1/2 a.png\nltcl: 2/2 b.png\n"
+
+
+def test_bar_follows_the_digits_gained() -> None:
+    steps = console.Steps(items=2, solves=2)
+    (task,) = steps._bar.tasks
+    steps.item("a.png")
+    seen = []
+    for _ in range(2):
+        callback = steps.solve(1e-2)
+        for iteration, residual in enumerate((1.0, 0.1, 1e-3)):
+            callback(iteration, residual)
+            seen.append(task.completed)
+    assert seen == pytest.approx([0, 0.5, 1, 1, 1.5, 2])
+    steps.item("b.png")
+    steps.solve(1e-2)(0, float("nan"))
+    assert task.completed == 2
