@@ -12,7 +12,7 @@ import numpy as np
 from ltcl import checks, theory
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
-from ltcl.transport import Transport
+from ltcl.transport import Transport, require
 
 
 @dataclass(frozen=True)
@@ -98,13 +98,14 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     >>> 0.5 < a.channels[0].spectral_radius < 0.7  # m / (1 - m) = 2/3, less what diag(T) took along
     True
     """
+    require(T)
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
     F = np.atleast_2d(T.first_bounce)
     return Analysis(
         shape=T.shape,
         grid=T.grid,
         rtol=rtol,
-        nbytes=sum(S.nbytes for S in T.systems),
+        nbytes=T.nbytes,
         masked=int(T.masked.sum()),
         channels=tuple(_channel(S, f[~T.masked], rtol) for S, f in zip(T.systems, F, strict=True)),
     )

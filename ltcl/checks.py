@@ -35,7 +35,10 @@ def finite(name: str, array: np.ndarray) -> np.ndarray:
 
 def real(name: str, value: Any) -> np.ndarray:
     """Return `value` as an array of real numbers (no copy where it is one); refuse others."""
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{name} is ragged; it must be a rectangular array of real numbers") from error
     if array.dtype.kind not in "fiub":
         raise InputTypeError(f"{name} holds {array.dtype}; it must hold real numbers")
     return array

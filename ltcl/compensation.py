@@ -17,7 +17,7 @@ import numpy as np
 from ltcl import checks, layout
 from ltcl.errors import InputError
 from ltcl.solvers import Solution, solve
-from ltcl.transport import Transport
+from ltcl.transport import Transport, require
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def compensate(
     >>> ltcl.compensate(T, numpy.array([[0.3, 0.3]])).pattern.round(2).tolist()
     [[0.5, 0.5]]
     """
-    T.require_square()
+    require(T)
     low, high = _bounds(bounds)
     gain = checks.number("gain", gain, above=0.0)
     columns, shape = layout.unpack("desired", desired, T.grid, T.channels)

@@ -51,7 +51,10 @@ def _exact(matrix: Any) -> np.ndarray:
     try:
         inverse = scipy.linalg.inv(dense, overwrite_a=True, check_finite=False)
     except np.linalg.LinAlgError as error:
-        raise InputError("first_bounce='exact' needs an invertible T, but this one is singular") from error
+        raise InputError(
+            "first_bounce is 'exact', which needs an invertible T, but this one is singular; "
+            "give 'diagonal' or an array (N,)"
+        ) from error
     with np.errstate(divide="ignore"):
         found = 1.0 / np.diagonal(inverse)
     F = np.zeros(n)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.transport import Transport
+from ltcl.transport import Transport, require
 
 
 def relight(T: Transport, pattern: Any) -> np.ndarray:
@@ -36,4 +36,4 @@ def relight(T: Transport, pattern: Any) -> np.ndarray:
     >>> print(ltcl.relight(T, numpy.array([[1.0, 1.0]])))
     [[0.6 0.6]]
     """
-    return T @ pattern
+    return require(T, square=False) @ pattern

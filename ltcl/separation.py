@@ -20,7 +20,7 @@ import numpy as np
 from ltcl import checks, layout
 from ltcl.operators import Operator
 from ltcl.solvers import Solution, solve
-from ltcl.transport import Transport
+from ltcl.transport import Transport, require
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def separate(
     >>> bool(abs(b.direct - 0.5).max() < 1e-3)
     True
     """
-    T.require_square()
+    require(T)
     checks.count("bounces", bounces, least=0)
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     chains = [

@@ -16,8 +16,8 @@ import scipy.sparse.linalg
 
 from ltcl import checks, first_bounces, layout
 from ltcl.device import Device, open_device
-from ltcl.errors import InputError
-from ltcl.operators import IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
+from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import CSR, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
 
 
 class Transport:
@@ -38,7 +38,8 @@ class Transport:
     device : Device or str, optional
         As `open_device` takes it; opened at the first product only.
     on_dark : "raise" or "mask"
-        What to do where F is zero or negative: refuse, or never light these projector pixels.
+        What to do where F is zero or negative: refuse, or never light these projector pixels in a
+        compensation. Relighting stays exact: what a pattern lights there is seen.
 
     Attributes
     ----------
@@ -82,6 +83,8 @@ class Transport:
         self.masked: np.ndarray = np.zeros(self.shape[1], bool)
         self._first_bounce: np.ndarray | None = None
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
+        if not self.is_square and not (isinstance(first_bounce, str) and first_bounce == "diagonal"):
+            raise InputError(f"first_bounce is given, but T is {self.shape}; only a square T has one")
         if self.is_square:
             F = first_bounces.find(self.matrices, first_bounce)
             dark = F <= 0.0
@@ -132,10 +135,17 @@ class Transport:
         return self.systems[0] if self.channels == 1 else self.systems
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of all S on the device; a pattern that channels share counts once."""
+        patterns = [S.R.pattern for S in self.systems if isinstance(S.R, CSR)]
+        twice = sum(pattern.nbytes for pattern in patterns) - sum(p.nbytes for p in set(patterns))
+        return sum(S.nbytes for S in self.systems) - twice
+
+    @property
     def operators(self) -> tuple[Operator, ...]:
-        """T of each channel on the device; S F where S exists, so that nothing is stored twice."""
+        """T of each channel on the device; S F where that is all of T, so that nothing is stored twice."""
         if self._forward is None:
-            if self.is_square:
+            if self.is_square and not self.masked.any():
                 F = self._require_first_bounce()
                 self._forward = tuple(ScaledColumns(S, f) for S, f in zip(self.systems, F, strict=True))
             else:
@@ -155,10 +165,6 @@ class Transport:
             for l_d, F in zip(columns, self._require_first_bounce(), strict=True)
         ]
 
-    def require_square(self) -> None:
-        """Refuse, before anything is uploaded, what needs S where T can only relight."""
-        self._require_first_bounce()
-
     def _require_first_bounce(self) -> np.ndarray:
         if self._first_bounce is None:
             (h, w), (rows, columns) = self.grid, self.camera_grid
@@ -167,6 +173,15 @@ class Transport:
                 "both on one grid, this T can only relight"
             )
         return self._first_bounce
+
+
+def require(T: Any, *, square: bool = True) -> Transport:
+    """T itself; refuses, before anything is uploaded, what is no Transport or has no S that is needed."""
+    if not isinstance(T, Transport):
+        raise InputTypeError(f"T is a {type(T).__name__}; it must be a ltcl.Transport(matrix, grid=(h, w))")
+    if square:
+        T._require_first_bounce()
+    return T
 
 
 def _product(T: Operator, x: np.ndarray) -> np.ndarray:

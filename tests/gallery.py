@@ -83,5 +83,6 @@ DENSE = {
     "300x1": signed(300, 1),
     "32x32": signed(32, 32),
     "65x129": signed(65, 129),
+    "9x63": signed(9, 63),
     "zeros": np.zeros((17, 9), np.float32),
 }

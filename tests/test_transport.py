@@ -236,7 +236,7 @@ BAD: dict[str, tuple[Any, dict[str, Any], type[LtclError], str]] = {
         np.ones((35, 35)),
         {"first_bounce": "exact"},
         InputError,
-        "first_bounce='exact' needs an inv",
+        "first_bounce is 'exact', which needs an inv",
     ),
 }
 

@@ -51,6 +51,11 @@ class Pattern:
             slabs.append(Slab(start, stop - start, (pointers, columns, values)))
         return slabs
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return sum(pointers.nbytes + columns.nbytes for pointers, columns in self.slabs)
+
     def matches(self, matrix: Any) -> bool:
         """Whether `matrix` has its nonzeros in the same places."""
         if self.shape != matrix.shape or len(self.indices) != matrix.nnz:

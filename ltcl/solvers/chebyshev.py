@@ -22,23 +22,23 @@ from ltcl.solvers.stopping import Monitor, System
 
 @dataclass(frozen=True)
 class Chebyshev:
-    """Options: ``bounds=(lower, upper)`` of the spectrum of S; the free bounds when not given."""
+    """Options: ``spectrum=(lower, upper)``, between which that of S lies; the free bounds when not given."""
 
     name: ClassVar[str] = "chebyshev"
-    bounds: tuple[float, float] | None = None
+    spectrum: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if self.bounds is None:
+        if self.spectrum is None:
             return
         try:
-            lower, upper = self.bounds
+            lower, upper = self.spectrum
         except (TypeError, ValueError):
-            raise InputError(f"bounds is {self.bounds!r}; it must be (lower, upper)") from None
-        checks.number("bounds[1]", upper, least=checks.number("bounds[0]", lower, above=0.0))
+            raise InputError(f"spectrum is {self.spectrum!r}; it must be (lower, upper)") from None
+        checks.number("spectrum[1]", upper, least=checks.number("spectrum[0]", lower, above=0.0))
 
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
-        lower, upper = self.bounds or theory.free_bounds(system.S)
+        lower, upper = self.spectrum or theory.free_bounds(system.S)
         centre = (upper + lower) / 2
         radius = max((upper - lower) / 2, 1e-6 * centre)
         sigma = centre / radius  # 2.

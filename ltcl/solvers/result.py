@@ -21,7 +21,7 @@ class Status(enum.Enum):
         "try method='chebyshev' or 'direct'"
     )
     STAGNATED = (
-        "the residual stopped falling above the tolerance, as float32 products do near 1e-6; "
+        "the residual stopped falling, or the tolerance is below what float32 products can tell, about 1e-6; "
         "loosen rtol or try method='direct'"
     )
     BREAKDOWN = "the system is singular; check the first bounce and the transport"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -61,7 +62,7 @@ def solve(
     throw : bool
         Raise where the tolerance is not met; otherwise look at ``.converged``.
     **options
-        Of the method, for instance ``bounds=(0.5, 4.0)`` of chebyshev. An unknown one is an error.
+        Of the method, for instance ``spectrum=(0.5, 4.0)`` of chebyshev. An unknown one is an error.
 
     Returns
     -------
@@ -89,18 +90,9 @@ def solve(
     guess = _guess(x0, b_host)
     chosen = _method(method, options)
     S = as_operator(S)
-    reason, fallback = "", None
-    if chosen is None:
-        method, reason = auto.choose(S, rtol)
-        chosen = _method(method, {})
-        fallback = Direct() if method != Direct.name and S.shape[0] <= auto.LARGEST_DIRECT else None
-    solution = _run(chosen, S, b_host, guess, rule)
-    if fallback is not None and not solution.converged:
-        reason += (
-            f"; {solution.method} ended {solution.status.name.lower()}, so a dense factorization took over"
-        )
-        solution = _run(fallback, S, b_host, guess, rule)
-    solution = dataclasses.replace(solution, seconds=time.perf_counter() - start, reason=reason)
+    solve_it = _automatic if chosen is None else functools.partial(_run, chosen)
+    solution = solve_it(S, b_host, guess, rule)
+    solution = dataclasses.replace(solution, seconds=time.perf_counter() - start)
     if throw and not solution.converged:
         raise ConvergenceError(str(solution), solution)
     return solution
@@ -143,6 +135,19 @@ def _method(name: str, options: dict[str, Any]) -> Any:
             has = f"has {', '.join(known)}" if known else "has none"
             raise InputTypeError(f"unknown option {option!r}; method {name!r} {has}")
     return kind(**options)
+
+
+def _automatic(S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
+    """The first method of the plan that converges, or the last one tried; products of all are counted."""
+    methods, reason = auto.plan(S, rule.rtol)
+    attempts: list[Solution] = []
+    for name in methods:
+        attempts.append(_run(_method(name, {}), S, b, guess, rule))
+        if attempts[-1].converged:
+            break
+        reason += f"; {name} ended {attempts[-1].status.name.lower()}"
+    products = sum(attempt.products for attempt in attempts)
+    return dataclasses.replace(attempts[-1], products=products, reason=reason)
 
 
 def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:

@@ -41,9 +41,7 @@ def test_python_numbers_take_the_types_of_the_source(device):
 def test_groups_beyond_the_devices_are_refused(device):
     kernel = device.kernel("vector", "vector_fill")
     assert 1 <= kernel.largest_group() <= device.max_group
-    with pytest.raises(
-        DeviceError, match=r"running vector_fill on .*: OpenCL answered INVALID_WORK_"
-    ):
+    with pytest.raises(DeviceError, match=r"running vector_fill on .*: OpenCL answered INVALID_WORK_"):
         kernel(1, device.max_group * 2, 1, 0.0, device.empty(1))
 
 

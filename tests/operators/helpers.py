@@ -13,7 +13,7 @@ from ltcl.operators import Operator
 from ltcl.operators.rows import Launch, RowOperator
 from tests import gallery, reference
 
-COLUMNS = (None, 1, 2, 3, 5, 8, 11)  # None: (N,), not (N, 1)
+COLUMNS = (None, 1, 2, 3, 5, 6, 8, 11)  # None: (N,), not (N, 1)
 EPILOGUES = {
     "plain": (1.0, None),
     "scaled": (-0.75, None),
@@ -21,12 +21,10 @@ EPILOGUES = {
     "onto itself": (-1.0, "out"),
 }
 # How a product may be launched: end of the kernel's name and items that share a row.
-LAUNCHES = {
-    "item": ("", 0),
-    "stream": ("_stream", 0),
-    "group32": ("_group", 32),
-    "group64": ("_group", 64),
-} | {"group128": ("_group", 128)}
+LAUNCHES = {"item": ("", 0), "stream": ("_stream", 0)} | {
+    f"group{items}": ("_group", items)
+    for items in (7, 32, 64, 128)  # sums in trees work for any size
+}
 Twin = Callable[..., np.ndarray]
 
 

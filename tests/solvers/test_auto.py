@@ -35,7 +35,7 @@ def system(device, R):
     ("S", "rtol", "method", "why"),
     [
         (np.eye(20) + 0.01, 1e-2, "direct", "20 pixels are few enough"),
-        (np.eye(N) + ring(0.01), 1e-2, "jacobi", r"row sums of R are at most 0.01: 1 products, Chebyshev 4"),
+        (np.eye(N) + ring(0.01), 1e-2, "jacobi", r"row sums of R are at most 0.01: 1 products, chebyshev 4"),
         (np.eye(N) + ring(0.9), 1e-2, "chebyshev", r"row sums of R are at most 0.9: \d+ products"),
         (np.eye(N) + ring(0.01), 1e-9, "direct", "rtol=1e-09 is below what float32 products reach"),
     ],
@@ -45,7 +45,6 @@ def test_the_choice_and_its_reason(device, S, rtol, method, why):
     b = np.random.default_rng(0).uniform(size=len(S))
     s = ltcl.solve(system(device, S - np.eye(len(S))), b, rtol=rtol)
     assert s.method == method
-    pytest.importorskip("re")
     assert re.search(why, s.reason), s.reason
     assert residual(S, s.x, b) <= max(rtol, 1e-6) * (1 + 1e-3)
 
@@ -59,7 +58,7 @@ def test_where_the_choice_fails_a_factorization_takes_over(device):
     R, b = ring(3.0, skew=1.0), np.random.default_rng(0).uniform(size=N)
     s = ltcl.solve(system(device, R), b)
     assert s.method == "direct"
-    assert "chebyshev ended diverged, so a dense factorization took over" in s.reason
+    assert s.reason.endswith("; chebyshev ended diverged")
     assert residual(np.eye(N) + R, s.x, b) <= 1e-2
 
 

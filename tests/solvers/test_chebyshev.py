@@ -69,13 +69,13 @@ def test_true_bounds_help(device):
     spectrum = np.linalg.eigvalsh(scene.S)
     b -= b.mean()  # nothing of the dominant eigenvector, whose eigenvalue is ten times the next
     free = ltcl.solve(S, b, "chebyshev", rtol=1e-3)
-    tight = ltcl.solve(S, b, "chebyshev", rtol=1e-3, bounds=(spectrum[0], spectrum[-2]))
+    tight = ltcl.solve(S, b, "chebyshev", rtol=1e-3, spectrum=(spectrum[0], spectrum[-2]))
     assert tight.products < free.products
     assert tight.products <= theory.chebyshev_products(spectrum[0], spectrum[-2], 1e-3) + 1
 
 
 def test_one_point_spectrum_is_met_at_once(device):
-    s = ltcl.solve(np.eye(5) * 3.0, np.ones(5), "chebyshev", bounds=(3.0, 3.0), rtol=1e-5)
+    s = ltcl.solve(np.eye(5) * 3.0, np.ones(5), "chebyshev", spectrum=(3.0, 3.0), rtol=1e-5)
     assert s.iterations == 1
     np.testing.assert_allclose(s.x, 1 / 3, rtol=1e-6)
 
@@ -83,7 +83,7 @@ def test_one_point_spectrum_is_met_at_once(device):
 def test_bounds_that_leave_out_the_spectrum_are_noticed(device):
     scene = enclosure(30, 0.8)
     with pytest.raises(ConvergenceError) as caught:
-        ltcl.solve(IdentityPlus(Dense(device, scene.R)), np.ones(30), "chebyshev", bounds=(0.5, 1.0))
+        ltcl.solve(IdentityPlus(Dense(device, scene.R)), np.ones(30), "chebyshev", spectrum=(0.5, 1.0))
     assert caught.value.solution.status is Status.DIVERGED
 
 
@@ -92,5 +92,5 @@ def test_bounds_that_leave_out_the_spectrum_are_noticed(device):
     [(0.0, 1.0), (-1.0, 1.0), (2.0, 1.0), (1.0,), 3.0, "ab", (0.5, np.inf), (np.nan, 1.0), (1.0, "b")],
 )
 def test_unusable_bounds_are_refused(bounds):
-    with pytest.raises(InputError, match="bounds"):
-        ltcl.solve(np.eye(3), np.ones(3), "chebyshev", bounds=bounds)
+    with pytest.raises(InputError, match="spectrum"):
+        ltcl.solve(np.eye(3), np.ones(3), "chebyshev", spectrum=bounds)
