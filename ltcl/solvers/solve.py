@@ -21,9 +21,10 @@ from ltcl.solvers.direct import Direct
 from ltcl.solvers.jacobi import Jacobi
 from ltcl.solvers.neumann import Neumann
 from ltcl.solvers.result import Solution, Status
+from ltcl.solvers.richardson import Richardson
 from ltcl.solvers.stopping import Monitor, Rule, System
 
-ITERATIVE = {method.name: method for method in (Jacobi, Neumann, Chebyshev)}
+ITERATIVE = {method.name: method for method in (Jacobi, Neumann, Richardson, Chebyshev)}
 METHODS: tuple[str, ...] = (*ITERATIVE, Direct.name, "auto")
 _MAXITER = 1000
 
@@ -50,7 +51,7 @@ def solve(
     b : (N,) or (N, k)
         k right-hand sides are solved together, each to its own tolerance.
     method : str
-        "jacobi", "neumann", "chebyshev", "direct" or "auto".
+        "jacobi", "neumann", "richardson", "chebyshev", "direct" or "auto".
     rtol, atol : float
         Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column.
     maxiter : int, optional

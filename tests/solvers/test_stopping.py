@@ -11,8 +11,8 @@ from ltcl.errors import ConvergenceError, LtclError
 from ltcl.operators import Dense, IdentityPlus, as_operator
 from ltcl.solvers import Status
 from tests.problems import enclosure, lambertian, residual
+from tests.solvers.helpers import ITERATIVE
 
-ITERATIVE = ("jacobi", "neumann", "chebyshev")
 random = np.random.default_rng(10)
 
 
