@@ -24,6 +24,10 @@ class Status(enum.Enum):
         "the residual stopped falling, or the tolerance is below what float32 products can tell, about 1e-6; "
         "loosen rtol or try method='direct'"
     )
+    INDEFINITE = (
+        "S is not positive definite in the inner product of cg, which then has no next step; "
+        "give the weights= that make S self-adjoint, normal=True, or try method='gmres' or 'chebyshev'"
+    )
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
