@@ -34,11 +34,11 @@ def test_maxiter_ends_it_with_the_best_iterate(device, method):
     scene = lambertian(64, 0.9, seed=12)
     S, b = IdentityPlus(Dense(device, scene.R)), random.uniform(0.0, 1.0, 64)
     with pytest.raises(ConvergenceError, match="maxiter was reached") as caught:
-        ltcl.solve(S, b, method, rtol=1e-6, maxiter=3)
+        ltcl.solve(S, b, method, rtol=1e-6, maxiter=2)
     s = caught.value.solution
     assert s.status is Status.MAXITER
-    assert s.iterations == 3
-    assert len(s.residuals) == 4
+    assert s.iterations == 2
+    assert len(s.residuals) == 3
     assert residual(scene.S, s.x, b) == pytest.approx(min(s.residuals), rel=1e-2)
     assert isinstance(caught.value, (LtclError, ArithmeticError))
 
