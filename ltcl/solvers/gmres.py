@@ -46,24 +46,28 @@ class GMRES:
             if monitor.unsolved.any() and stuck[monitor.unsolved].all():
                 monitor.give_up(Status.BREAKDOWN)
                 return
-            stuck = self._cycle(system, x, r, monitor)
+            stuck, _ = cycle(system, x, r, monitor, self.restart)
 
-    def _cycle(self, system: System, x: Array, r: Array, monitor: Monitor) -> np.ndarray:
-        """One cycle on x and r; returns the columns (k,) whose space holds all of S and no solution."""
-        beta, step = monitor.norms, monitor.unsolved
-        basis = [vectors.axpby_columns(ratio(np.ones_like(beta), beta, step), r, 0.0, r, r.like())]  # 1.
-        problem = Hessenberg(beta, self.restart)
-        stuck = np.zeros_like(step)
-        for j in range(self.restart):  # 2.
-            w = system.apply(basis[j], r.like())  # 3.
-            h = arnoldi.extend(basis, w, step)  # 4. to 10.
-            problem.extend(h)
-            open_ = monitor.above(problem.residuals)
-            stuck |= step & open_ & (h[:, -1] == 0.0)
-            step = step & ~stuck & open_ & ~(problem.residuals <= _FALL * beta)
-            if j + 1 == self.restart or not step.any() or monitor.due(problem.residuals):
-                break
-        for y, v in zip(problem.solve().T, basis, strict=False):  # 12.; the newest direction has no y
-            vectors.axpby_columns(y, v, 1.0, x, x)
-        system.residual(x, r)
-        return stuck
+
+def cycle(system: System, x: Array, r: Array, monitor: Monitor, steps: int) -> tuple[np.ndarray, Hessenberg]:
+    """Improve `x` and its residual `r`, whose `norms` the monitor holds, by up to so many steps.
+
+    Returns the columns (k,) whose space holds all of S and no solution, and what was learnt of S.
+    """
+    beta, step = monitor.norms, monitor.unsolved
+    basis = [vectors.axpby_columns(ratio(np.ones_like(beta), beta, step), r, 0.0, r, r.like())]  # 1.
+    problem = Hessenberg(beta, steps)
+    stuck = np.zeros_like(step)
+    for j in range(steps):  # 2.
+        w = system.apply(basis[j], r.like())  # 3.
+        h = arnoldi.extend(basis, w, step)  # 4. to 10.
+        problem.extend(h)
+        above = monitor.above(problem.residuals)
+        stuck |= step & above & (h[:, -1] == 0.0)
+        step = step & ~stuck & above & ~(problem.residuals <= _FALL * beta)
+        if j + 1 == steps or not step.any() or monitor.due(problem.residuals):
+            break
+    for y, v in zip(problem.solve().T, basis, strict=False):  # 12.; the newest direction has no y
+        vectors.axpby_columns(y, v, 1.0, x, x)
+    system.residual(x, r)
+    return stuck, problem

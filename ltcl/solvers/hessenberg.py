@@ -26,6 +26,7 @@ class Hessenberg:
         self._right = np.zeros((k, m + 1))
         self._right[:, 0] = beta
         self.residuals = np.array(beta, np.float64)
+        self._columns: list[np.ndarray] = []
 
     def extend(self, h: np.ndarray) -> np.ndarray:
         """Append the columns h (k, j + 1); returns where they are a step, that is not 0 once rotated.
@@ -33,6 +34,7 @@ class Hessenberg:
         A column that is 0 leaves its problem as it was: the right-hand side rests, or S is singular.
         """
         j = len(self._rotations)
+        self._columns.append(h)
         h = h.copy()
         for i, (c, s) in enumerate(self._rotations):
             h[:, i], h[:, i + 1] = c * h[:, i] + s * h[:, i + 1], c * h[:, i + 1] - s * h[:, i]
@@ -52,3 +54,14 @@ class Hessenberg:
         """y (k, j), 0 in unknowns that were no step."""
         j = len(self._rotations)
         return np.linalg.solve(self._triangle[:, :j, :j], self._right[:, :j, None])[..., 0]
+
+    def ritz_values(self) -> np.ndarray:
+        """Eigenvalues of the square parts of all H, complex: estimates of those of S."""
+        found = []
+        for c in range(len(self.residuals)):
+            steps = next((j for j, h in enumerate(self._columns) if not h[c].any()), len(self._columns))
+            H = np.zeros((steps, steps))
+            for j in range(steps):
+                H[: j + 2, j] = self._columns[j][c, : min(j + 2, steps)]
+            found.append(np.linalg.eigvals(H) if np.isfinite(H).all() else np.zeros(0))
+        return np.concatenate(found)

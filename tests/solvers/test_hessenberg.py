@@ -51,3 +51,16 @@ def test_a_singular_matrix_makes_no_step():
     assert not problem.extend(np.array([[0.0, 0.0, 0.0]])).any()
     assert problem.residuals.tolist() == [1.0]
     assert problem.solve().tolist() == [[0.0, 0.0]]
+
+
+@pytest.mark.parametrize("m", [1, 2, 5])
+def test_ritz_values_are_eigenvalues_of_the_square_parts(m):
+    H = small(2, m)
+    problem = Hessenberg(np.ones(2), m)
+    for j in range(m):
+        problem.extend(H[:, : j + 2, j] * ([[1.0], [1.0]] if j < 3 else [[1.0], [0.0]]))
+    wanted = [np.linalg.eigvals(H[0, :m, :m]), np.linalg.eigvals(H[1, : min(m, 3), : min(m, 3)])]
+    found = sorted(problem.ritz_values(), key=lambda z: (z.real, z.imag))
+    np.testing.assert_allclose(
+        found, sorted(np.concatenate(wanted), key=lambda z: (z.real, z.imag)), rtol=1e-9
+    )
