@@ -128,6 +128,7 @@ def _channel(S: IdentityPlus, F: np.ndarray, rtol: float) -> ChannelAnalysis:
         products={
             "jacobi": series,
             "neumann": series,
+            "richardson": theory.richardson_products(*bounds, rtol),
             "chebyshev": theory.chebyshev_products(*bounds, rtol),
         },
         first_bounce=(float(F.min()), float(np.median(F)), float(F.max())),

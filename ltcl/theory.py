@@ -87,6 +87,19 @@ def series_products(rho: float, rtol: float) -> float:
     return 1 if rho <= rtol else math.ceil(math.log(rtol) / math.log(rho))
 
 
+def richardson_products(lower: float, upper: float, rtol: float) -> int:
+    """Products of the Richardson iteration to `rtol` with the spectrum in [lower, upper].
+
+    Each step with omega = 2 / (lower + upper) shrinks the residual by (upper - lower) / (upper + lower)
+    (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., example 4.1).
+
+    >>> richardson_products(0.5, 5.0, 1e-2)
+    23
+    """
+    factor = (upper - lower) / (upper + lower)
+    return 1 if factor <= rtol else math.ceil(math.log(rtol) / math.log(factor))
+
+
 def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     """Products of the Chebyshev iteration to `rtol` with the spectrum in [lower, upper].
 

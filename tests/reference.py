@@ -52,6 +52,14 @@ def vector_axpby(a: float, x: np.ndarray, b: float, y: np.ndarray) -> np.ndarray
     return a * np.asarray(x, np.float64) + b * np.asarray(y, np.float64)
 
 
+def vector_axpby_columns(a: np.ndarray, x: np.ndarray, b: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """a_c x_c + b_c y_c in every column c of (N,) or (N, k), operands with coefficient 0 left out."""
+    terms = [
+        np.where(c == 0, 0.0, c * np.asarray(v, np.float64).reshape(len(v), -1)) for c, v in ((a, x), (b, y))
+    ]
+    return (terms[0] + terms[1]).reshape(x.shape)
+
+
 def vector_scale_rows(d: np.ndarray, x: np.ndarray) -> np.ndarray:
     """diag(d) x with d (N,), x (N,) or (N, k)."""
     return (np.asarray(d, np.float64) * np.asarray(x, np.float64).T).T

@@ -103,5 +103,17 @@ def test_chebyshev_takes_the_first_degree_below_the_tolerance(lower, upper, rtol
     assert k == 1 or 1 / Chebyshev.basis(k - 1)(centre) > rtol * (1 - 1e-9)
 
 
+@pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
+@pytest.mark.parametrize(("lower", "upper"), [(0.5, 1.5), (0.5, 5.0), (0.2, 1.8)])
+def test_richardson_takes_the_first_power_below_the_tolerance(lower, upper, rtol):
+    k = theory.richardson_products(lower, upper, rtol)
+    omega = 2 / (lower + upper)
+    factor = max(abs(1 - omega * lower), abs(1 - omega * upper))
+    assert factor**k <= rtol * (1 + 1e-9)
+    assert k == 1 or factor ** (k - 1) > rtol * (1 - 1e-9)
+    assert theory.chebyshev_products(lower, upper, rtol) <= k
+
+
 def test_a_spectrum_of_one_point_takes_one_product():
+    assert theory.richardson_products(2.0, 2.0, 1e-9) == 1
     assert theory.chebyshev_products(2.0, 2.0, 1e-9) == 1

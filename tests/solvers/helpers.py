@@ -1,0 +1,11 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The methods that the tables of this folder run over."""
+
+from __future__ import annotations
+
+from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
+from ltcl.solvers.solve import METHODS
+
+ITERATIVE = tuple(_ITERATIVE)
+
+__all__ = ["ITERATIVE", "METHODS"]
