@@ -110,6 +110,11 @@ class CSR(RowOperator):
         """Bytes on the device, those of the transpose included once it was asked for."""
         return super().nbytes + (self._transposed_copy.nbytes if self._transposed_copy is not None else 0)
 
+    @property
+    def data(self) -> np.ndarray:
+        """The values on the host, (nnz,), in the order of `pattern`."""
+        return self._host.data
+
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64."""
         return self._host.diagonal().astype(np.float64)
