@@ -110,6 +110,36 @@ def sor(S: np.ndarray, x: np.ndarray, b: np.ndarray, omega: float = 1.0, sweeps:
     return x
 
 
+def southwell_pick(
+    rows: int, parts: int, shift: float, diagonal: np.ndarray, x: np.ndarray, r: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """x, r, picked and delta after one pick in each part; x and r are (N, k)."""
+    edges = np.arange(parts + 1) * rows // parts
+    picked = np.array([a + np.argmax(np.abs(r[a:b]), axis=0) for a, b in itertools.pairwise(edges)])
+    here = (picked, np.arange(r.shape[1]))
+    delta = r[here] / diagonal[picked]
+    x, r = x.copy(), r.copy()
+    x[here] += delta
+    r[here] -= shift * delta
+    return x, r, picked, delta
+
+
+def southwell_dense(
+    M: np.ndarray, scale: float, picked: np.ndarray, delta: np.ndarray, r: np.ndarray
+) -> np.ndarray:
+    """r - scale M[:, picked] delta, each right-hand side with its own."""
+    columns = range(r.shape[1])
+    return r - scale * np.stack([M[:, picked[:, c]] @ delta[:, c] for c in columns], axis=1)
+
+
+def southwell_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
+    """The same with the sparse rows of M^T."""
+    n = len(pointers) - 1
+    return southwell_dense(
+        scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray().T, *arguments
+    )
+
+
 def gamma(roundings: float) -> float:
     """Relative error of that many roundings in a row.
 

@@ -137,6 +137,10 @@ class CSR(RowOperator):
         if not transpose:
             self._forward(x, out, scale, add)
             return
+        self.transposed_copy()._forward(x, out, scale, add)
+
+    def transposed_copy(self) -> CSR:
+        """A^T in sparse rows of its own, made at the first call."""
         if self._transposed_copy is None:
             self._transposed_copy = CSR(self.device, scipy.sparse.csr_array(self._host.T))
-        self._transposed_copy._forward(x, out, scale, add)
+        return self._transposed_copy

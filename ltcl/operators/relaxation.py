@@ -141,21 +141,17 @@ def relaxation(S: Operator, method: str, block: int | None = None) -> Relaxation
     InputError
         S does not give its rows, or has a zero on its diagonal; the message names `method`.
     """
-    rows = _rows(S, method)
+    rows = readable(S, method)
     kept, key = rows.M.relaxations, (rows.shift, rows.scale, block)
     if key not in kept:
         made = Relaxation(rows, block)
-        dark = np.flatnonzero(made.diagonal.astype(np.float32) == 0.0)
-        if dark.size:
-            raise InputError(
-                f"method={method!r} divides by the diagonal of S, which is 0 in {dark.size} row(s), "
-                f"first in row {dark[0]}; use method='direct'"
-            )
+        refuse_zeros(made.diagonal, method)
         kept[key] = made
     return kept[key]
 
 
-def _rows(S: Operator, method: str) -> Rows:
+def readable(S: Operator, method: str) -> Rows:
+    """The rows of S; operators that do not give them are refused, naming `method`."""
     shift, scale, M = (1.0, S.sign, S.R) if isinstance(S, IdentityPlus) else (0.0, 1.0, S)
     if not isinstance(M, CSR | Dense):
         raise InputError(
@@ -163,3 +159,13 @@ def _rows(S: Operator, method: str) -> Rows:
             "sparse matrix, or use method='chebyshev'"
         )
     return Rows(M, shift, scale)
+
+
+def refuse_zeros(diagonal: np.ndarray, method: str) -> None:
+    """Refuse to divide by a zero on the diagonal of S, naming its first row and `method`."""
+    zeros = np.flatnonzero(diagonal.astype(np.float32) == 0.0)
+    if zeros.size:
+        raise InputError(
+            f"method={method!r} divides by the diagonal of S, which is 0 in {zeros.size} row(s), "
+            f"first in row {zeros[0]}; use method='direct'"
+        )

@@ -24,9 +24,12 @@ from ltcl.solvers.neumann import Neumann
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.richardson import Richardson
 from ltcl.solvers.sor import SOR
+from ltcl.solvers.southwell import Southwell
 from ltcl.solvers.stopping import Monitor, Rule, System
 
-ITERATIVE = {method.name: method for method in (Jacobi, Neumann, Richardson, Chebyshev, GaussSeidel, SOR)}
+ITERATIVE = {
+    method.name: method for method in (Jacobi, Neumann, Richardson, Chebyshev, GaussSeidel, SOR, Southwell)
+}
 METHODS: tuple[str, ...] = (*ITERATIVE, Direct.name, "auto")
 _MAXITER = 1000
 
@@ -53,7 +56,8 @@ def solve(
     b : (N,) or (N, k)
         k right-hand sides are solved together, each to its own tolerance.
     method : str
-        "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor", "direct" or "auto".
+        "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor",
+        "southwell", "direct" or "auto".
     rtol, atol : float
         Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column.
     maxiter : int, optional
