@@ -7,5 +7,10 @@ from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
 from ltcl.solvers.solve import METHODS
 
 ITERATIVE = tuple(_ITERATIVE)
+READS_ROWS = (
+    "gauss_seidel",
+    "sor",
+    "southwell",
+)  # methods that refuse operators whose entries cannot be read
 
-__all__ = ["ITERATIVE", "METHODS"]
+__all__ = ["ITERATIVE", "METHODS", "READS_ROWS"]
