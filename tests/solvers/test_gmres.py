@@ -52,11 +52,11 @@ def test_the_residual_never_grows(device, restart):
 
 
 @pytest.mark.parametrize("rho", [0.8, 4.0])
-def test_no_method_takes_fewer_steps(device, rho):
+def test_no_polynomial_in_S_takes_fewer_steps(device, rho):
     scene = lambertian(40, rho, 26)
     S, b = IdentityPlus(Dense(device, scene.R)), random.normal(size=scene.n)
     s = ltcl.solve(S, b, "gmres", rtol=1e-3)
-    for method in ITERATIVE:
+    for method in set(ITERATIVE) - {"gauss_seidel", "sor", "southwell"}:  # these see rows, not products
         other = ltcl.solve(S, b, method, rtol=1e-3, throw=False)
         degree = other.iterations * (2 if method == "bicgstab" else 1)  # of its polynomial in S
         assert s.iterations <= degree or not other.converged
