@@ -82,9 +82,9 @@ def convergence(solutions: Mapping[str, Solution], rtol: float, title: str = "Co
     --------
     >>> import ltcl
     >>> S, b = [[1.0, 0.5], [0.5, 1.0]], [1.0, 0.0]
-    >>> figure = convergence({m: ltcl.solve(S, b, m) for m in ("jacobi", "chebyshev")}, rtol=1e-2)
+    >>> figure = convergence({m: ltcl.solve(S, b, m) for m in ("jacobi", "richardson")}, rtol=1e-2)
     >>> sorted(text.get_text() for text in figure.axes[0].texts)
-    ['chebyshev', 'jacobi', 'tolerance']
+    ['jacobi', 'richardson', 'tolerance']
     """
     figure = _figure(900, 560)
     _heading(figure, 34, 26, title, 17)

@@ -3,13 +3,13 @@
 
 Where the paper's series needs rho(R) < 1, this converges for every albedo below one: of a Lambertian scene
 the spectrum of S lies in [1/2, 1 + max row sum of R], which costs nothing to know (`theory.free_bounds`).
-No inner products, so nothing is read back between products but the residual. Not for spectra with large
-imaginary parts, nor for eigenvalues on both sides of 0; there the monitor sees the residual grow.
+No inner products after the start, so nothing is read back between products but the residual. Not for spectra
+with large imaginary parts, nor for eigenvalues on both sides of 0; there the monitor sees the residual grow.
 
 Of other scenes the bounds may leave out eigenvalues, and then the residual grows by their eigenvectors. A few
 steps of GMRES take those out and tell their eigenvalues; the bounds are widened and the iteration goes on.
-The same steps at the start, `arnoldi` of them, draw the bounds in; they solve as well as they measure, but
-cost inner products.
+The same steps at the start, `arnoldi` of them, draw the bounds in. They solve as well as they measure: in
+boxes of rho(R) = 4 a solve to 1 % takes 4 products in place of 9, for a handful of inner products read back.
 
 Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 12.1.
 """
@@ -31,6 +31,7 @@ from ltcl.solvers.stopping import Monitor, System
 _GROWTH = 10.0  # times the residual at the start of a run: above what weights of surfaces may do to norms
 _REPAIRS = 3  # times that bounds are widened before the monitor alone decides
 _REPAIR_STEPS = 5
+_FIRST_STEPS = 2
 _MARGIN = 0.25  # of the width of the Ritz values, added on both sides: the outermost are not found at once
 _SAFETY = 0.05
 
@@ -44,15 +45,16 @@ class Chebyshev:
     spectrum : (lower, upper), optional
         Between which the spectrum of S lies; the free bounds when not given.
     arnoldi : int
-        Steps of GMRES to begin with, at least 2, whose Ritz values refine the bounds; 0 for none.
+        Steps of GMRES to begin with, at least 2, whose Ritz values refine the bounds; 0 for none. When not
+        given, 2 with the free bounds, which they about halve the products of, and 0 with a `spectrum`.
     """
 
     name: ClassVar[str] = "chebyshev"
     spectrum: tuple[float, float] | None = None
-    arnoldi: int = 0
+    arnoldi: int | None = None
 
     def __post_init__(self) -> None:
-        if checks.count("arnoldi", self.arnoldi, least=0) == 1:
+        if self.arnoldi is not None and checks.count("arnoldi", self.arnoldi, least=0) == 1:
             raise InputError("arnoldi is 1; it must be 0 or at least 2, since one step tells no width")
         if self.spectrum is None:
             return
@@ -67,8 +69,9 @@ class Chebyshev:
         if monitor.done(x, r):
             return
         bounds = self.spectrum or theory.free_bounds(system.S)
-        if self.arnoldi:
-            _, learnt = gmres.cycle(system, x, r, monitor, self.arnoldi)
+        steps = self.arnoldi if self.arnoldi is not None else 0 if self.spectrum else _FIRST_STEPS
+        if steps:
+            _, learnt = gmres.cycle(system, x, r, monitor, steps)
             if monitor.done(x, r):
                 return
             bounds = _refined(bounds, learnt.ritz_values())

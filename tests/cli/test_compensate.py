@@ -52,7 +52,7 @@ def test_report_tells_what_happened(
     assert [entry["file"] for entry in report["pictures"]] == [str(picture), str(large_picture)]
     for entry in report["pictures"]:
         assert {channel["method"] for channel in entry["channels"]} == {"chebyshev"}
-        assert all(channel["products"] == len(channel["residuals"]) - 1 for channel in entry["channels"])
+        assert all(channel["products"] >= len(channel["residuals"]) - 1 for channel in entry["channels"])
         assert all(
             (out / entry[part][kind]).is_file()
             for part in ("pattern", "appearance")

@@ -105,13 +105,24 @@ def test_a_few_arnoldi_steps_lose_no_products(device, arnoldi, rho, rtol):
     """They solve as well as they measure; one product more where their iterate is formed."""
     scene = lambertian(60, rho, 9, density=0.3)
     S, b = IdentityPlus(Dense(device, scene.R)), random.uniform(size=(60, 2))
-    free = ltcl.solve(S, b, "chebyshev", rtol=rtol)
+    free = ltcl.solve(S, b, "chebyshev", rtol=rtol, arnoldi=0)
     refined = ltcl.solve(S, b, "chebyshev", rtol=rtol, arnoldi=arnoldi)
     assert residual(scene.S, refined.x, b) <= rtol * (1 + 1e-2)
     assert refined.products <= free.products + 1
 
 
-@pytest.mark.parametrize("arnoldi", [-1, 1, 1.5, "few", None])
+@pytest.mark.parametrize("rho", [0.8, 4.0, 9.0])
+def test_by_default_free_bounds_are_refined_and_given_ones_are_not(device, rho):
+    scene = enclosure(40, rho / (1 + rho))
+    S, b = IdentityPlus(Dense(device, scene.R)), scene.S @ random.uniform(size=scene.n)
+    default, free = ltcl.solve(S, b, "chebyshev"), ltcl.solve(S, b, "chebyshev", arnoldi=0)
+    np.testing.assert_array_equal(default.x, ltcl.solve(S, b, "chebyshev", arnoldi=2).x)
+    assert default.products < free.products
+    given = ltcl.solve(S, b, "chebyshev", spectrum=theory.free_bounds(S))
+    np.testing.assert_array_equal(given.x, free.x)
+
+
+@pytest.mark.parametrize("arnoldi", [-1, 1, 1.5, "few"])
 def test_an_unusable_number_of_arnoldi_steps_is_refused(arnoldi):
     with pytest.raises(InputError, match=r"arnoldi is .*; it must be .* at least [02]"):
         ltcl.solve(np.eye(3), np.ones(3), "chebyshev", arnoldi=arnoldi)
