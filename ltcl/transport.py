@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ltcl import checks, first_bounces, layout
+from ltcl import checks, first_bounces, layout, reciprocity
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import CSR, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
@@ -82,6 +82,7 @@ class Transport:
         self._forward: tuple[Operator, ...] | None = None
         self.masked: np.ndarray = np.zeros(self.shape[1], bool)
         self._first_bounce: np.ndarray | None = None
+        self._reciprocity_defect: float | None = None
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
         if not self.is_square and not (isinstance(first_bounce, str) and first_bounce == "diagonal"):
             raise InputError(f"first_bounce is given, but T is {self.shape}; only a square T has one")
@@ -114,6 +115,15 @@ class Transport:
         """Diagonal of F: (N,) float64, or (3, N) in colour; 0 at masked pixels."""
         F = self._require_first_bounce()
         return F[0] if self.channels == 1 else F
+
+    @property
+    def reciprocity_defect(self) -> float:
+        """Of the worst channel, by a sample of pixels (`ltcl.reciprocity`); computed at the first call."""
+        if self._reciprocity_defect is None:
+            pairs = zip(self.matrices, self._require_first_bounce(), strict=True)
+            found = [reciprocity.defect(T, F, entries=reciprocity.QUICK) for T, F in pairs]
+            self._reciprocity_defect = max(found)
+        return self._reciprocity_defect
 
     @property
     def device(self) -> Device:

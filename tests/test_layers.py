@@ -27,17 +27,27 @@ LAYERS: list[set[str]] = [
     {"checks"},
     {"files"},
     {"images", "device"},
-    {"operators", "layout", "first_bounces"},
+    {"operators", "layout", "first_bounces", "reciprocity"},
     {"theory", "transport"},
     {"solvers"},
-    {"compensation", "separation", "relighting", "analysis", "scenes", "store", "acquisition", "report"},
+    {
+        "compensation",
+        "separation",
+        "relighting",
+        "analysis",
+        "energy",
+        "scenes",
+        "store",
+        "acquisition",
+        "report",
+    },
     {"plots"},
     {"batch", "demo"},
     {"cli"},
     {"__init__", "__main__"},
 ]
 RANK = {unit: rank for rank, units in enumerate(LAYERS) for unit in units}
-SIDEWAYS = {("transport", "theory")}  # the imports allowed within one layer
+SIDEWAYS = {("transport", "theory"), ("analysis", "energy")}  # the imports allowed within one layer
 NEVER = {(a, b) for a in ("acquisition", "images", "store") for b in ("device", "operators")}
 OPENCL = ("device", "pyopencl")  # the one unit that imports it
 
