@@ -25,6 +25,7 @@ from ltcl.device import cache
 
 log = logging.getLogger(__name__)
 _FILE = "drivers.json"
+_POCL = "POCL_CACHE_DIR"  # where PoCL keeps kernels says nothing about its health
 _SCRIPT = Path(__file__).with_name("probe.py")
 _SECONDS = 120  # a driver that hangs is treated as one that died
 _PREFIXES = (
@@ -48,9 +49,9 @@ def hide_fatal_drivers() -> list[str]:
     """
     # pyopencl's own caches hold pickles, and it cannot launch a kernel where they cannot be written.
     os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
-    _let_pocl_cache()
     files = icd_files()
     key = _key(files)
+    _let_pocl_cache()
     fatal = cache.recall(_FILE, key)
     if not isinstance(fatal, list):
         fatal = find_fatal(files)
@@ -131,13 +132,13 @@ def _temporary_folder() -> Path:
 
 def _let_pocl_cache() -> None:
     """PoCL offers no device at all where it cannot write its kernel cache: give it a temporary one there."""
-    if os.name != "posix" or "POCL_CACHE_DIR" in os.environ:
+    if os.name != "posix" or _POCL in os.environ:
         return
     place = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/", ".cache"))
     while not place.exists():
         place = place.parent
     if not (place.is_dir() and os.access(place, os.W_OK)):
-        os.environ["POCL_CACHE_DIR"] = str(_temporary_folder())
+        os.environ[_POCL] = str(_temporary_folder())
 
 
 def _hide(keep: list[Path], verdict: str) -> None:
@@ -167,7 +168,11 @@ def _key(files: list[Path]) -> str:
             facts.append(_stamp(Path(file.read_text(errors="replace").strip())))
         except OSError:
             facts.append(f"{file} cannot be read")
-    facts += [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(_PREFIXES)]
+    facts += [
+        f"{name}={value}"
+        for name, value in sorted(os.environ.items())
+        if name.startswith(_PREFIXES) and name != _POCL
+    ]
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
 

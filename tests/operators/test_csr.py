@@ -71,8 +71,8 @@ def test_slabs_give_the_same_as_one_buffer(device, small_device, name):
     for k in (None, 1, 3):
         if max(rows, columns) * (k or 1) <= ROOM:
             x = gallery.vectors(columns, k)
-            found = [A.apply(A.device.upload(x)).get() for A in (whole, cut)]
-            helpers.same_rows(device, *found, reference.product_error(matrix.toarray(), x))
+            one, many = (A.apply(A.device.upload(x)).get() for A in (whole, cut))
+            helpers.same_rows(device, one, many, reference.product_error(matrix.toarray(), x))
 
 
 def test_transposes_in_slabs_meet_their_twin(small_device):

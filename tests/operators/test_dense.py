@@ -43,8 +43,8 @@ def test_slabs_give_the_same_as_one_buffer(device, small_device, shape):
     for k in (None, 1, 3):
         if shape[1] * (k or 1) <= ROOM:
             x = gallery.vectors(shape[1], k)
-            found = [A.apply(A.device.upload(x)).get() for A in (whole, cut)]
-            helpers.same_rows(device, *found, reference.product_error(matrix, x))
+            one, many = (A.apply(A.device.upload(x)).get() for A in (whole, cut))
+            helpers.same_rows(device, one, many, reference.product_error(matrix, x))
 
 
 def test_transposes_in_slabs_meet_their_twin(small_device):
