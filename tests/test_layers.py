@@ -28,7 +28,7 @@ LAYERS: list[set[str]] = [
     {"files"},
     {"images", "device"},
     {"operators", "layout", "first_bounces", "reciprocity"},
-    {"theory", "transport"},
+    {"theory", "inverse_diagonal", "transport"},
     {"solvers"},
     {
         "compensation",
@@ -47,7 +47,12 @@ LAYERS: list[set[str]] = [
     {"__init__", "__main__"},
 ]
 RANK = {unit: rank for rank, units in enumerate(LAYERS) for unit in units}
-SIDEWAYS = {("transport", "theory"), ("analysis", "energy")}  # the imports allowed within one layer
+SIDEWAYS = {
+    ("transport", "theory"),
+    ("transport", "inverse_diagonal"),
+    ("inverse_diagonal", "theory"),
+    ("analysis", "energy"),
+}  # the imports allowed within one layer
 NEVER = {(a, b) for a in ("acquisition", "images", "store") for b in ("device", "operators")}
 OPENCL = ("device", "pyopencl")  # the one unit that imports it
 
