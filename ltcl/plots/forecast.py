@@ -77,14 +77,16 @@ def _dress(axes: Axes, title: str, label: str) -> None:
 
 def _draw_radii(axes: Axes, channels: Mapping[str, ChannelAnalysis]) -> None:
     colour = COLOURS["chebyshev"]
+    limit = 1.6 * max(1.0, *(channel.spectral_radius for channel in channels.values()))
     for row, channel in enumerate(channels.values()):
         lower, upper = channel.spectral_radius_bounds
         upper = upper if math.isfinite(upper) else channel.spectral_radius
         axes.plot([lower, upper], [row, row], color=colour, lw=7, alpha=0.6, solid_capstyle="butt")
         axes.plot([channel.spectral_radius], [row], "|", color=INK, ms=16, mew=2)
-        axes.text(upper, row + 0.2, f"  {channel.spectral_radius_certificate}", color=FAINT, fontsize=9)
+        said = channel.spectral_radius_certificate
+        axes.text(limit, row, said, color=FAINT, fontsize=9, ha="right", va="center")
     axes.axvline(1.0, color=COLOURS["jacobi"], lw=1.2, ls=(0, (4, 4)))
-    axes.set_xlim(0, 1.6 * max(1.0, *(channel.spectral_radius for channel in channels.values())))
+    axes.set_xlim(0, limit)
     axes.set_ylim(len(channels) - 0.4, -0.6)
     axes.set_yticks(range(len(channels)), list(channels))
 
