@@ -22,6 +22,19 @@ kernel void vector_axpby(int count, real a, global const real *x, real b, global
         out[i] = a * x[i] + b * y[i];
 }
 
+// out = a_c x + b_c y with coefficients for each column c: a in ab[0 .. k - 1], b in ab[k .. 2 k - 1]. An
+// operand whose coefficient is 0 does not count, whatever it holds. `out` may be x or y.
+kernel void vector_axpby_columns(
+    int count, int k, global const real *ab, global const real *x, global const real *y, global real *out)
+{
+    const int i = get_global_id(0);
+    if (i < count) {
+        const real a = ab[i % k];
+        const real b = ab[k + i % k];
+        out[i] = (a == 0 ? 0 : a * x[i]) + (b == 0 ? 0 : b * y[i]);
+    }
+}
+
 // out = diag(d) x for k right-hand sides. `out` may be x.
 kernel void vector_scale_rows(int count, int k, global const real *d, global const real *x, global real *out)
 {

@@ -10,10 +10,14 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Scene:
-    """One bounce A (N, N), first bounce F (N,), and what follows of them; all float64."""
+    """One bounce A (N, N), first bounce F (N,), and what follows of them; all float64.
+
+    `weights` (N,), area / albedo, make A and S self-adjoint: diag(weights) A is symmetric.
+    """
 
     A: np.ndarray
     F: np.ndarray
+    weights: np.ndarray
 
     @property
     def n(self) -> int:
@@ -47,7 +51,7 @@ def lambertian(n: int, rho: float, seed: int = 0, density: float = 1.0) -> Scene
     weight = rng.uniform(0.5, 1.5, n)
     A = (G + G.T) * weight[:, None]
     largest = np.abs(np.linalg.eigvals(A)).max()
-    return Scene(A * (rho / (1 + rho) / (largest or 1.0)), rng.uniform(0.2, 0.9, n))
+    return Scene(A * (rho / (1 + rho) / (largest or 1.0)), rng.uniform(0.2, 0.9, n), 1.0 / weight)
 
 
 def enclosure(n: int, albedo: float, seed: int = 0) -> Scene:
@@ -60,7 +64,7 @@ def enclosure(n: int, albedo: float, seed: int = 0) -> Scene:
     for _ in range(200):  # Sinkhorn, symmetric
         d = 1.0 / np.sqrt(G.sum(axis=1))
         G = d[:, None] * G * d
-    return Scene(albedo * G, np.full(n, albedo))
+    return Scene(albedo * G, np.full(n, albedo), np.ones(n))
 
 
 def residual(S: np.ndarray, x: np.ndarray, b: np.ndarray) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import scipy.sparse
 
 UNIT = 2.0**-24  # largest relative error of rounding to float32
 _LEAVES = 4096  # work-items among which the dot product spreads its rows, where there are that many
@@ -52,6 +53,14 @@ def vector_axpby(a: float, x: np.ndarray, b: float, y: np.ndarray) -> np.ndarray
     return a * np.asarray(x, np.float64) + b * np.asarray(y, np.float64)
 
 
+def vector_axpby_columns(a: np.ndarray, x: np.ndarray, b: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """a_c x_c + b_c y_c in every column c of (N,) or (N, k), operands with coefficient 0 left out."""
+    terms = [
+        np.where(c == 0, 0.0, c * np.asarray(v, np.float64).reshape(len(v), -1)) for c, v in ((a, x), (b, y))
+    ]
+    return (terms[0] + terms[1]).reshape(x.shape)
+
+
 def vector_scale_rows(d: np.ndarray, x: np.ndarray) -> np.ndarray:
     """diag(d) x with d (N,), x (N,) or (N, k)."""
     return (np.asarray(d, np.float64) * np.asarray(x, np.float64).T).T
@@ -64,6 +73,79 @@ def vector_dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def vector_triad(a: float, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return vector_axpby(a, b, 1.0, c)
+
+
+def relax_dense(
+    M: np.ndarray, rows: slice, shift: float, scale: float, x: np.ndarray, b: np.ndarray, carry: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """s, r and the next carry of a block of rows; S = shift I + scale M."""
+    M, x = np.asarray(M, np.float64), np.asarray(x, np.float64)
+    upper = scale * (np.triu(M, 1) @ x)[rows]
+    s = (b - shift * x - scale * (M @ x))[rows]
+    return s, carry[rows] - upper, upper
+
+
+def relax_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
+    """The same of a sparse M."""
+    n = len(pointers) - 1
+    return relax_dense(
+        scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray(), *arguments
+    )
+
+
+def relax_dense_triangle(
+    M: np.ndarray, rows: slice, shift: float, scale: float, omega: float, s: np.ndarray
+) -> np.ndarray:
+    """delta of (D / omega + L)_BB delta = s_B."""
+    block = scale * np.asarray(M, np.float64)[rows, rows]
+    np.fill_diagonal(block, shift + block.diagonal())
+    return np.linalg.solve(np.tril(block, -1) + np.diag(block.diagonal() / omega), s)
+
+
+def relax_csr_triangle(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
+    """The same of a sparse M."""
+    n = len(pointers) - 1
+    matrix = scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray()
+    return relax_dense_triangle(matrix, *arguments)
+
+
+def sor(S: np.ndarray, x: np.ndarray, b: np.ndarray, omega: float = 1.0, sweeps: int = 1) -> np.ndarray:
+    """Sweeps of SOR as in a textbook, row after row in place; with omega = 1 of Gauss-Seidel."""
+    x = np.array(x, np.float64)
+    for _ in range(sweeps):
+        for i in range(len(x)):
+            x[i] += omega * (b[i] - S[i] @ x) / S[i, i]
+    return x
+
+
+def southwell_pick(
+    rows: int, parts: int, shift: float, diagonal: np.ndarray, x: np.ndarray, r: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """x, r, picked and delta after one pick in each part; x and r are (N, k)."""
+    edges = np.arange(parts + 1) * rows // parts
+    picked = np.array([a + np.argmax(np.abs(r[a:b]), axis=0) for a, b in itertools.pairwise(edges)])
+    here = (picked, np.arange(r.shape[1]))
+    delta = r[here] / diagonal[picked]
+    x, r = x.copy(), r.copy()
+    x[here] += delta
+    r[here] -= shift * delta
+    return x, r, picked, delta
+
+
+def southwell_dense(
+    M: np.ndarray, scale: float, picked: np.ndarray, delta: np.ndarray, r: np.ndarray
+) -> np.ndarray:
+    """r - scale M[:, picked] delta, each right-hand side with its own."""
+    columns = range(r.shape[1])
+    return r - scale * np.stack([M[:, picked[:, c]] @ delta[:, c] for c in columns], axis=1)
+
+
+def southwell_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
+    """The same with the sparse rows of M^T."""
+    n = len(pointers) - 1
+    return southwell_dense(
+        scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray().T, *arguments
+    )
 
 
 def gamma(roundings: float) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a solver does between two products: fill, axpby, diagonal scaling, dot, norm.
+"""What a solver does between two products: fill, axpby, axpby column by column, diagonal scaling, dot, norm.
 
 Everything is queued and returns at once; only `dot` and `norm` give numbers to the host and so wait.
 Sums are trees over a fixed number of slices: the same bits at every call on a given device.
@@ -8,6 +8,7 @@ Sums are trees over a fixed number of slices: the same bits at every call on a g
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ltcl.device.array import Array
 from ltcl.errors import InputError
@@ -31,6 +32,22 @@ def axpby(a: float, x: Array, b: float, y: Array, out: Array) -> Array:
 def axpy(a: float, x: Array, y: Array) -> Array:
     """y = a x + y."""
     return axpby(a, x, 1.0, y, y)
+
+
+def axpby_columns(a: ArrayLike, x: Array, b: ArrayLike, y: Array, out: Array) -> Array:
+    """out = a_c x_c + b_c y_c in every column c; `out` may be `x` or `y`.
+
+    `a` and `b` are numbers or (k,) on the host. An operand whose coefficient is 0 does not count, not even
+    its NaN: with (0, 1) a column of y stays as it is, whatever became of x.
+    """
+    _same_shape(x, y, out)
+    k = out.columns
+    with np.errstate(over="ignore"):  # a step beyond float32 becomes infinite, which the residual tells
+        ab = np.stack([np.broadcast_to(np.asarray(c).astype(np.float32), k) for c in (a, b)])
+    if k == 1 and ab.all():  # numbers travel with the launch, arrays before it
+        return axpby(ab[0, 0], x, ab[1, 0], y, out)
+    _elementwise(out, "vector_axpby_columns", k, out.device.upload(ab), x, y, out)
+    return out
 
 
 def difference(x: Array, y: Array, out: Array) -> Array:

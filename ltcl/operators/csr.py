@@ -110,6 +110,11 @@ class CSR(RowOperator):
         """Bytes on the device, those of the transpose included once it was asked for."""
         return super().nbytes + (self._transposed_copy.nbytes if self._transposed_copy is not None else 0)
 
+    @property
+    def data(self) -> np.ndarray:
+        """The values on the host, (nnz,), in the order of `pattern`."""
+        return self._host.data
+
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64."""
         return self._host.diagonal().astype(np.float64)
@@ -133,6 +138,10 @@ class CSR(RowOperator):
         if not transpose:
             self._forward(x, out, scale, add)
             return
+        self.transposed_copy()._forward(x, out, scale, add)
+
+    def transposed_copy(self) -> CSR:
+        """A^T in sparse rows of its own, made at the first call."""
         if self._transposed_copy is None:
             self._transposed_copy = CSR(self.device, scipy.sparse.csr_array(self._host.T))
-        self._transposed_copy._forward(x, out, scale, add)
+        return self._transposed_copy

@@ -24,6 +24,14 @@ class Status(enum.Enum):
         "the residual stopped falling, or the tolerance is below what float32 products can tell, about 1e-6; "
         "loosen rtol or try method='direct'"
     )
+    INDEFINITE = (
+        "S is not positive definite in the inner product of cg, which then has no next step; "
+        "give the weights= that make S self-adjoint, normal=True, or try method='gmres' or 'chebyshev'"
+    )
+    NO_STEP = (
+        "the method has no next step here, not even started anew; "
+        "try method='gmres', 'cg' with normal=True, or 'direct'"
+    )
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 

@@ -16,14 +16,35 @@ from ltcl.device import Array
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
 from ltcl.solvers import auto
+from ltcl.solvers.bicgstab import BiCGStab
+from ltcl.solvers.cg import CG
 from ltcl.solvers.chebyshev import Chebyshev
 from ltcl.solvers.direct import Direct
+from ltcl.solvers.gauss_seidel import GaussSeidel
+from ltcl.solvers.gmres import GMRES
 from ltcl.solvers.jacobi import Jacobi
 from ltcl.solvers.neumann import Neumann
 from ltcl.solvers.result import Solution, Status
+from ltcl.solvers.richardson import Richardson
+from ltcl.solvers.sor import SOR
+from ltcl.solvers.southwell import Southwell
 from ltcl.solvers.stopping import Monitor, Rule, System
 
-ITERATIVE = {method.name: method for method in (Jacobi, Neumann, Chebyshev)}
+ITERATIVE = {
+    method.name: method
+    for method in (
+        Jacobi,
+        Neumann,
+        Richardson,
+        Chebyshev,
+        GaussSeidel,
+        SOR,
+        Southwell,
+        CG,
+        GMRES,
+        BiCGStab,
+    )
+}
 METHODS: tuple[str, ...] = (*ITERATIVE, Direct.name, "auto")
 _MAXITER = 1000
 
@@ -50,7 +71,8 @@ def solve(
     b : (N,) or (N, k)
         k right-hand sides are solved together, each to its own tolerance.
     method : str
-        "jacobi", "neumann", "chebyshev", "direct" or "auto".
+        "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor", "southwell", "cg", "gmres",
+        "bicgstab", "direct" or "auto".
     rtol, atol : float
         Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column.
     maxiter : int, optional

@@ -39,6 +39,11 @@ class System:
         self.products += 1
         return self.S.apply(x, out, scale=scale, add=add)
 
+    def apply_transpose(self, x: Array, out: Array) -> Array:
+        """out = S^T x."""
+        self.products += 1
+        return self.S.apply_transpose(x, out)
+
     def residual(self, x: Array, r: Array) -> Array:
         """r = b - S x."""
         return self.apply(x, r, scale=-1.0, add=self.b)
@@ -60,7 +65,11 @@ class Monitor:
 
     A method calls `done(x, r)` once an iteration, with the residual `r` of `x`. A method that keeps its
     residual by recursion passes ``recursive=True``, and it is recomputed before convergence is claimed and
-    wherever rounding may have parted the two. Tolerances below the rounding of float32 are never claimed.
+    wherever rounding may have parted the two; with ``replace=True`` the recomputed one is left in `r`.
+    Tolerances below the rounding of float32 are never claimed.
+
+    After a call, `norms` are those of the columns of `r`, and `unsolved` the columns above the tolerance: a
+    method whose steps differ between columns takes them there only.
     """
 
     system: System
@@ -75,8 +84,10 @@ class Monitor:
         self._target = np.maximum(self.rule.rtol * norms, self.rule.atol)
         self._reachable = bool(np.all(self._target >= _ROUNDING * norms))
         self._trusted = np.maximum(self._target, _DRIFT * norms)
+        self.norms = norms
+        self.unsolved = np.ones(norms.shape, bool)
         self._lowest = np.inf
-        self._since_lowest = 0
+        self._lowest_at = 0
         self._rises = 0
 
     @property
@@ -84,36 +95,61 @@ class Monitor:
         """Iterations done: the first residual is that of the start."""
         return max(0, len(self.residuals) - 1)
 
-    def done(self, x: Array, r: Array, *, recursive: bool = False) -> bool:
+    def done(self, x: Array, r: Array, *, recursive: bool = False, replace: bool = False) -> bool:
         """Whether the solve ends with the iterate `x`; sets `status` when it does."""
         norms = vectors.norm(r)
-        if recursive and np.all(norms <= self._trusted):
-            norms = vectors.norm(self.system.residual(x, r.like()))
-        self._record(x, float(np.max(norms / self._scale, initial=0.0)))
-        if self._reachable and np.all(norms <= self._target):
+        if (recursive or replace) and np.all(norms <= self._trusted):
+            norms = vectors.norm(self.system.residual(x, r if replace else r.like()))
+        self.norms = norms
+        self.unsolved = self.above(norms)
+        self._record(norms)
+        self._keep(x)
+        if self._reachable and not self.unsolved.any():
             self.status = Status.CONVERGED
         else:
             self.status = self._trouble()
         return self.status is not None
 
-    def _record(self, x: Array, residual: float) -> None:
+    def above(self, norms: np.ndarray) -> np.ndarray:
+        """The columns, (k,) bool, in which residuals of such norms are above the tolerance, or NaN."""
+        return ~(norms <= self._target)
+
+    def due(self, norms: np.ndarray) -> bool:
+        """Whether a method that need not form its iterate after every step has to after this one.
+
+        `norms` are what it knows of the residual without; where the answer is no, they are recorded.
+        """
+        if self.iterations + 1 >= self.rule.maxiter or not np.all(np.isfinite(norms)):
+            return True
+        self._record(norms)
+        return False
+
+    def give_up(self, status: Status) -> None:
+        """End the solve where the method has no next step; the best iterate stays."""
+        self.status = status
+
+    def _record(self, norms: np.ndarray) -> None:
+        residual = float(np.max(norms / self._scale, initial=0.0))
         previous = self.residuals[-1] if self.residuals else np.inf
         self.residuals.append(residual)
         if self.rule.callback is not None:
             self.rule.callback(self.iterations, residual)
         self._rises = self._rises + 1 if residual > previous else 0
+
+    def _keep(self, x: Array) -> None:
+        residual = self.residuals[-1]
         if residual < self._lowest:
-            self._lowest, self._since_lowest = residual, 0
+            self._lowest, self._lowest_at = residual, self.iterations
+        if residual == self._lowest:  # again, where one column is stuck while others improve
             self.best = (x.like() if self.best is None else self.best).copy_from(x)
-        else:
-            self._since_lowest += 1
 
     def _trouble(self) -> Status | None:
         first, residual = self.residuals[0], self.residuals[-1]
         grown = residual > _GROWTH * first or (self._rises >= _RISES and residual > first)
         if grown or not np.isfinite(residual):
             return Status.DIVERGED
-        if (self._since_lowest >= _PATIENCE and self._lowest < _DRIFT) or self._stalled():
+        waited = self.iterations - self._lowest_at
+        if (waited >= _PATIENCE and self._lowest < _DRIFT) or self._stalled():
             return Status.STAGNATED
         return Status.MAXITER if self.iterations >= self.rule.maxiter else None
 

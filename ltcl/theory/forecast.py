@@ -118,12 +118,14 @@ def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     return max(1, math.ceil(math.acosh(1.0 / rtol) / math.acosh(centre)))
 
 
-def richardson_products(lower: float, upper: float, rtol: float) -> float:
-    """Products of x <- x + omega (b - S x), omega = 2 / (lower + upper): ((b - a) / (b + a))^k <= rtol.
+def richardson_products(lower: float, upper: float, rtol: float) -> int:
+    """Products of the Richardson iteration to `rtol` with the spectrum in [lower, upper].
 
-    Best damping for a spectrum of S in [lower, upper] (Saad, section 4.2.1).
+    Each step with omega = 2 / (lower + upper) shrinks the residual by (upper - lower) / (upper + lower)
+    (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., example 4.1).
 
-    >>> richardson_products(0.5, 1.5, 1e-2)
-    7
+    >>> richardson_products(0.5, 5.0, 1e-2)
+    23
     """
-    return series_products((upper - lower) / (upper + lower), rtol)
+    factor = (upper - lower) / (upper + lower)
+    return 1 if factor <= rtol else math.ceil(math.log(rtol) / math.log(factor))

@@ -40,6 +40,35 @@ def test_elementwise_kernels_meet_their_twins(device, shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
+def test_columns_have_coefficients_of_their_own(device, shape):
+    x, y, X, Y = operands(device, shape)
+    k = X.columns
+    a, b = np.linspace(-1.5, 2.0, k), np.where(np.arange(k) % 3 == 1, 0.0, 0.75)
+    wanted = reference.vector_axpby_columns(a, x, b, y)
+    error = 2 * reference.gamma(3) * 2 * (np.abs(x) + np.abs(y))  # the coefficients are rounded, too
+    out = device.empty(shape)
+    assert vectors.axpby_columns(a, X, b, Y, out) is out
+    close(out.get(), wanted, error)
+    same_bits(vectors.axpby_columns(a, X, b, Y, X.copy()).get(), out.get())
+    close(vectors.axpby_columns(a, X, b, Y, X).get(), wanted, error)
+    close(vectors.axpby_columns(2.0, Y, 0.5, Y, Y).get(), 2.5 * y, 4 * error)
+
+
+@pytest.mark.parametrize("k", [None, 1, 3])
+def test_a_coefficient_of_zero_leaves_its_operand_out(device, k):
+    x, y, _, Y = operands(device, (53, k) if k else (53,))
+    bad = device.upload(np.where(x > 0, np.nan, np.inf))
+    same_bits(vectors.axpby_columns(np.zeros(k or 1), bad, 1.0, Y, Y.like()).get(), y.astype(np.float32))
+    same_bits(vectors.axpby_columns(1.0, Y, np.zeros(k or 1), bad, bad).get(), y.astype(np.float32))
+
+
+def test_a_coefficient_beyond_float32_is_infinite(device):
+    for k in (1, 2):
+        x = vectors.fill(device.empty((3, k)), 1.0)
+        assert np.isposinf(vectors.axpby_columns(1e300, x, 1.0, x, x).get()).all()
+
+
+@pytest.mark.parametrize("shape", SHAPES)
 def test_out_may_be_an_operand(device, shape):
     x, _, X, Y = operands(device, shape)
     d = gallery.vectors(shape[0], None, 3)

@@ -9,7 +9,7 @@ import pytest
 import ltcl
 from ltcl import theory
 from ltcl.errors import ConvergenceError, InputError
-from ltcl.operators import Dense, IdentityPlus
+from ltcl.operators import Dense, IdentityPlus, as_operator
 from ltcl.solvers import Status
 from tests.problems import enclosure, lambertian, residual
 
@@ -80,11 +80,41 @@ def test_one_point_spectrum_is_met_at_once(device):
     np.testing.assert_allclose(s.x, 1 / 3, rtol=1e-6)
 
 
-def test_bounds_that_leave_out_the_spectrum_are_noticed(device):
+@pytest.mark.parametrize("spectrum", [(0.5, 1.0), (0.5, 3.0), (2.0, 4.0), (3.0, 5.0)])
+def test_bounds_that_leave_out_the_spectrum_are_widened(device, spectrum):
+    """The spectrum reaches from 0.8 to 5."""
     scene = enclosure(30, 0.8)
+    S, b = IdentityPlus(Dense(device, scene.R)), random.uniform(size=(30, 2))
+    s = ltcl.solve(S, b, "chebyshev", spectrum=spectrum, rtol=1e-3)
+    assert residual(scene.S, s.x, b) <= 1e-3 * (1 + 1e-2)
+    assert [k for k, _ in enumerate(s.residuals)] == list(range(s.iterations + 1))
+
+
+def test_where_no_interval_helps_it_diverges(device):
+    """A one-way ring of gain 3: eigenvalues all around the origin."""
+    S = np.eye(30) + 3.0 * np.roll(np.eye(30), 1, axis=1)
     with pytest.raises(ConvergenceError) as caught:
-        ltcl.solve(IdentityPlus(Dense(device, scene.R)), np.ones(30), "chebyshev", spectrum=(0.5, 1.0))
+        ltcl.solve(as_operator(S, device), random.uniform(size=30), "chebyshev")
     assert caught.value.solution.status is Status.DIVERGED
+
+
+@pytest.mark.parametrize("rho", [0.8, 4.0, 9.0])
+@pytest.mark.parametrize("arnoldi", [2, 3, 5])
+@pytest.mark.parametrize("rtol", [1e-2, 1e-4])
+def test_a_few_arnoldi_steps_lose_no_products(device, arnoldi, rho, rtol):
+    """They solve as well as they measure; one product more where their iterate is formed."""
+    scene = lambertian(60, rho, 9, density=0.3)
+    S, b = IdentityPlus(Dense(device, scene.R)), random.uniform(size=(60, 2))
+    free = ltcl.solve(S, b, "chebyshev", rtol=rtol)
+    refined = ltcl.solve(S, b, "chebyshev", rtol=rtol, arnoldi=arnoldi)
+    assert residual(scene.S, refined.x, b) <= rtol * (1 + 1e-2)
+    assert refined.products <= free.products + 1
+
+
+@pytest.mark.parametrize("arnoldi", [-1, 1, 1.5, "few", None])
+def test_an_unusable_number_of_arnoldi_steps_is_refused(arnoldi):
+    with pytest.raises(InputError, match=r"arnoldi is .*; it must be .* at least [02]"):
+        ltcl.solve(np.eye(3), np.ones(3), "chebyshev", arnoldi=arnoldi)
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ def test_chebyshev_takes_the_first_degree_below_the_tolerance(lower, upper, rtol
 
 
 def test_a_spectrum_of_one_point_takes_one_product():
+    assert theory.richardson_products(2.0, 2.0, 1e-9) == 1
     assert theory.chebyshev_products(2.0, 2.0, 1e-9) == 1
 
 
@@ -80,10 +81,12 @@ def test_bounds_on_both_sides_of_one_leave_the_series_uncertified(device):
     assert theory.forecasts(S, rho, (0.5, 2.0), 1e-2)["jacobi"].certificate == "power iteration"
 
 
-@pytest.mark.parametrize(("lower", "upper"), [(0.5, 1.5), (0.5, 5.0), (1.0, 1.0)])
-def test_richardson_takes_the_first_power_below_the_tolerance(lower, upper):
-    k = theory.richardson_products(lower, upper, 1e-2)
+@pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
+@pytest.mark.parametrize(("lower", "upper"), [(0.5, 1.5), (0.5, 5.0), (0.2, 1.8)])
+def test_richardson_takes_the_first_power_below_the_tolerance(lower, upper, rtol):
+    k = theory.richardson_products(lower, upper, rtol)
     omega = 2 / (lower + upper)
     factor = max(abs(1 - omega * lower), abs(1 - omega * upper))
-    assert factor**k <= 1e-2
-    assert k == 1 or factor ** (k - 1) > 1e-2
+    assert factor**k <= rtol * (1 + 1e-9)
+    assert k == 1 or factor ** (k - 1) > rtol * (1 - 1e-9)
+    assert theory.chebyshev_products(lower, upper, rtol) <= k

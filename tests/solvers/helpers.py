@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The methods that the tables of this folder run over."""
+
+from __future__ import annotations
+
+from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
+from ltcl.solvers.solve import METHODS
+
+ITERATIVE = tuple(_ITERATIVE)
+READS_ROWS = (
+    "gauss_seidel",
+    "sor",
+    "southwell",
+)  # methods that refuse operators whose entries cannot be read
+
+__all__ = ["ITERATIVE", "METHODS", "READS_ROWS"]
