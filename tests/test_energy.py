@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.sparse.linalg import aslinearoperator
 
 import ltcl
 from ltcl import energy
-from tests.problems import Scene, enclosure, lambertian
+from tests.problems import enclosure, lambertian
 
 FORMS = pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
 
@@ -48,7 +49,7 @@ def test_a_surface_that_returns_more_than_it_gets_is_found(device):
     box = enclosure(40, 0.6)
     A = box.A.copy()
     A[3] *= 2.0  # albedo 1.2
-    scene = Scene(A, box.F)
+    scene = dataclasses.replace(box, A=A)
     found = check(device, scene.T, scene.F)
     assert found.bounce_highest == pytest.approx(1.2, abs=0.01)
     assert not found.conserved
