@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a transport is like before anything is solved: norms, spectrum, and what each method will cost."""
+"""What a transport is like before it is used: norms, spectrum, what each method costs, whether it can be."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ltcl import checks, theory
+from ltcl import checks, energy, reciprocity, theory
+from ltcl.energy import Energy
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
 from ltcl.transport import Transport, require
@@ -27,13 +29,23 @@ class ChannelAnalysis:
         rho(R) by power iteration; the paper's iteration converges below 1.
     spectral_radius_change : float
         Relative change of it in the last step.
+    spectral_radius_bounds : (lower, upper)
+        Between which rho(R) lies, as far as the certificate goes.
+    spectral_radius_certificate : str
+        "collatz-wielandt", for certain; "power iteration", an estimate; see `theory.SpectralRadius`.
     albedo : float
         rho / (1 + rho): the uniform albedo of a closed scene with this radius (eq. 14).
     bounds : (lower, upper)
         Free bounds on the spectrum of S.
     products : dict
-        Products each iterative method needs to reach rtol; infinite where it diverges.
+        Products (sweeps of Gauss-Seidel) each iterative method needs to reach rtol; infinite where it
+        diverges, NaN where there is no forecast.
+    certificates : dict
+        What each forecast rests on; see `theory.Forecast`.
     first_bounce : (smallest, median, largest)
+    reciprocity_defect : float
+        0 of a Lambertian scene without noise; see `ltcl.reciprocity`.
+    energy : Energy
     """
 
     norm_one: float
@@ -41,10 +53,15 @@ class ChannelAnalysis:
     norm_frobenius: float
     spectral_radius: float
     spectral_radius_change: float
+    spectral_radius_bounds: tuple[float, float]
+    spectral_radius_certificate: str
     albedo: float
     bounds: tuple[float, float]
     products: dict[str, float]
+    certificates: dict[str, str]
     first_bounce: tuple[float, float, float]
+    reciprocity_defect: float
+    energy: Energy
 
 
 @dataclass(frozen=True)
@@ -59,21 +76,20 @@ class Analysis:
     channels: tuple[ChannelAnalysis, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, lists and dicts for JSON; infinite products and unknown norms are None."""
-        report = dataclasses.asdict(self)
-        for channel in report["channels"]:
-            for values in (channel, channel["products"]):
-                nothing = [
-                    name
-                    for name, value in values.items()
-                    if isinstance(value, float) and not np.isfinite(value)
-                ]
-                values.update(dict.fromkeys(nothing))
-        return report
+        """Plain numbers, lists and dicts for JSON; what is infinite or unknown is None."""
+        return _plain(dataclasses.asdict(self))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_plain(part) for part in value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
-    """Norms and spectral radius of R, and the products each method would need.
+    """Norms and spectral radius of R, the products each method would need, and checks of the measurement.
 
     Parameters
     ----------
@@ -107,29 +123,34 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
         rtol=rtol,
         nbytes=T.nbytes,
         masked=int(T.masked.sum()),
-        channels=tuple(_channel(S, f[~T.masked], rtol) for S, f in zip(T.systems, F, strict=True)),
+        channels=tuple(
+            _channel(matrix, f, S, rtol) for matrix, f, S in zip(T.matrices, F, T.systems, strict=True)
+        ),
     )
 
 
-def _channel(S: IdentityPlus, F: np.ndarray, rtol: float) -> ChannelAnalysis:
+def _channel(T: Any, F: np.ndarray, S: IdentityPlus, rtol: float) -> ChannelAnalysis:
     try:
-        norms = dataclasses.astuple(S.R.norms())
+        norms = S.R.norms()
     except InputError:
-        norms = (float("nan"),) * 3
-    rho = theory.spectral_radius(S.R)
+        norms = None
+    rho = theory.spectral_radius(S.R, norms=norms)
     bounds = theory.free_bounds(S)
-    series = theory.series_products(rho.value, rtol)
+    forecasts = theory.forecasts(S, rho, bounds, rtol)
+    lit = F[F > 0]
     return ChannelAnalysis(
-        *norms,
+        norm_one=norms.one if norms else math.nan,
+        norm_inf=norms.inf if norms else math.nan,
+        norm_frobenius=norms.frobenius if norms else math.nan,
         spectral_radius=rho.value,
         spectral_radius_change=rho.change,
+        spectral_radius_bounds=(rho.lower, rho.upper),
+        spectral_radius_certificate=rho.certificate,
         albedo=rho.albedo,
         bounds=bounds,
-        products={
-            "jacobi": series,
-            "neumann": series,
-            "richardson": theory.richardson_products(*bounds, rtol),
-            "chebyshev": theory.chebyshev_products(*bounds, rtol),
-        },
-        first_bounce=(float(F.min()), float(np.median(F)), float(F.max())),
+        products={name: forecast.products for name, forecast in forecasts.items()},
+        certificates={name: forecast.certificate for name, forecast in forecasts.items()},
+        first_bounce=(float(lit.min()), float(np.median(lit)), float(lit.max())),
+        reciprocity_defect=reciprocity.defect(T, F),
+        energy=energy.check(T, F, S),
     )

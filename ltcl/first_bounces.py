@@ -13,17 +13,25 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 
+_BYTES = 3 * 8  # of a dense inverse, per entry: the matrix, its inverse and what LAPACK works with
+
 
 def find(matrices: Sequence[Any], wanted: Any) -> np.ndarray:
-    """F of each channel, (channels, N) float64, not yet checked for sign."""
+    """F of each channel, (channels, N) float64, not yet checked for sign; not "estimate"."""
     n = matrices[0].shape[0]
     if isinstance(wanted, str):
-        checks.one_of("first_bounce", wanted, ("diagonal", "exact"))
+        checks.one_of("first_bounce", wanted, ("diagonal", "exact", "estimate"))
         find = _diagonal if wanted == "diagonal" else _exact
         return np.stack([find(matrix) for matrix in matrices])
     F = checks.finite("first_bounce", checks.real("first_bounce", wanted)).astype(np.float64)
     checks.shape("first_bounce", F, *([(n,), (1, n)] if len(matrices) == 1 else [(n,), (3, n)]))
     return np.broadcast_to(F, (len(matrices), n))
+
+
+def too_large(matrix: Any) -> bool:
+    """Whether "exact" would invert more than the host has memory for."""
+    n = matrix.shape[0]
+    return _BYTES * n * n > checks.host_memory()
 
 
 def _diagonal(matrix: Any) -> np.ndarray:
@@ -40,10 +48,10 @@ def _exact(matrix: Any) -> np.ndarray:
     if not isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)):
         raise InputTypeError(
             f"first_bounce='exact' inverts the matrix densely, which a {type(matrix).__name__} does not "
-            "allow; give first_bounce as an array (N,)"
+            "allow; give 'estimate', or first_bounce as an array (N,)"
         )
     n = len(matrix.indptr) - 1 if isinstance(matrix, scipy.sparse.csr_array) else len(matrix)
-    checks.fits_host(f"first_bounce='exact' inverts T densely, which for N = {n}", 3 * 8 * n * n)
+    checks.fits_host(f"first_bounce='exact' inverts T densely, which for N = {n}", _BYTES * n * n)
     dense = (matrix if isinstance(matrix, np.ndarray) else matrix.toarray()).astype(np.float64)
     lit = dense.any(axis=0) & dense.any(axis=1)  # a dark pixel would make T singular; its F is 0
     if not lit.all():

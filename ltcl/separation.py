@@ -8,10 +8,15 @@ light that bounced at least once, and of it b_1 = X l^(1) bounced exactly once, 
 
 Equal to the paper's chain b_k = b_(k-1) - X b_(k-1) in exact arithmetic; in this form the bounces and the
 rest add up to the picture whatever the tolerance of the solves. Nothing is clipped on the way.
+
+One projector and one camera see T = P S F Q (eq. 28), and bounces are exact of Lambertian scenes only
+(eq. 29, section 8.4): elsewhere P A^k F Q is no power of anything that T tells. A T that is far from
+reciprocal gives such a scene away, and the result then carries a warning.
 """
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +26,12 @@ from ltcl import checks, layout
 from ltcl.operators import Operator
 from ltcl.solvers import Solution, solve
 from ltcl.transport import Transport, require
+
+logger = logging.getLogger(__name__)
+
+LAMBERTIAN = (
+    0.1  # largest reciprocity defect of a scene taken for Lambertian; path tracing noise alone gives 0.05
+)
 
 
 @dataclass(frozen=True)
@@ -39,6 +50,10 @@ class Separation:
         All further bounces together: direct + sum of bounces + rest is the image.
     solutions : tuple
         Solves in the order direct, first bounce, ...; per entry one Solution, or 3 in colour.
+    reciprocity_defect : float
+        Of T, see `ltcl.reciprocity`: 0 of a Lambertian scene measured without noise; NaN where unknown.
+    warning : str
+        Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 or unknown.
     """
 
     direct: np.ndarray
@@ -46,6 +61,8 @@ class Separation:
     bounces: np.ndarray
     rest: np.ndarray
     solutions: tuple[Solution | tuple[Solution, ...], ...]
+    reciprocity_defect: float = float("nan")
+    warning: str = ""
 
 
 def separate(
@@ -95,6 +112,9 @@ def separate(
         return shape.pack(parts, T.grid).astype(np.float32)
 
     direct, *indirect = [picture([chain.bounces[k] for chain in chains]) for k in range(bounces + 1)]
+    warning = _warning(T.reciprocity_defect)
+    if warning:
+        logger.warning(warning)
     per_bounce = [tuple(chain.solutions[k] for chain in chains) for k in range(bounces + 1)]
     return Separation(
         direct=direct,
@@ -102,6 +122,18 @@ def separate(
         bounces=np.stack(indirect) if indirect else np.empty((0, *direct.shape), np.float32),
         rest=picture([chain.rest for chain in chains]),
         solutions=tuple(found[0] if T.channels == 1 else found for found in per_bounce),
+        reciprocity_defect=T.reciprocity_defect,
+        warning=warning,
+    )
+
+
+def _warning(defect: float) -> str:
+    if not defect > LAMBERTIAN:  # nor where it is unknown
+        return ""
+    return (
+        f"T is not reciprocal (defect {defect:.2g}, above {LAMBERTIAN:g}): surfaces reflect differently to "
+        "different sides, or T is noisy; with one camera the bounces of such a scene are approximate "
+        "(section 8.4, eq. 28 and 29)"
     )
 
 

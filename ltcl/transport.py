@@ -7,6 +7,7 @@ S = T F^-1 = I + R, one operator per colour channel, on the device from its firs
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,10 +15,12 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from ltcl import checks, first_bounces, layout
+from ltcl import checks, first_bounces, inverse_diagonal, layout, reciprocity
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import CSR, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
+
+logger = logging.getLogger(__name__)
 
 
 class Transport:
@@ -30,9 +33,11 @@ class Transport:
         are row-major.
     grid : (h, w)
         Of the projector; N = h * w.
-    first_bounce : "diagonal", "exact" or array (N,) or (3, N)
+    first_bounce : "diagonal", "exact", "estimate" or array (N,) or (3, N)
         How F is found: diag(T), which also holds light that came back; 1 / diag(T^-1), which does not, for
-        Lambertian scenes without self-illumination, at the cost of a dense inverse; or F itself.
+        Lambertian scenes without self-illumination, at the cost of a dense inverse; a stochastic estimate
+        of the same by products on the device, opened at once, which "exact" becomes where a dense inverse
+        does not fit the host; or F itself.
     camera_grid : (h, w), optional
         Of the camera where T is rectangular, M = h * w; S then does not exist and T only relights.
     device : Device or str, optional
@@ -40,6 +45,8 @@ class Transport:
     on_dark : "raise" or "mask"
         What to do where F is zero or negative: refuse, or never light these projector pixels in a
         compensation. Relighting stays exact: what a pattern lights there is seen.
+    probes, seed : int
+        Of the estimate, whose error falls as 1 / sqrt(probes), each of about 20 products; at least 2.
 
     Attributes
     ----------
@@ -47,6 +54,8 @@ class Transport:
         T on the host, as given and checked.
     masked : (N,) bool
         Projector pixels dropped by ``on_dark="mask"``, in any channel.
+    first_bounce_error : array like first_bounce, or None
+        Standard error of an estimated first bounce.
 
     Raises
     ------
@@ -71,6 +80,8 @@ class Transport:
         device: Device | str | None = None,
         *,
         on_dark: str = "raise",
+        probes: int = 128,
+        seed: int = 0,
     ) -> None:
         self.matrices = _channels(matrix)
         self.shape: tuple[int, int] = self.matrices[0].shape
@@ -82,11 +93,13 @@ class Transport:
         self._forward: tuple[Operator, ...] | None = None
         self.masked: np.ndarray = np.zeros(self.shape[1], bool)
         self._first_bounce: np.ndarray | None = None
+        self.first_bounce_error: np.ndarray | None = None
+        self._reciprocity_defect: float | None = None
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
         if not self.is_square and not (isinstance(first_bounce, str) and first_bounce == "diagonal"):
             raise InputError(f"first_bounce is given, but T is {self.shape}; only a square T has one")
         if self.is_square:
-            F = first_bounces.find(self.matrices, first_bounce)
+            F = self._find_first_bounce(first_bounce, probes, seed)
             dark = F <= 0.0
             if dark.any():
                 first_bounces.refuse_dark(dark, self.grid, on_dark, self.matrices)
@@ -114,6 +127,15 @@ class Transport:
         """Diagonal of F: (N,) float64, or (3, N) in colour; 0 at masked pixels."""
         F = self._require_first_bounce()
         return F[0] if self.channels == 1 else F
+
+    @property
+    def reciprocity_defect(self) -> float:
+        """Of the worst channel, by a sample of pixels (`ltcl.reciprocity`); computed at the first call."""
+        if self._reciprocity_defect is None:
+            pairs = zip(self.matrices, self._require_first_bounce(), strict=True)
+            found = [reciprocity.defect(T, F, entries=reciprocity.QUICK) for T, F in pairs]
+            self._reciprocity_defect = max(found)
+        return self._reciprocity_defect
 
     @property
     def device(self) -> Device:
@@ -164,6 +186,22 @@ class Transport:
             np.divide(l_d, F[:, None], out=np.zeros(l_d.shape), where=F[:, None] > 0)
             for l_d, F in zip(columns, self._require_first_bounce(), strict=True)
         ]
+
+    def _find_first_bounce(self, wanted: Any, probes: int, seed: int) -> np.ndarray:
+        checks.count("probes", probes, least=2)
+        checks.count("seed", seed, least=0)
+        wanted_by_name = wanted if isinstance(wanted, str) else ""
+        if wanted_by_name == "exact" and first_bounces.too_large(self.matrices[0]):
+            logger.warning(
+                "T of %d pixels is too large for a dense inverse; its first bounce is estimated",
+                self.shape[1],
+            )
+            wanted_by_name = "estimate"
+        if wanted_by_name != "estimate":
+            return first_bounces.find(self.matrices, wanted)
+        F, error = inverse_diagonal.estimate(self.matrices, self.device, probes, seed)
+        self.first_bounce_error = error[0] if self.channels == 1 else error
+        return F
 
     def _require_first_bounce(self) -> np.ndarray:
         if self._first_bounce is None:

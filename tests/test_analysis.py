@@ -93,3 +93,38 @@ def test_an_operator_that_hides_its_entries_has_no_norms(device):
 def test_a_bad_tolerance_is_refused(device, rtol):
     with pytest.raises(InputError, match=r"rtol is .*; it must be a finite number above 0 and below 1"):
         ltcl.analyze(transport(lambertian(40, 0.5), device), rtol=rtol)
+
+
+def test_every_number_says_what_it_rests_on(device):
+    scene = lambertian(40, 1.7)
+    (channel,) = ltcl.analyze(transport(scene, device)).channels
+    lower, upper = channel.spectral_radius_bounds
+    assert 1.65 < lower <= 1.7 <= upper < 1.75
+    assert channel.spectral_radius_certificate == "collatz-wielandt"
+    assert channel.certificates.keys() == channel.products.keys()
+    assert channel.certificates["jacobi"] == "collatz-wielandt"
+    assert channel.certificates["chebyshev"] == "free bounds"
+
+
+def test_the_measurement_is_checked(device):
+    scene = lambertian(40, 0.9)
+    noisy = ltcl.Transport(
+        scene.T * (1 + 0.05 * np.random.default_rng(0).normal(size=(40, 40))), GRID, scene.F, device=device
+    )
+    (clean,), (measured,) = ltcl.analyze(transport(scene, device)).channels, ltcl.analyze(noisy).channels
+    assert clean.reciprocity_defect < 1e-5
+    assert measured.reciprocity_defect == pytest.approx(0.05, rel=0.2)
+    assert clean.energy.bounce_highest == pytest.approx(scene.A.sum(axis=1).max(), abs=2e-3)
+    assert clean.energy.conserved
+
+
+def test_the_forecast_of_richardson_is_met(device):
+    """x <- x + omega (b - S x) in float64, the spectrum of a closed room reaching both free bounds almost."""
+    scene = enclosure(40, 0.7)
+    (channel,) = ltcl.analyze(transport(scene, device)).channels
+    omega = 2 / sum(channel.bounds)
+    r = scene.S @ np.random.default_rng(0).uniform(0.2, 1.0, 40)
+    start = np.linalg.norm(r)
+    for _ in range(int(channel.products["richardson"])):
+        r = r - omega * (scene.S @ r)
+    assert np.linalg.norm(r) <= 1e-2 * start

@@ -27,17 +27,32 @@ LAYERS: list[set[str]] = [
     {"checks"},
     {"files"},
     {"images", "device"},
-    {"operators", "layout", "first_bounces"},
-    {"theory", "transport"},
+    {"operators", "layout", "first_bounces", "reciprocity"},
+    {"theory", "inverse_diagonal", "transport"},
     {"solvers"},
-    {"compensation", "separation", "relighting", "analysis", "scenes", "store", "acquisition", "report"},
+    {
+        "compensation",
+        "separation",
+        "relighting",
+        "analysis",
+        "energy",
+        "scenes",
+        "store",
+        "acquisition",
+        "report",
+    },
     {"plots"},
     {"batch", "demo"},
     {"cli"},
     {"__init__", "__main__"},
 ]
 RANK = {unit: rank for rank, units in enumerate(LAYERS) for unit in units}
-SIDEWAYS = {("transport", "theory")}  # the imports allowed within one layer
+SIDEWAYS = {
+    ("transport", "theory"),
+    ("transport", "inverse_diagonal"),
+    ("inverse_diagonal", "theory"),
+    ("analysis", "energy"),
+}  # the imports allowed within one layer
 NEVER = {(a, b) for a in ("acquisition", "images", "store") for b in ("device", "operators")}
 OPENCL = ("device", "pyopencl")  # the one unit that imports it
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ltcl
 from ltcl import images, plots
 from ltcl.errors import FileError, InputError
 from ltcl.solvers import Solution, Status
@@ -100,3 +101,14 @@ def test_no_pyplot_and_no_matplotlib_before_the_first_plot() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).resolve().parents[1]
     )
     assert run.returncode == 0, run.stderr
+
+
+def test_an_analysis_shows_every_channel_and_method(device) -> None:
+    one = ltcl.analyze(ltcl.scenes.box(3, albedo=0.8).transport(device=device))
+    left, right = plots.analysis({"a": one, "b": one}).axes
+    assert [label.get_text() for label in left.get_yticklabels()] == ["a", "b"]
+    assert [label.get_text() for label in right.get_yticklabels()] == list(one.channels[0].products)
+    said = [text.get_text().strip() for text in right.texts]
+    assert said.count("diverges") == 4  # jacobi and neumann, twice
+    with pytest.raises(InputError, match="found is empty"):
+        plots.analysis({})

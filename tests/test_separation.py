@@ -165,3 +165,26 @@ def test_bad_input_is_refused_by_name(device, case):
     with pytest.raises(error, match=says) as caught:
         ltcl.separate(transport(device), **{"image": FINE, **change})
     assert "\n" not in str(caught.value)
+
+
+# What one camera cannot know (section 8.4).
+
+
+def test_a_diffuse_scene_carries_no_warning(device, caplog):
+    T = transport(device)
+    b = ltcl.separate(T, T @ np.ones(GRID), bounces=1)
+    assert b.reciprocity_defect < 1e-5
+    assert b.warning == ""
+    assert not caplog.records
+
+
+def test_a_view_dependent_scene_carries_a_warning(device, caplog):
+    """Light that leaves in each direction its own way: R times a factor of the pair of pixels."""
+    shine = np.random.default_rng(0).lognormal(sigma=0.5, size=SCENE.R.shape)
+    matrix = (np.eye(SCENE.n) + 0.3 * SCENE.R * shine) * SCENE.F
+    T = ltcl.Transport(matrix, GRID, device=device)
+    b = ltcl.separate(T, T @ np.ones(GRID), bounces=1)
+    assert b.reciprocity_defect > 0.1
+    assert "T is not reciprocal" in b.warning
+    assert "section 8.4" in b.warning
+    assert [record.message for record in caplog.records] == [b.warning]

@@ -11,6 +11,7 @@ import scipy.sparse
 from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 import ltcl
+from ltcl import first_bounces
 from ltcl.errors import DeviceError, InputError, InputTypeError, LtclError
 from ltcl.operators import Dense
 from tests.problems import lambertian
@@ -253,4 +254,4 @@ def test_bad_input_is_refused_by_name(case, monkeypatch):
 def test_what_would_not_fit_the_host_is_said_before(monkeypatch):
     monkeypatch.setattr("ltcl.checks.host_memory", lambda: 1024)
     with pytest.raises(MemoryError, match="first_bounce='exact' inverts T densely, which for N = 35 needs"):
-        transport(SCENE.T, first_bounce="exact")
+        first_bounces.find([SCENE.T], "exact")  # a Transport would turn to an estimate

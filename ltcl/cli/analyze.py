@@ -3,56 +3,130 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
 from ltcl.cli import console, options, transports
 
 _COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
+_Plot = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Draw bounds on rho(R) and the forecast: .png, .svg, .pdf.", show_default=False
+    ),
+]
 
 
 def run(
     files: options.Matrices,
     rtol: options.Rtol = 1e-2,
+    plot: _Plot = None,
     grid: options.Grid = None,
     first_bounce: options.FirstBounce = None,
     on_dark: options.OnDark = "raise",
     device: options.Device = None,
     json: options.Json = False,
 ) -> None:
-    """Norms and spectral radius of R, and the products each method needs to reach the tolerance."""
+    """Spectrum of R, products each method needs to the tolerance, and whether T is physically possible."""
     from ltcl.analysis import analyze
 
-    found = []
+    analyses, found = {}, []
     with console.Steps(len(files)) as steps:
         for file in files:
             steps.item(str(file))
             T = transports.load(file, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
-            found.append({"file": str(file), "device": T.device.name, **analyze(T, rtol=rtol).to_dict()})
+            analyses[str(file)] = analyze(T, rtol=rtol)
+            found.append({"file": str(file), "device": T.device.name, **analyses[str(file)].to_dict()})
+    if plot is not None:
+        _draw(plot, analyses)
     if json:
         console.answer(found)
-        return
+    else:
+        _show(found, rtol)
+
+
+def _draw(path: Path, analyses: dict[str, Any]) -> None:
+    from ltcl import plots
+
+    plots.save(plots.analysis({Path(file).name: one for file, one in analyses.items()}), path)
+
+
+def _show(found: list[dict[str, Any]], rtol: float) -> None:
     methods = tuple(found[0]["channels"][0]["products"])
-    columns = ("file", "channel", "rho(R)", "albedo", "norm 1", "norm inf", "first bounce", *methods)
-    console.table(columns, [row for entry in found for row in _rows(entry, methods)])
-    typer.echo(f"\n{', '.join(methods)}: products with S to a relative residual of {rtol:g}")
+    typer.echo("Spectrum of R, and bounds on that of S")
+    columns = (
+        "file",
+        "channel",
+        "rho(R)",
+        "between",
+        "certificate",
+        "albedo",
+        "norm 1",
+        "norm inf",
+        "S between",
+    )
+    console.table((*columns, "first bounce"), _rows(found, _spectrum))
+    typer.echo(f"\nProducts with S (sweeps of Gauss-Seidel) to a relative residual of {rtol:g}")
+    console.table(("file", "channel", *methods), _rows(found, _forecast))
+    for name in methods:
+        certificates = {channel["certificates"][name] for entry in found for channel in entry["channels"]}
+        typer.echo(f"  {name}: by {', '.join(sorted(certificates))}")
+    typer.echo("\nChecks of the measurement")
+    columns = (
+        "reciprocity defect",
+        "one bounce keeps",
+        "albedo by columns",
+        "negative entries",
+        "their light",
+    )
+    console.table(("file", "channel", *columns), _rows(found, _checks))
 
 
-def _rows(entry: dict[str, Any], methods: tuple[str, ...]) -> list[tuple]:
+def _rows(found: list[dict[str, Any]], cells: Any) -> list[tuple]:
     return [
-        (
-            entry["file"],
-            colour,
-            channel["spectral_radius"],
-            channel["albedo"],
-            channel["norm_one"],
-            channel["norm_inf"],
-            "{:.4g} .. {:.4g}".format(channel["first_bounce"][0], channel["first_bounce"][-1]),
-            *(
-                "diverges" if channel["products"][name] is None else channel["products"][name]
-                for name in methods
-            ),
-        )
+        (entry["file"], colour, *cells(channel))
+        for entry in found
         for colour, channel in zip(_COLOURS[len(entry["channels"])], entry["channels"], strict=True)
     ]
+
+
+def _spectrum(channel: dict[str, Any]) -> tuple:
+    return (
+        channel["spectral_radius"],
+        _between(*channel["spectral_radius_bounds"]),
+        channel["spectral_radius_certificate"],
+        channel["albedo"],
+        channel["norm_one"],
+        channel["norm_inf"],
+        _between(*channel["bounds"]),
+        _between(channel["first_bounce"][0], channel["first_bounce"][-1]),
+    )
+
+
+def _forecast(channel: dict[str, Any]) -> tuple:
+    """JSON has None for both: what has a certificate but no number diverges."""
+    return tuple(
+        "diverges" if products is None and channel["certificates"][name] != "none" else products
+        for name, products in channel["products"].items()
+    )
+
+
+def _checks(channel: dict[str, Any]) -> tuple:
+    energy = channel["energy"]
+    return (
+        channel["reciprocity_defect"],
+        _between(energy["bounce_lowest"], energy["bounce_highest"]),
+        energy["albedo_from_columns"],
+        _percent(energy["negative_entries"]),
+        _percent(energy["negative_light"]),
+    )
+
+
+def _between(lower: float | None, upper: float | None) -> str:
+    return " .. ".join("-" if value is None else f"{value:.4g}" for value in (lower, upper))
+
+
+def _percent(share: float | None) -> str | None:
+    return None if share is None else f"{100 * share:.3g} %"

@@ -62,10 +62,10 @@ CameraGrid = Annotated[
     ),
 ]
 FirstBounce = Annotated[
-    Literal["diagonal", "exact"] | None,
+    Literal["diagonal", "exact", "estimate"] | None,
     typer.Option(
         help="Where the direct light comes from: the diagonal of T, or 1 / diag(T^-1), slower and free of "
-        "returned light. Default: the file's, else diagonal.",
+        "returned light, by a dense inverse or estimated by products. Default: the file's, else diagonal.",
         show_default=False,
     ),
 ]

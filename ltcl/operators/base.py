@@ -20,11 +20,12 @@ WIDTHS = (8, 4, 3, 2, 1)  # right-hand sides one launch of a product kernel take
 
 @dataclass(frozen=True)
 class Norms:
-    """Largest column sum, largest row sum (both of absolute values) and Frobenius norm."""
+    """Largest column sum, largest row sum (both of absolute values), Frobenius norm, smallest entry or 0."""
 
     one: float
     inf: float
     frobenius: float
+    lowest: float
 
 
 class Operator(scipy.sparse.linalg.LinearOperator):

@@ -126,6 +126,7 @@ class CSR(RowOperator):
             one=float(np.max(absolute.sum(axis=0), initial=0.0)),
             inf=float(np.max(absolute.sum(axis=1), initial=0.0)),
             frobenius=float(np.linalg.norm(self._host.data)),
+            lowest=float(np.min(self._host.data, initial=0.0)),
         )
 
     def to_dense(self) -> np.ndarray:

@@ -59,13 +59,14 @@ class Dense(RowOperator):
 
     def norms(self) -> Norms:
         """Norms of the matrix, in float64, slab by slab."""
-        columns, row, squares = np.zeros(self.shape[1]), 0.0, 0.0
+        columns, row, squares, lowest = np.zeros(self.shape[1]), 0.0, 0.0, 0.0
         for _, block in self._blocks():
+            lowest = min(lowest, float(block.min(initial=0.0)))
             np.abs(block, out=block)
             columns += block.sum(axis=0)
             row = max(row, float(block.sum(axis=1).max(initial=0.0)))
             squares += float(np.vdot(block, block))
-        return Norms(one=float(columns.max(initial=0.0)), inf=row, frobenius=squares**0.5)
+        return Norms(float(columns.max(initial=0.0)), row, squares**0.5, lowest)
 
     def to_dense(self) -> np.ndarray:
         """The whole matrix, (M, N) float64, on the host."""

@@ -42,3 +42,29 @@ def test_refusals(program: Program, dark_transport: Path, tmp_path: Path) -> Non
     program("analyze", path, "--grid", "2x4").refused("h * w must be 6")
     program("analyze", path, "--grid", "2x3", "--rtol", "2").refused("rtol is 2.0")
     assert program("analyze", path, "--grid", "2x3").code == 0
+
+
+def test_everything_is_in_the_tables_and_in_json(program: Program, transport: Path) -> None:
+    outcome = program("analyze", transport)
+    assert outcome.code == 0
+    for part in ("between", "collatz-wielandt", "gauss_seidel", "richardson", "reciprocity defect", "0 %"):
+        assert part in outcome.out
+    (channel,) = program("analyze", transport, "--json").json[0]["channels"]
+    assert channel["reciprocity_defect"] < 1e-5
+    assert 0 < channel["energy"]["bounce_highest"] < 0.6  # the albedo
+    assert channel["certificates"]["chebyshev"] == "free bounds"
+    lower, upper = channel["spectral_radius_bounds"]
+    assert lower <= channel["spectral_radius"] <= upper
+
+
+def test_plot(program: Program, transport: Path, colour_transport: Path, tmp_path: Path) -> None:
+    assert program("analyze", transport, colour_transport, "--plot", tmp_path / "a.png").code == 0
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    program("analyze", transport, "--plot", tmp_path / "a.xyz").refused("plots are")
+
+
+def test_an_estimated_first_bounce(program: Program, transport: Path) -> None:
+    (entry,) = program("analyze", transport, "--first-bounce", "estimate", "--json").json
+    (exact,) = program("analyze", transport, "--first-bounce", "exact", "--json").json
+    found, wanted = (e["channels"][0]["spectral_radius"] for e in (entry, exact))
+    assert found == pytest.approx(wanted, rel=0.1)

@@ -82,6 +82,7 @@ def norms_match(A: Operator, matrix: np.ndarray, rel: float) -> None:
     assert norms.one == pytest.approx(np.linalg.norm(matrix, 1), rel=rel)
     assert norms.inf == pytest.approx(np.linalg.norm(matrix, np.inf), rel=rel)
     assert norms.frobenius == pytest.approx(np.linalg.norm(matrix, "fro"), rel=rel)
+    assert norms.lowest == pytest.approx(min(float(matrix.min(initial=0.0)), 0.0), rel=rel)
 
 
 def force(monkeypatch: pytest.MonkeyPatch, A: RowOperator, name: str) -> None:

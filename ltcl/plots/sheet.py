@@ -1,34 +1,34 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Plots: how solves converge, and the contact sheet of the demo.
-
-Every function takes data and returns a matplotlib `Figure`; `save` writes it whole or not at all. Figures are
-drawn by Agg without pyplot, so nothing here needs a screen or touches global state. matplotlib is imported
-by the first plot, not with this module.
-"""
+"""How solves converge, and the contact sheet of the demo."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.files import replace_file
 from ltcl.images import from_srgb, resize, to_srgb
+from ltcl.plots.page import (
+    COLOURS,
+    FAINT,
+    GRID,
+    OTHERS,
+    PAPER,
+    axes_at,
+    figure_of,
+    heading,
+    label_at,
+)
 from ltcl.solvers import Solution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DPI = 100
-_PAPER, _INK, _FAINT, _GRID = "#15171b", "#f1efea", "#9aa1ab", "#2b2f36"
-_COLOURS = {"chebyshev": "#5cc8ff", "jacobi": "#ff5d5d", "neumann": "#ffb347", "direct": "#8bd17c"}
-_OTHERS = ("#c792ea", "#f78fb3", "#7fdbca", "#d6deeb")
 _LOWEST = 1e-8  # of a residual worth drawing: float32 products end above
 
 
@@ -86,8 +86,8 @@ def convergence(solutions: Mapping[str, Solution], rtol: float, title: str = "Co
     >>> sorted(text.get_text() for text in figure.axes[0].texts)
     ['jacobi', 'richardson', 'tolerance']
     """
-    figure = _figure(900, 560)
-    _heading(figure, 34, 26, title, 17)
+    figure = figure_of(900, 560)
+    heading(figure, 34, 26, title, 17)
     _draw_convergence(figure.add_axes((0.09, 0.13, 0.73, 0.72)), solutions, rtol)
     return figure
 
@@ -110,35 +110,15 @@ def contact_sheet(sheet: Sheet, width: int = 1600) -> Figure:
     tops = [rows[0].top]
     for row in rows[:2]:
         tops.append(tops[-1] + row.height + 74)
-    figure = _figure(width, tops[-1] + rows[-1].height + 30)
-    _heading(figure, margin, 32, sheet.title, 26)
-    _text(figure, margin, 82, sheet.subtitle, size=15, color=_FAINT)
+    figure = figure_of(width, tops[-1] + rows[-1].height + 30)
+    heading(figure, margin, 32, sheet.title, 26)
+    label_at(figure, margin, 82, sheet.subtitle, size=15, color=FAINT)
     for row, top in zip(rows, tops, strict=True):
         for place, panel in enumerate(row.panels):
             _draw_panel(figure, panel, margin + place * (row.width + gap), top, row)
     left = margin + len(sheet.medium) * (rows[1].width + gap)
     _draw_plot(figure, sheet, (left, tops[1], width - margin - left, rows[1].height))
     return figure
-
-
-def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure; an earlier file at `path` is replaced whole or not at all.
-
-    Raises
-    ------
-    InputError
-        An extension that matplotlib cannot write.
-    FileError
-        The file cannot be written.
-    """
-    known = figure.canvas.get_supported_filetypes()
-    extension = os.path.splitext(path)[1].lstrip(".").lower()
-    if extension not in known:
-        raise InputError(
-            f"{path}: extension {extension or 'missing'!r} is unknown; plots are {', '.join(sorted(known))}"
-        )
-    with replace_file(path) as temporary:
-        figure.savefig(temporary, dpi=_DPI, facecolor=figure.get_facecolor())
 
 
 @dataclass(frozen=True)
@@ -155,49 +135,23 @@ class _Row:
         return round(max((self.width * shape[0] / shape[1] for shape in shapes), default=0))
 
 
-def _figure(width: int, height: int) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor=_PAPER)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _text(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:
-    """Text whose top is `y` pixels below the top of the figure; sizes in points, 1.4 pixels each."""
-    width, height = figure.get_size_inches() * _DPI
-    figure.text(x / width, 1 - y / height, text, fontsize=size, **{"va": "top", "color": _INK, **style})
-
-
-def _heading(figure: Figure, x: float, y: float, text: str, size: float) -> None:
-    _text(figure, x, y, text, size=size, fontweight="bold")
-
-
-def _axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
-    """Axes in pixels: left, top, width, height, from the top left corner of the figure."""
-    width, height = figure.get_size_inches() * _DPI
-    left, top, w, h = box
-    return figure.add_axes((left / width, 1 - (top + h) / height, w / width, h / height))
-
-
 def _draw_panel(figure: Figure, panel: Panel, left: int, top: int, row: _Row) -> None:
     height = round(row.width * panel.image.shape[0] / panel.image.shape[1])
     size = 17 if row.width > 400 else 13.5
     line = top - 10
-    _text(figure, left, line, panel.label, size=size, fontweight="bold", va="bottom")
+    label_at(figure, left, line, panel.label, size=size, fontweight="bold", va="bottom")
     # Pictures rarely fill their corners: the note keeps away from the next panel's label.
-    _text(
+    label_at(
         figure,
         left + 0.96 * row.width,
         line,
         panel.note,
         size=size - 1,
-        color=_FAINT,
+        color=FAINT,
         va="bottom",
         ha="right",
     )
-    axes = _axes(figure, (left, top, row.width, height))
+    axes = axes_at(figure, (left, top, row.width, height))
     axes.imshow(_display(panel.image, (height, row.width)), interpolation="none", aspect="auto")
     axes.axis("off")
 
@@ -205,15 +159,15 @@ def _draw_panel(figure: Figure, panel: Panel, left: int, top: int, row: _Row) ->
 def _display(image: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
     """8-bit sRGB of a linear picture on `grid` pixels, laid over the colour of the page by its coverage."""
     picture, coverage = (image[..., :3], image[..., 3:]) if image.shape[-1] == 4 else (image, 1.0)
-    paper = from_srgb(np.array([int(_PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)]))
+    paper = from_srgb(np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)]))
     over = np.clip(picture, 0, 1) * coverage + paper * (1.0 - coverage)
     return np.rint(255 * to_srgb(np.clip(resize(over, grid), 0, 1))).astype(np.uint8)
 
 
 def _draw_plot(figure: Figure, sheet: Sheet, box: tuple[int, int, int, int]) -> None:
     left, top, width, height = box
-    _text(figure, left + 70, top - 10, sheet.plot_title, size=13.5, fontweight="bold", va="bottom")
-    axes = _axes(figure, (left + 70, top, width - 70 - 118, height - 50))
+    label_at(figure, left + 70, top - 10, sheet.plot_title, size=13.5, fontweight="bold", va="bottom")
+    axes = axes_at(figure, (left + 70, top, width - 70 - 118, height - 50))
     _draw_convergence(axes, sheet.solutions, sheet.rtol)
 
 
@@ -228,11 +182,11 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
     values = np.concatenate([y for _, y in curves.values()])
     limits = min(float(values.min()), rtol) / 2, max(2.0, 2 * float(values.max()))
     axes.set_ylim(*limits)
-    axes.plot([0, products], [rtol, rtol], color=_FAINT, lw=1.2, ls=(0, (4, 4)))
-    axes.text(0.99 * products, rtol, "tolerance", color=_FAINT, fontsize=11, va="bottom", ha="right")
-    others, ends = iter(_OTHERS * len(solutions)), []
+    axes.plot([0, products], [rtol, rtol], color=FAINT, lw=1.2, ls=(0, (4, 4)))
+    axes.text(0.99 * products, rtol, "tolerance", color=FAINT, fontsize=11, va="bottom", ha="right")
+    others, ends = iter(OTHERS * len(solutions)), []
     for name, (x, y) in curves.items():
-        colour = _COLOURS.get(name) or next(others)
+        colour = COLOURS.get(name) or next(others)
         # Neumann runs on top of Jacobi, which must stay visible.
         axes.plot(x, y, color=colour, lw=2.6, ls=(0, (2, 2)) if name == "neumann" else "-", clip_on=False)
         label = name if solutions[name].residual >= _LOWEST else f"{name} \u2193"
@@ -245,17 +199,17 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
 def _dress(axes: Axes) -> None:
     from matplotlib.ticker import LogLocator, MaxNLocator
 
-    axes.set_facecolor(_PAPER)
+    axes.set_facecolor(PAPER)
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(10, numticks=8))
     axes.minorticks_off()
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-    axes.grid(color=_GRID, lw=1)
-    axes.tick_params(colors=_FAINT, labelsize=11, length=0, pad=7)
+    axes.grid(color=GRID, lw=1)
+    axes.tick_params(colors=FAINT, labelsize=11, length=0, pad=7)
     for spine in axes.spines.values():
         spine.set_visible(False)
-    axes.set_xlabel("products with S", color=_FAINT, fontsize=12, labelpad=6)
-    axes.set_ylabel("relative residual", color=_FAINT, fontsize=12, labelpad=6)
+    axes.set_xlabel("products with S", color=FAINT, fontsize=12, labelpad=6)
+    axes.set_ylabel("relative residual", color=FAINT, fontsize=12, labelpad=6)
 
 
 def _curve(solution: Solution, products: int) -> tuple[np.ndarray, np.ndarray]:

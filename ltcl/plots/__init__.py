@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Plots: how solves converge, what an analysis says, and the contact sheet of the demo.
+
+Every function takes data and returns a matplotlib `Figure`; `save` writes it whole or not at all. Figures are
+drawn by Agg without pyplot, so nothing here needs a screen or touches global state. matplotlib is imported
+by the first plot, not with this module.
+"""
+
+from __future__ import annotations
+
+from ltcl.plots.forecast import analysis
+from ltcl.plots.page import save
+from ltcl.plots.sheet import Panel, Sheet, contact_sheet, convergence
+
+__all__ = ["Panel", "Sheet", "analysis", "contact_sheet", "convergence", "save"]

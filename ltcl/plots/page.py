@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What all plots share: the dark page, its colours, text and axes in pixels, and saving."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+from ltcl.errors import InputError
+from ltcl.files import replace_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+DPI = 100
+PAPER, INK, FAINT, GRID = "#15171b", "#f1efea", "#9aa1ab", "#2b2f36"
+COLOURS = {"chebyshev": "#5cc8ff", "jacobi": "#ff5d5d", "neumann": "#ffb347", "direct": "#8bd17c"}
+OTHERS = ("#c792ea", "#f78fb3", "#7fdbca", "#d6deeb")
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure; an earlier file at `path` is replaced whole or not at all.
+
+    Raises
+    ------
+    InputError
+        An extension that matplotlib cannot write.
+    FileError
+        The file cannot be written.
+    """
+    known = figure.canvas.get_supported_filetypes()
+    extension = os.path.splitext(path)[1].lstrip(".").lower()
+    if extension not in known:
+        raise InputError(
+            f"{path}: extension {extension or 'missing'!r} is unknown; plots are {', '.join(sorted(known))}"
+        )
+    with replace_file(path) as temporary:
+        figure.savefig(temporary, dpi=DPI, facecolor=figure.get_facecolor())
+
+
+def figure_of(width: int, height: int) -> Figure:
+    """An empty page of so many pixels, drawn by Agg."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def label_at(figure: Figure, x: float, y: float, text: str, *, size: float, **style: Any) -> None:
+    """Text whose top is `y` pixels below the top of the figure; sizes in points, 1.4 pixels each."""
+    width, height = figure.get_size_inches() * DPI
+    figure.text(x / width, 1 - y / height, text, fontsize=size, **{"va": "top", "color": INK, **style})
+
+
+def heading(figure: Figure, x: float, y: float, text: str, size: float) -> None:
+    """Bold text whose top is `y` pixels below the top of the figure."""
+    label_at(figure, x, y, text, size=size, fontweight="bold")
+
+
+def axes_at(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
+    """Axes in pixels: left, top, width, height, from the top left corner of the figure."""
+    width, height = figure.get_size_inches() * DPI
+    left, top, w, h = box
+    return figure.add_axes((left / width, 1 - (top + h) / height, w / width, h / height))

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What n terms of a series leave undone: bounce by bounce in integers, and as a bound from the albedo.
+
+    forward   S_n    = I + A + ... + A^n             (eq. 8, 11)
+    inverse   S_n^-1 = I - R + ... + (-1)^n R^n      (eq. 10)
+
+m bounds the albedo, so that ||A|| <= m; the norm is any induced p-norm (footnote 2 of the paper).
+"""
+
+from __future__ import annotations
+
+from math import comb
+
+from ltcl import checks
+from ltcl.errors import InputError
+
+
+def bounce_coefficients(n: int, bounces: int) -> tuple[int, ...]:
+    """Coefficients of A^0, A^1, ..., A^bounces in the n-term inverse series (eq. 12), exactly.
+
+    R^k = (A + A^2 + ...)^k holds A^j binom(j-1, k-1) times; summed with alternating signs over k = 1 ..
+    min(j, n) these cancel for 2 <= j <= n (eq. 13), so that I - A remains and bounces above n.
+
+    Parameters
+    ----------
+    n : int
+        Order of the series, at least 0.
+    bounces : int
+        Highest power of A, at least 0.
+
+    Returns
+    -------
+    tuple of int
+        ``bounces + 1`` of them.
+
+    Raises
+    ------
+    InputError
+        Not whole numbers of at least 0.
+
+    Examples
+    --------
+    >>> bounce_coefficients(3, 6)  # I - A, bounces 2 and 3 gone, higher ones not yet
+    (1, -1, 0, 0, -1, -3, -6)
+    """
+    checks.count("n", n, least=0)
+    checks.count("bounces", bounces, least=0)
+    return (1, *(_coefficient(n, j) for j in range(1, bounces + 1)))
+
+
+def _coefficient(n: int, j: int) -> int:
+    """Of A^j, j >= 1; R^0 = I has none."""
+    return sum((-1) ** k * comb(j - 1, k - 1) for k in range(1, min(j, n) + 1))
+
+
+def norm_bound(m: float) -> float:
+    """||R|| <= m / (1 - m) (eq. 14).
+
+    Raises
+    ------
+    InputError
+        m outside [0, 1): no surface gives back all light, or more.
+
+    Examples
+    --------
+    >>> norm_bound(0.5)
+    1.0
+    """
+    m = _albedo(m)
+    return m / (1.0 - m)
+
+
+def forward_error_bound(m: float, n: int) -> float:
+    """||S - S_n|| <= m^(n+1) / (1 - m) of n bounces (eq. 15).
+
+    Raises
+    ------
+    InputError
+        m outside [0, 1), n below 0.
+
+    Examples
+    --------
+    >>> forward_error_bound(0.5, 3)
+    0.125
+    """
+    m = _albedo(m)
+    return m ** (checks.count("n", n, least=0) + 1) / (1.0 - m)
+
+
+def inverse_error_bound(m: float, n: int) -> float:
+    """||S^-1 - S_n^-1|| <= m^(n+1) / ((1 - m)^n (1 - 2 m)) of n terms (eq. 16).
+
+    Raises
+    ------
+    InputError
+        m outside [0, 1/2): beyond, ||R|| < 1 is not certain and no bound follows; n below 0.
+
+    Examples
+    --------
+    >>> inverse_error_bound(0.25, 1)
+    0.16666666666666666
+    """
+    m, n = _albedo(m), checks.count("n", n, least=0)
+    if m >= 0.5:
+        raise InputError(
+            f"m is {m:g}; the bound of the inverse series (eq. 16) needs an albedo m below 1/2: "
+            "above, use method 'chebyshev', which converges for every albedo"
+        )
+    return m * (m / (1.0 - m)) ** n / (1.0 - 2.0 * m)  # no power on its own, which would underflow first
+
+
+def _albedo(m: float) -> float:
+    return checks.number("m", m, least=0.0, below=1.0)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Forecasts against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.polynomial.chebyshev import Chebyshev
+
+from ltcl import theory
+from ltcl.operators import Dense, IdentityPlus
+from ltcl.theory import SpectralRadius
+from tests.problems import enclosure, lambertian
+
+
+@pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
+@pytest.mark.parametrize("rho", [0.0, 1e-3, 0.3, 0.77, 0.99, 1.0, 4.0])
+def test_the_series_takes_the_first_power_below_the_tolerance(rho, rtol):
+    if rho >= 1.0:
+        assert theory.series_products(rho, rtol) == math.inf
+        return
+    k = theory.series_products(rho, rtol)
+    assert k >= 1
+    assert rho**k <= rtol * (1 + 1e-12)
+    assert k == 1 or rho ** (k - 1) > rtol * (1 - 1e-12)
+
+
+@pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
+@pytest.mark.parametrize(("lower", "upper"), [(0.5, 1.5), (0.5, 2.0), (0.5, 5.0), (0.5, 50.0), (0.2, 1.8)])
+def test_chebyshev_takes_the_first_degree_below_the_tolerance(lower, upper, rtol):
+    """The best polynomial of degree k with p(0) = 1 has maximum 1 / T_k(centre / radius) on the interval."""
+    k = theory.chebyshev_products(lower, upper, rtol)
+    centre = (upper + lower) / (upper - lower)
+    assert 1 / Chebyshev.basis(k)(centre) <= rtol * (1 + 1e-9)
+    assert k == 1 or 1 / Chebyshev.basis(k - 1)(centre) > rtol * (1 - 1e-9)
+
+
+def test_a_spectrum_of_one_point_takes_one_product():
+    assert theory.richardson_products(2.0, 2.0, 1e-9) == 1
+    assert theory.chebyshev_products(2.0, 2.0, 1e-9) == 1
+
+
+def radius_of_sweeps(S: np.ndarray) -> float:
+    return float(np.abs(np.linalg.eigvals(-np.linalg.solve(np.tril(S), np.triu(S, 1)))).max())
+
+
+@pytest.mark.parametrize("rho", [0.3, 0.9, 4.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_gauss_seidel_has_the_radius_of_its_iteration_matrix(device, rho, seed):
+    scene = lambertian(40, rho, seed)
+    wanted = theory.series_products(radius_of_sweeps(scene.S), 1e-6)
+    found = theory.gauss_seidel_forecast(IdentityPlus(Dense(device, scene.R)), 1e-6)
+    assert found.certificate == "power iteration of sweeps"
+    assert found.products == pytest.approx(wanted, rel=0.1, abs=1)
+
+
+@pytest.mark.parametrize("albedo", [0.45, 0.51, 0.8])
+def test_gauss_seidel_converges_where_jacobi_does_not(device, albedo):
+    scene = enclosure(40, albedo)
+    R = Dense(device, scene.R)
+    S, rho = IdentityPlus(R), theory.spectral_radius(R, norms=R.norms())
+    found = theory.forecasts(S, rho, theory.free_bounds(S), 1e-2)
+    assert math.isinf(found["jacobi"].products) == (albedo > 0.5)
+    assert found["gauss_seidel"].products < 60
+    assert found["jacobi"].certificate == "collatz-wielandt"
+    assert found["chebyshev"].products <= found["richardson"].products < math.inf
+
+
+def test_what_is_unknown_has_no_forecast(device):
+    zero_on_diagonal = IdentityPlus(Dense(device, [[-1.0, 0.5], [0.5, 0.0]]))
+    found = theory.gauss_seidel_forecast(zero_on_diagonal, 1e-2)
+    assert math.isnan(found.products)
+    assert found.certificate == "none"
+
+
+def test_bounds_on_both_sides_of_one_leave_the_series_uncertified(device):
+    S = IdentityPlus(Dense(device, [[0.0, 0.5], [0.5, 0.0]]))
+    rho = SpectralRadius(0.9, 0.0, 1, lower=0.8, upper=1.1, certificate="collatz-wielandt")
+    assert theory.forecasts(S, rho, (0.5, 2.0), 1e-2)["jacobi"].certificate == "power iteration"
+
+
+@pytest.mark.parametrize("rtol", [0.3, 1e-2, 1e-5])
+@pytest.mark.parametrize(("lower", "upper"), [(0.5, 1.5), (0.5, 5.0), (0.2, 1.8)])
+def test_richardson_takes_the_first_power_below_the_tolerance(lower, upper, rtol):
+    k = theory.richardson_products(lower, upper, rtol)
+    omega = 2 / (lower + upper)
+    factor = max(abs(1 - omega * lower), abs(1 - omega * upper))
+    assert factor**k <= rtol * (1 + 1e-9)
+    assert k == 1 or factor ** (k - 1) > rtol * (1 - 1e-9)
+    assert theory.chebyshev_products(lower, upper, rtol) <= k
