@@ -20,7 +20,7 @@ from ltcl.solvers import Solution, solve
 from ltcl.transport import Transport, require
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Compensation:
     """Result of `ltcl.compensate`. Pictures have the shape of `desired`, linear, float32.
 
@@ -46,6 +46,10 @@ class Compensation:
     clipped: float
     target: np.ndarray
     solution: Solution | tuple[Solution, ...]
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.pattern.shape))
+        return f"<ltcl Compensation {shape}, off by {self.error:.2%}, {self.clipped:.2%} clipped>"
 
     @property
     def error(self) -> float:

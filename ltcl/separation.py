@@ -34,7 +34,7 @@ LAMBERTIAN = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Separation:
     """Result of `ltcl.separate`. Pictures have the shape of the image, linear, float32.
 
@@ -63,6 +63,10 @@ class Separation:
     solutions: tuple[Solution | tuple[Solution, ...], ...]
     reciprocity_defect: float = float("nan")
     warning: str = ""
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.direct.shape))
+        return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces>"
 
 
 def separate(

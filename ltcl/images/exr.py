@@ -65,7 +65,10 @@ def read(path: Path) -> np.ndarray:
 def write(path: Path, picture: np.ndarray) -> None:
     """Write (h, w) or (h, w, 3) float16 or float32 pixels, losslessly compressed."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, {"Y" if picture.ndim == 2 else "RGB": picture}).write(str(path))
+    try:
+        OpenEXR.File(header, {"Y" if picture.ndim == 2 else "RGB": picture}).write(str(path))
+    except RuntimeError as error:  # a full disk, for one
+        raise FileError(f"cannot be written: {' '.join(str(error).split())}") from error
 
 
 def _picture(channels: dict[str, np.ndarray]) -> np.ndarray:

@@ -14,7 +14,7 @@ class Status(enum.Enum):
 
     CONVERGED = "the true residual is within the tolerance"
     MAXITER = (
-        "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try method='chebyshev'"
+        "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try another method"
     )
     DIVERGED = (
         "the residual grew: the series converges only where the spectral radius of R is below 1; "
@@ -81,7 +81,11 @@ class Solution:
         return finite[-1] if self.converged else min(finite)
 
     def __str__(self) -> str:
+        best, last = self.residual, self.residuals[-1]
+        residual = f"{best:.2g}" if best > 0 else "lost in rounding"
+        if last > best:
+            residual += f" at best and {last:.2g} at the end"
         return (
             f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, "
-            f"{self.products} products, relative residual {self.residual:.2g}: {self.status.value}"
+            f"{self.products} products, relative residual {residual}: {self.status.value}"
         )

@@ -107,6 +107,8 @@ def solve(
     start = time.perf_counter()
     checks.one_of("method", method, METHODS)
     b_host = checks.finite("b", checks.real("b", b))
+    if isinstance(S, (tuple, list)) and any(isinstance(part, Operator) for part in S):
+        raise InputTypeError(f"S is {len(S)} operators, one per colour channel; it must be one: solve each")
     shape = S.shape if hasattr(S, "shape") else checks.real("S", S).shape
     rule = _rule(shape, b_host, rtol, atol, maxiter, callback)
     guess = _guess(x0, b_host)

@@ -148,6 +148,8 @@ class Monitor:
         grown = residual > _GROWTH * first or (self._rises >= _RISES and residual > first)
         if grown or not np.isfinite(residual):
             return Status.DIVERGED
+        if not self._reachable and residual <= _ROUNDING:
+            return Status.STAGNATED  # all that float32 can tell
         waited = self.iterations - self._lowest_at
         if (waited >= _PATIENCE and self._lowest < _DRIFT) or self._stalled():
             return Status.STAGNATED

@@ -76,7 +76,9 @@ def load(
             wanted = camera_grid or _unknown("camera_grid", rows, "camera")
             camera_grid = checks.grid("camera_grid", wanted, rows)
         if first_bounce is None:
-            first_bounce = "diagonal" if record.first_bounce is None else record.first_bounce
+            # On another camera grid T only relights, and the file's first bounce means nothing.
+            stored = record.first_bounce if camera_grid in (None, grid) else None
+            first_bounce = "diagonal" if stored is None else stored
         return Transport(
             record.matrices if len(record.matrices) == 3 else record.matrices[0],
             grid=grid,

@@ -55,6 +55,10 @@ class Archive:
     """
 
     def __init__(self, path: Path) -> None:
+        with path.open("rb") as file:
+            start = file.read(4)
+        if start[:2] != b"PK":  # of every zip file, an empty or damaged one included
+            raise FileError(f"is no .npz archive: it begins with {start!r}, not {b'PK'!r}")
         with _refusing("the archive"):
             self._zip = zipfile.ZipFile(path)
         self._size = path.stat().st_size
