@@ -39,15 +39,14 @@ inline real8 relax_gather8(global const real *x, int stride, global const int *c
 }
 
 #define RELAX_STRETCH(even, odd) \
-    real8 even, odd; \
     do { \
         const int column = columns[j]; \
         if (stride == 1 && columns[j + 15] == column + 15) { \
-            even = LOAD8(values + j) * LOAD8(x + column); \
-            odd = LOAD8(values + j + 8) * LOAD8(x + column + 8); \
+            even = LOAD8(values + j) * LOAD8(x + column) + even; \
+            odd = LOAD8(values + j + 8) * LOAD8(x + column + 8) + odd; \
         } else { \
-            even = LOAD8(values + j) * relax_gather8(x, stride, columns + j); \
-            odd = LOAD8(values + j + 8) * relax_gather8(x, stride, columns + j + 8); \
+            even = LOAD8(values + j) * relax_gather8(x, stride, columns + j) + even; \
+            odd = LOAD8(values + j + 8) * relax_gather8(x, stride, columns + j + 8) + odd; \
         } \
     } while (0)
 
@@ -58,25 +57,20 @@ inline row_sums csr_sums(
     int end)
 {
     real8 s0 = 0, s1 = 0;
-    for (; j + 16 <= split; j += 16) {
-        RELAX_STRETCH(even, odd);
-        s0 += even;
-        s1 += odd;
-    }
+    for (; j + 16 <= split; j += 16)
+        RELAX_STRETCH(s0, s1);
     real8 low = s0 + s1;
     if (j < split && j + 16 <= end) {
         const int8 lane = (int8)(0, 1, 2, 3, 4, 5, 6, 7);
+        real8 even = 0, odd = 0;
         RELAX_STRETCH(even, odd);
         low += select((real8)(0), even, lane < split - j) + select((real8)(0), odd, lane + 8 < split - j);
         s0 += even;
         s1 += odd;
         j += 16;
     }
-    for (; j + 16 <= end; j += 16) {
-        RELAX_STRETCH(even, odd);
-        s0 += even;
-        s1 += odd;
-    }
+    for (; j + 16 <= end; j += 16)
+        RELAX_STRETCH(s0, s1);
     row_sums sum;
     sum.lower.vector = sum8(low);
     sum.all.vector = sum8(s0 + s1);
