@@ -58,7 +58,7 @@ def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
         if not np.allclose(x.get(), host, rtol=1e-4, atol=1e-5):
             raise SystemExit(f"the sweep of {name} is not that of PyAMG")
         actions["pyamg"] = lambda: theirs(full, host, b)
-    times = {key: value * 1e3 for key, value in seconds(actions).items()}
+    times = {key: value * 1e3 for key, value in seconds(actions, repeats=15).items()}
     ours, question = times["sweep"], f"{name}, blocks of {relax.block}"
     rows = [
         Row(question, "one product", times["product"], ours, "ms", times["product"] / ours, PRODUCT_TARGET)

@@ -23,7 +23,6 @@ from ltcl.operators.dense import Dense
 from ltcl.operators.rows import Slab
 
 _ITEMS = 8  # rows of a work-group on a CPU: few, so that cores end a block together
-_GROUP = 64  # work-items that share a row on a GPU
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,6 @@ class Relaxation:
         self.device: Device = rows.M.device
         self.block = triangles.best_block(rows.M) if block is None else min(block, max(rows.M.shape[0], 1))
         self.diagonal = rows.shift + rows.scale * rows.M.diagonal()
-        self.grouped = not self.device.is_cpu
         self._inverses: dict[float, Array] = {}
         self._parts = [self._part(slab) for slab in rows.M.slabs]
 
@@ -103,13 +101,14 @@ class Relaxation:
             state.r,
             state.carry,
         )
-        name, columns = f"relax_{self.rows.M.file}", state.x.columns
-        if not self.grouped:
-            self._kernel(name, width, columns)(place[0], _ITEMS, *arguments)
-            return
-        kernel = self._kernel(f"{name}_group", width, columns)
-        group = min(_GROUP, kernel.largest_group())
-        kernel(place[0] * group, group, *arguments, self.device.local(group))
+        fastest = self.rows.M.fastest(state.x, width)  # variants of one name read rows alike
+        variant = fastest.kernel.name.removeprefix(f"{self.rows.M.file}_matvec")
+        kernel = self._kernel(f"relax_{self.rows.M.file}{variant}", width, state.x.columns)
+        if fastest.group:
+            local = self.device.local(fastest.group)
+            kernel(place[0] * fastest.group, fastest.group, *arguments, local)
+        else:
+            kernel(place[0], _ITEMS if self.device.is_cpu else 64, *arguments)
 
     def _substitute(self, part: Part, place: tuple[int, ...], width: int, state: Sweep, omega: float) -> None:
         """(D / omega + L)_BB delta = s_B, x_B += delta."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Gauss-Seidel: Jacobi that uses each new value at once (the paper's section 6, progressive radiosity's kin).
+"""Gauss-Seidel: Jacobi that uses each new value at once (eq. 17-20 of the paper, in place).
 
     l_i^(k+1) = (l_out_i - sum_(j<i) S_ij l_j^(k+1) - sum_(j>i) S_ij l_j^(k)) / S_ii
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Successive over-relaxation: Gauss-Seidel with each correction stretched by omega.
+"""Successive over-relaxation (end of section 6): Gauss-Seidel with each correction stretched by omega.
 
     l_i^(k+1) = (1 - omega) l_i^(k) + omega (the value of Gauss-Seidel)
 

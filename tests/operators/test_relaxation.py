@@ -33,14 +33,15 @@ def sweep_state(device, n: int, k: int | None) -> tuple[Sweep, np.ndarray, np.nd
     return Sweep(device.upload(x), device.upload(b), s, r, device.upload(carry)), x, b, carry
 
 
-@pytest.mark.parametrize("grouped", [False, True], ids=["item", "group"])
-@pytest.mark.parametrize("k", [None, 1, 2, 3, 4, 8, 11])
+@pytest.mark.parametrize("launch", ["item", "stream", "group7", "group64"])
+@pytest.mark.parametrize("k", [None, 3, 8])
 @pytest.mark.parametrize("name", MATRICES)
 @pytest.mark.parametrize("form", FORMATS)
-def test_both_launches_meet_their_twins(device, form, name, k, grouped):
+def test_both_launches_meet_their_twins(device, monkeypatch, form, name, k, launch):
     M = MATRICES[name]
-    relax = Relaxation(Rows(FORMATS[form](device, M), 1.0, -1.0), 1 << 20)
-    relax.grouped = grouped
+    A = FORMATS[form](device, M)
+    helpers.force(monkeypatch, A, launch)
+    relax = Relaxation(Rows(A, 1.0, -1.0), 1 << 20)
     state, x, b, carry = sweep_state(device, len(M), k)
     relax.sweep(state, 1.3)
     csr = scipy.sparse.csr_array(M)

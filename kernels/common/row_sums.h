@@ -1,0 +1,146 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Sums over parts of a row times x, in wide loads, for K right-hand sides: what csr.cl and dense.cl do over
+// whole rows. x points at the first right-hand side of the launch; a sparse sum can be cut in two on its way.
+
+#ifndef LTCL_ROW_SUMS_H
+#define LTCL_ROW_SUMS_H
+
+#include "common/lanes.h"
+
+#if K == 1
+
+typedef union {
+    real vector;
+    real item[1];
+} sums;
+
+typedef struct {
+    sums lower, all;
+} row_sums;
+
+inline real8 relax_gather8(global const real *x, int stride, global const int *columns)
+{
+    const int8 c = vload8(0, columns) * stride;
+    return (real8)(x[c.s0], x[c.s1], x[c.s2], x[c.s3], x[c.s4], x[c.s5], x[c.s6], x[c.s7]);
+}
+
+#define RELAX_STRETCH(even, odd) \
+    do { \
+        const int column = columns[j]; \
+        if (stride == 1 && columns[j + 15] == column + 15) { \
+            even = LOAD8(values + j) * LOAD8(x + column) + even; \
+            odd = LOAD8(values + j + 8) * LOAD8(x + column + 8) + odd; \
+        } else { \
+            even = LOAD8(values + j) * relax_gather8(x, stride, columns + j) + even; \
+            odd = LOAD8(values + j + 8) * relax_gather8(x, stride, columns + j + 8) + odd; \
+        } \
+    } while (0)
+
+// Entries j .. end of a row, and those up to `split` of them. Stretches of 16 as in csr.cl; the one that the
+// split cuts is masked, which leaves no more single entries than the product has.
+inline row_sums csr_sums(
+    global const int *columns, global const real *values, global const real *x, int stride, int j, int split,
+    int end)
+{
+    real8 s0 = 0, s1 = 0;
+    for (; j + 16 <= split; j += 16)
+        RELAX_STRETCH(s0, s1);
+    real8 low = s0 + s1;
+    if (j < split && j + 16 <= end) {
+        const int8 lane = (int8)(0, 1, 2, 3, 4, 5, 6, 7);
+        real8 even = 0, odd = 0;
+        RELAX_STRETCH(even, odd);
+        low += select((real8)(0), even, lane < split - j) + select((real8)(0), odd, lane + 8 < split - j);
+        s0 += even;
+        s1 += odd;
+        j += 16;
+    }
+    for (; j + 16 <= end; j += 16)
+        RELAX_STRETCH(s0, s1);
+    row_sums sum;
+    sum.lower.vector = sum8(low);
+    sum.all.vector = sum8(s0 + s1);
+    for (; j < end; ++j) {
+        const real product = values[j] * x[columns[j] * stride];
+        sum.all.vector += product;
+        if (j < split)
+            sum.lower.vector += product;
+    }
+    return sum;
+}
+
+// Columns j .. end of a dense row.
+inline sums dense_sum(global const real *a, global const real *x, int stride, int j, int end)
+{
+    real8 s0 = 0, s1 = 0, s2 = 0, s3 = 0;  // four sums hide the latency of the addition
+    if (stride == 1)
+        for (; j + 32 <= end; j += 32) {
+            s0 = LOAD8(a + j) * LOAD8(x + j) + s0;
+            s1 = LOAD8(a + j + 8) * LOAD8(x + j + 8) + s1;
+            s2 = LOAD8(a + j + 16) * LOAD8(x + j + 16) + s2;
+            s3 = LOAD8(a + j + 24) * LOAD8(x + j + 24) + s3;
+        }
+    if (stride == 1)
+        for (; j + 8 <= end; j += 8)
+            s0 = LOAD8(a + j) * LOAD8(x + j) + s0;
+    sums sum;
+    sum.vector = sum8((s0 + s1) + (s2 + s3));
+    for (; j < end; ++j)
+        sum.vector = a[j] * x[j * stride] + sum.vector;
+    return sum;
+}
+
+#else
+
+typedef lanes_items sums;
+
+typedef struct {
+    sums lower, all;
+} row_sums;
+
+inline sums csr_sum(
+    global const int *columns, global const real *values, global const real *x, int stride, int j, int end)
+{
+    lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;
+    for (; j + 4 <= end; j += 4) {
+        s0 = (lanes)(values[j]) * LOAD(x + columns[j] * stride) + s0;
+        s1 = (lanes)(values[j + 1]) * LOAD(x + columns[j + 1] * stride) + s1;
+        s2 = (lanes)(values[j + 2]) * LOAD(x + columns[j + 2] * stride) + s2;
+        s3 = (lanes)(values[j + 3]) * LOAD(x + columns[j + 3] * stride) + s3;
+    }
+    for (; j < end; ++j)
+        s0 = (lanes)(values[j]) * LOAD(x + columns[j] * stride) + s0;
+    sums sum;
+    sum.vector = (s0 + s1) + (s2 + s3);
+    return sum;
+}
+
+inline row_sums csr_sums(
+    global const int *columns, global const real *values, global const real *x, int stride, int j, int split,
+    int end)
+{
+    row_sums sum;
+    sum.lower = csr_sum(columns, values, x, stride, j, split);
+    sum.all.vector = csr_sum(columns, values, x, stride, split, end).vector + sum.lower.vector;
+    return sum;
+}
+
+inline sums dense_sum(global const real *a, global const real *x, int stride, int j, int end)
+{
+    lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;
+    for (; j + 4 <= end; j += 4) {
+        s0 = (lanes)(a[j]) * LOAD(x + j * stride) + s0;
+        s1 = (lanes)(a[j + 1]) * LOAD(x + (j + 1) * stride) + s1;
+        s2 = (lanes)(a[j + 2]) * LOAD(x + (j + 2) * stride) + s2;
+        s3 = (lanes)(a[j + 3]) * LOAD(x + (j + 3) * stride) + s3;
+    }
+    for (; j < end; ++j)
+        s0 = (lanes)(a[j]) * LOAD(x + j * stride) + s0;
+    sums sum;
+    sum.vector = (s0 + s1) + (s2 + s3);
+    return sum;
+}
+
+#endif
+
+#endif
