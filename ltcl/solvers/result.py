@@ -13,9 +13,7 @@ class Status(enum.Enum):
     """How a solve ended; the value says what to try next."""
 
     CONVERGED = "the true residual is within the tolerance"
-    MAXITER = (
-        "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try another method"
-    )
+    MAXITER = "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try another method"
     DIVERGED = (
         "the residual grew: the series converges only where the spectral radius of R is below 1; "
         "try method='chebyshev' or 'direct'"
