@@ -7,10 +7,11 @@
 //   csr_matvec_group   one work-group a row, its items side by side along the row; for GPUs
 //
 // Required define: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8.
-// Optional: PACKED, see common/lanes.h.
+// Optional: PACKED, see common/lanes.h; STRIDE() there turns `stride` into a constant where it is one.
 // Layout: a slab of `rows` rows, the first of which is row `first` of the matrix. pointers[rows + 1]
-// counts from 0 within the slab; columns and values follow it. x and out are row-major with `stride` reals
-// a row; the launch works on their columns offset .. offset + K - 1.
+// counts from 0 within the slab; columns and values follow it, columns ascending and unique within a row.
+// x and out are row-major with `stride` reals a row; the launch works on their columns
+// offset .. offset + K - 1. `add` counts where `adds` is 1; see LTCL_STORE in common/real.h.
 
 #include "common/lanes.h"
 #include "common/reduce.h"
@@ -44,8 +45,8 @@ inline real8 gather8(global const real *x, int stride, global const int *columns
     return (real8)(x[c.s0], x[c.s1], x[c.s2], x[c.s3], x[c.s4], x[c.s5], x[c.s6], x[c.s7]);
 }
 
-// Columns ascend within a row and are unique, so 16 of them are neighbours in x when the ends are 15
-// apart: then two wide loads replace 16 gathers. A pixel of a transport sees many such stretches.
+// One right-hand side. 16 ascending columns are neighbours in x when the ends are 15 apart: then two wide
+// loads replace 16 gathers. A pixel of a transport sees many such stretches.
 kernel void csr_matvec_stream(
     int rows, int first, int stride, int offset, real scale, int adds, global const int *pointers,
     global const int *columns, global const real *values, global const real *x, global const real *add,
@@ -78,7 +79,7 @@ kernel void csr_matvec_stream(
 
 #else
 
-// The K values of a pixel lie side by side: one wide load a nonzero.
+// Several right-hand sides: the K values of a pixel lie side by side, one wide load a nonzero.
 kernel void csr_matvec_stream(
     int rows, int first, int stride, int offset, real scale, int adds, global const int *pointers,
     global const int *columns, global const real *values, global const real *x, global const real *add,

@@ -8,6 +8,15 @@ ltcl undoes the bounces with matrix-vector products only.
     c = ltcl.compensate(T, desired)            # c.pattern makes the wall look like `desired`
     b = ltcl.separate(T, image)                # b.direct, b.bounces: each bounce as its own picture
 
+The house, from the ground up; imports point down only:
+
+    errors, checks, files           one-line refusals; outputs that appear whole or not at all
+    device                          OpenCL: devices, kernels, arrays; operators: matrices there, S = I + R
+    transport, theory, solvers      T = S F; what can be forecast; one algorithm per file
+    compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
+    images, layout, report          pictures, pictures as right-hand sides, JSON
+    plots, demo, cli                what people look at
+
 After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse Light Transport, IEEE PAMI
 2011; equation numbers in this package are that paper's. Importing ltcl touches no OpenCL driver.
 """

@@ -25,5 +25,5 @@ class Jacobi:
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
         while not monitor.done(x, r):
-            vectors.axpy(1.0, r, x)
-            system.residual(x, r)
+            vectors.axpy(1.0, r, x)  # x = x + r, in place
+            system.residual(x, r)  # r = l_out - S x: the next step, and the measure of this one

@@ -107,9 +107,7 @@ def solve(
     start = time.perf_counter()
     checks.one_of("method", method, METHODS)
     b_host = checks.finite("b", checks.real("b", b))
-    if isinstance(S, (tuple, list)) and any(isinstance(part, Operator) for part in S):
-        raise InputTypeError(f"S is {len(S)} operators, one per colour channel; it must be one: solve each")
-    shape = S.shape if hasattr(S, "shape") else checks.real("S", S).shape
+    shape = _shape(S)
     rule = _rule(shape, b_host, rtol, atol, maxiter, callback)
     guess = _guess(x0, b_host)
     chosen = _method(method, options)
@@ -120,6 +118,13 @@ def solve(
     if throw and not solution.converged:
         raise ConvergenceError(str(solution), solution)
     return solution
+
+
+def _shape(S: Any) -> tuple[int, ...]:
+    """The shape of whatever was given for S, before it becomes an operator on a device."""
+    if isinstance(S, (tuple, list)) and any(isinstance(part, Operator) for part in S):
+        raise InputTypeError(f"S is {len(S)} operators, one per colour channel; it must be one: solve each")
+    return getattr(S, "shape", None) or checks.real("S", S).shape
 
 
 def _rule(
