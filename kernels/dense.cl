@@ -3,7 +3,7 @@
 //
 // Three kernels do the same; the device layer times them and takes the fastest:
 //   dense_matvec         one work-item a row, as it reads in a textbook
-//   dense_matvec_stream  one work-item a row, in wide loads; for CPUs, where a row is a stream
+//   dense_matvec_stream  one work-item a row, in wide loads (common/row_sums.h); for CPUs
 //   dense_matvec_group   one work-group a row, its items side by side along the row; for GPUs
 // dense_rmatvec          the transpose: one work-item LANES neighbouring columns, down the rows of a slab
 //
@@ -14,6 +14,7 @@
 
 #include "common/lanes.h"
 #include "common/reduce.h"
+#include "common/row_sums.h"
 
 #ifndef LANES
 #error "dense.cl needs -DLANES=<columns one item of dense_rmatvec sums: 1 or 8>"
@@ -39,8 +40,6 @@ kernel void dense_matvec(
         LTCL_STORE(out, i + c, sum[c], scale, adds, add);
 }
 
-#if K == 1
-
 kernel void dense_matvec_stream(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
     global const real *x, global const real *add, global real *out)
@@ -49,54 +48,11 @@ kernel void dense_matvec_stream(
     const int row = get_global_id(0);
     if (row >= rows)
         return;
-    x += offset;
-    global const real *a = matrix + (size_t)row * width;
-    real8 s0 = 0, s1 = 0, s2 = 0, s3 = 0;  // four sums hide the latency of the addition
-    int j = 0;
-    if (stride == 1)
-        for (; j + 32 <= width; j += 32) {
-            s0 = LOAD8(a + j) * LOAD8(x + j) + s0;
-            s1 = LOAD8(a + j + 8) * LOAD8(x + j + 8) + s1;
-            s2 = LOAD8(a + j + 16) * LOAD8(x + j + 16) + s2;
-            s3 = LOAD8(a + j + 24) * LOAD8(x + j + 24) + s3;
-        }
-    real sum = sum8((s0 + s1) + (s2 + s3));
-    for (; j < width; ++j)
-        sum = a[j] * x[j * stride] + sum;
-    const int i = (first + row) * stride + offset;
-    LTCL_STORE(out, i, sum, scale, adds, add);
-}
-
-#else
-
-kernel void dense_matvec_stream(
-    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
-    global const real *x, global const real *add, global real *out)
-{
-    stride = STRIDE(stride);
-    const int row = get_global_id(0);
-    if (row >= rows)
-        return;
-    x += offset;
-    global const real *a = matrix + (size_t)row * width;
-    lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;
-    int j = 0;
-    for (; j + 4 <= width; j += 4) {
-        s0 = (lanes)(a[j]) * LOAD(x + j * stride) + s0;
-        s1 = (lanes)(a[j + 1]) * LOAD(x + (j + 1) * stride) + s1;
-        s2 = (lanes)(a[j + 2]) * LOAD(x + (j + 2) * stride) + s2;
-        s3 = (lanes)(a[j + 3]) * LOAD(x + (j + 3) * stride) + s3;
-    }
-    for (; j < width; ++j)
-        s0 = (lanes)(a[j]) * LOAD(x + j * stride) + s0;
-    lanes_items sum;
-    sum.vector = (s0 + s1) + (s2 + s3);
+    const sums sum = dense_sum(matrix + (size_t)row * width, x + offset, stride, 0, width);
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c)
         LTCL_STORE(out, i + c, sum.item[c], scale, adds, add);
 }
-
-#endif
 
 kernel void dense_matvec_group(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Sums over parts of a row times x, in wide loads, for K right-hand sides: what csr.cl and dense.cl do over
-// whole rows. x points at the first right-hand side of the launch; a sparse sum can be cut in two on its way.
+// Sums over a row, or parts of it, times x, in wide loads, for K right-hand sides: for CPUs, where a row is a
+// stream. x points at the first right-hand side of the launch; a sparse sum can be cut in two on its way.
 
 #ifndef LTCL_ROW_SUMS_H
 #define LTCL_ROW_SUMS_H
@@ -18,45 +18,61 @@ typedef struct {
     sums lower, all;
 } row_sums;
 
-inline real8 relax_gather8(global const real *x, int stride, global const int *columns)
+inline real8 gather8(global const real *x, int stride, global const int *columns)
 {
     const int8 c = vload8(0, columns) * stride;
     return (real8)(x[c.s0], x[c.s1], x[c.s2], x[c.s3], x[c.s4], x[c.s5], x[c.s6], x[c.s7]);
 }
 
-#define RELAX_STRETCH(even, odd) \
+// The next 16 entries. Columns ascend and are unique, so these are neighbours in x when the ends are 15
+// apart: then two wide loads replace 16 gathers. A pixel of a transport sees many such stretches.
+#define ADD_STRETCH(even, odd) \
     do { \
         const int column = columns[j]; \
         if (stride == 1 && columns[j + 15] == column + 15) { \
             even = LOAD8(values + j) * LOAD8(x + column) + even; \
             odd = LOAD8(values + j + 8) * LOAD8(x + column + 8) + odd; \
         } else { \
-            even = LOAD8(values + j) * relax_gather8(x, stride, columns + j) + even; \
-            odd = LOAD8(values + j + 8) * relax_gather8(x, stride, columns + j + 8) + odd; \
+            even = LOAD8(values + j) * gather8(x, stride, columns + j) + even; \
+            odd = LOAD8(values + j + 8) * gather8(x, stride, columns + j + 8) + odd; \
         } \
     } while (0)
 
-// Entries j .. end of a row, and those up to `split` of them. Stretches of 16 as in csr.cl; the one that the
-// split cuts is masked, which leaves no more single entries than the product has.
+// Entries j .. end of a sparse row.
+inline sums csr_sum(
+    global const int *columns, global const real *values, global const real *x, int stride, int j, int end)
+{
+    real8 even = 0, odd = 0;
+    for (; j + 16 <= end; j += 16)
+        ADD_STRETCH(even, odd);
+    sums sum;
+    sum.vector = sum8(even + odd);
+    for (; j < end; ++j)
+        sum.vector = values[j] * x[columns[j] * stride] + sum.vector;
+    return sum;
+}
+
+// Entries j .. end of a row, and those up to `split` of them. The stretch that the split
+// cuts is masked, which leaves no more single entries than the product has.
 inline row_sums csr_sums(
     global const int *columns, global const real *values, global const real *x, int stride, int j, int split,
     int end)
 {
     real8 s0 = 0, s1 = 0;
     for (; j + 16 <= split; j += 16)
-        RELAX_STRETCH(s0, s1);
+        ADD_STRETCH(s0, s1);
     real8 low = s0 + s1;
     if (j < split && j + 16 <= end) {
         const int8 lane = (int8)(0, 1, 2, 3, 4, 5, 6, 7);
         real8 even = 0, odd = 0;
-        RELAX_STRETCH(even, odd);
+        ADD_STRETCH(even, odd);
         low += select((real8)(0), even, lane < split - j) + select((real8)(0), odd, lane + 8 < split - j);
         s0 += even;
         s1 += odd;
         j += 16;
     }
     for (; j + 16 <= end; j += 16)
-        RELAX_STRETCH(s0, s1);
+        ADD_STRETCH(s0, s1);
     row_sums sum;
     sum.lower.vector = sum8(low);
     sum.all.vector = sum8(s0 + s1);
@@ -98,6 +114,7 @@ typedef struct {
     sums lower, all;
 } row_sums;
 
+// The K values of a pixel lie side by side: one wide load a nonzero.
 inline sums csr_sum(
     global const int *columns, global const real *values, global const real *x, int stride, int j, int end)
 {
