@@ -54,7 +54,7 @@ class Row:
         if self.target is None:
             return ""
         part = self.ratio / self.target
-        return "hit" if part >= 1.0 else f"MISS: {part:.0%} of {self.target:g}x"
+        return "hit" if part >= 1.0 else f"MISS: {part:.1%} of {self.target:g}x"
 
 
 def options(description: str) -> Options:
