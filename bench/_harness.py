@@ -54,7 +54,7 @@ class Row:
         if self.target is None:
             return ""
         part = self.ratio / self.target
-        return "hit" if part >= 1.0 else f"MISS: {part:.1%} of {self.target:g}x"
+        return "hit" if part >= 1.0 else f"MISS: {part:.1%} of {self.target:.3g}x"
 
 
 def options(description: str) -> Options:
@@ -115,7 +115,7 @@ def report(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -
         console.print("[yellow]--smoke: sizes this small show that it runs, not how fast[/]")
     table = Table("question", "competitor", "theirs", "ours", "unit", "ratio", "target", "verdict")
     for row in rows:
-        target = "" if row.target is None else f"{row.target:g}x"
+        target = "" if row.target is None else f"{row.target:.3g}x"
         figures = (f"{row.theirs:.4g}", f"{row.ours:.4g}", row.unit, f"{row.ratio:.2f}x")
         table.add_row(row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict)
     console.print(table)
