@@ -10,9 +10,8 @@ import numpy as np
 import typer
 
 from ltcl import report
-from ltcl.cli import console, options, pictures, transports
+from ltcl.cli import console, options, pictures, results, transports
 from ltcl.compensation import Compensation
-from ltcl.files import fill_folder
 from ltcl.transport import Transport
 
 _GAIN = Annotated[float, typer.Option(metavar="FACTOR", help="Match FACTOR times the picture.")]
@@ -50,7 +49,7 @@ def run(
     """Find the projector patterns that make a scene look like PICTURE.
 
     Writes for each picture the pattern and how the scene will look under it, exactly as .exr and for the eye
-    as .png, and a report.json.
+    as .png, and compensate.json.
     """
     from ltcl.compensation import compensate
 
@@ -58,17 +57,32 @@ def run(
     reader = pictures.Reader(T.grid, "the projector", encoding, resize)
     desired = reader.read_all(picture)
     dark = None if background is None else reader.read(background)
+    text = transports.heading(
+        "compensate",
+        transport,
+        T,
+        grid=grid,
+        method=method,
+        rtol=rtol,
+        first_bounce=first_bounce,
+        on_dark=on_dark,
+        gain=gain,
+        low=low,
+        high=high,
+        background=background,
+        resize=resize,
+        encoding=encoding,
+        device=device,
+    )
     settings = {"bounds": (low, high), "gain": gain, "method": method, "rtol": rtol}
-    text = transports.heading("compensate", transport, T, background=background, **settings)
     entries = text["pictures"] = []
-    with console.Steps(len(desired), T.channels) as steps, fill_folder(out) as folder:
+    with console.Steps(len(desired), T.channels) as steps, results.fill(out, text) as folder:
         for (name, wanted), file in zip(desired.items(), picture, strict=True):
             steps.item(file.name)
             done = compensate(T, wanted, background=dark, callback=steps.solve(rtol), **settings)
             entries.append(
                 {"file": str(file), **_entry(T, done, low, high)} | _write(folder, name, done, high)
             )
-        report.write(folder / "report.json", text)
     if json:
         console.answer({"folder": out, **text})
     else:

@@ -46,7 +46,7 @@ def test_report_tells_what_happened(
         "exact",
     ]
     assert program("compensate", transport, picture, large_picture, *arguments).code == 0
-    report = json.loads((out / "report.json").read_text())
+    report = json.loads((out / "compensate.json").read_text())
     assert report["versions"]["ltcl"] == ltcl.__version__
     assert report["options"]["gain"] == 0.5
     assert [entry["file"] for entry in report["pictures"]] == [str(picture), str(large_picture)]
@@ -114,10 +114,10 @@ def test_divergence_is_one_line_and_touches_nothing(
     store.save(closed, scenes.box(3, albedo=0.8).transport())
     out = tmp_path / "out"
     out.mkdir()
-    (out / "report.json").write_text("old")
+    (out / "compensate.json").write_text("old")
     outcome = program("compensate", closed, large_picture, "--resize", "--out", out, "--method", "jacobi")
     outcome.refused("jacobi: diverged", "--method chebyshev")
-    assert (out / "report.json").read_text() == "old"
+    assert (out / "compensate.json").read_text() == "old"
     assert len(list(out.iterdir())) == 1
 
 
@@ -126,10 +126,10 @@ def test_earlier_results_give_way_to_new_ones(
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    (out / "report.json").write_text("old")
+    (out / "compensate.json").write_text("old")
     (out / "mine.txt").write_text("mine")
     assert program("compensate", transport, picture, "--out", out).code == 0
-    assert json.loads((out / "report.json").read_text())["command"] == "compensate"
+    assert json.loads((out / "compensate.json").read_text())["command"] == "compensate"
     assert (out / "mine.txt").read_text() == "mine"
 
 
