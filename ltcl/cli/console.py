@@ -60,19 +60,22 @@ def _is_number(text: str) -> bool:
 class Steps:
     """Progress through several items and the solves in each, on stderr.
 
-    On a terminal a bar; elsewhere a line an item, once the whole has taken longer than two seconds.
+    On a terminal a bar; elsewhere a line an item, by default once the whole has taken longer than two
+    seconds.
 
     Parameters
     ----------
     items : int
     solves : int
         Of each item, for the length of the bar.
+    patient : bool
+        Say nothing in the first two seconds; otherwise every item gets its line.
     """
 
-    def __init__(self, items: int, solves: int = 1) -> None:
+    def __init__(self, items: int, solves: int = 1, *, patient: bool = True) -> None:
         self._items, self._solves = items, solves
         self._item = self._solve = 0
-        self._began = time.monotonic()
+        self._quiet_until = time.monotonic() + _PATIENCE if patient else 0.0
         console = Console(stderr=True)
         self._is_terminal = console.is_terminal
         columns = (
@@ -99,7 +102,7 @@ class Steps:
         counted = f"{self._item}/{self._items} {name}" if self._items > 1 else name
         done = (self._item - 1) * self._solves
         self._bar.update(self._task, description=counted, completed=done, text="")
-        if not self._is_terminal and time.monotonic() - self._began > _PATIENCE:
+        if not self._is_terminal and time.monotonic() >= self._quiet_until:
             note(counted)
 
     def solve(self, rtol: float) -> Callable[[int, float], None]:
