@@ -117,17 +117,18 @@ def _show(out: Path, entries: list[dict[str, Any]]) -> None:
         ("picture", "method", "products", "residual", "clipped", "error", "pattern"),
         [
             (
-                entry["file"],
+                Path(entry["file"]).name,
                 ", ".join(sorted({channel["method"] for channel in entry["channels"]})),
                 sum(channel["products"] for channel in entry["channels"]),
                 max(channel["residual"] for channel in entry["channels"]),
                 f"{100 * entry['clipped']:.1f} %",
                 f"{100 * entry['error']:.2f} %",
-                out / entry["pattern"]["exr"],
+                entry["pattern"]["exr"],
             )
             for entry in entries
         ],
     )
+    typer.echo(f"\npatterns and appearances as .exr and .png in {out}")
     for entry in entries:
         _advise(entry)
 

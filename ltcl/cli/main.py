@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from ltcl import __version__
-from ltcl.cli import analyze, compensate, convert, demo, devices, doctor, info, relight, separate
+from ltcl.cli import analyze, compensate, console, convert, demo, devices, doctor, info, relight, separate
 from ltcl.errors import LtclError
 
 
@@ -35,7 +35,7 @@ class _Commands(TyperGroup):
 
 
 def _failed(message: str, code: int) -> typer.Exit:
-    typer.echo(f"ltcl: error: {' '.join(as_options(message).split())}", err=True)
+    console.error(as_options(message))
     return typer.Exit(code)
 
 

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
+
+import typer
 
 from ltcl.cli import console, options, pictures, results, transports
 
@@ -51,5 +54,8 @@ def run(
     if json:
         console.answer({"folder": out, **text})
         return
-    rows = [(entry["file"], entry["brightest"], entry["png_scale"], out / entry["exr"]) for entry in entries]
+    rows = [
+        (Path(entry["file"]).name, entry["brightest"], entry["png_scale"], entry["exr"]) for entry in entries
+    ]
     console.table(("pattern", "brightest", "white in png", "picture"), rows)
+    typer.echo(f"\npictures as .exr and .png in {out}")

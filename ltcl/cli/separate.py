@@ -96,18 +96,19 @@ def _light(part: np.ndarray) -> float:
 
 def _show(out: Path, entries: list[dict[str, Any]]) -> None:
     console.table(
-        ("picture", "part", "share of light", "products", "residual", "white in png", "file"),
+        ("picture", "part", "share of light", "products", "residual", "white in png"),
         [
             (
-                entry["file"],
+                Path(entry["file"]).name,
                 part["part"],
                 None if part["share"] is None else f"{100 * part['share']:.2f} %",
                 sum(channel["products"] for channel in part["channels"]) if part["channels"] else None,
                 max((channel["residual"] for channel in part["channels"]), default=None),
                 part["png_scale"],
-                out / part["exr"],
             )
             for entry in entries
             for part in entry["parts"]
         ],
     )
+    places = [out / Path(entry["parts"][0]["exr"]).parent for entry in entries]
+    typer.echo(f"\neach part as .exr and .png in {', '.join(map(str, places))}")
