@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -81,7 +82,8 @@ def run(
             steps.item(file.name)
             done = compensate(T, wanted, background=dark, callback=steps.solve(rtol), **settings)
             entries.append(
-                {"file": str(file), **_entry(T, done, low, high)} | _write(folder, name, done, high)
+                {"file": str(file), **_entry(T, done, low, high), **_under(done, dark)}
+                | _write(folder, name, done, high)
             )
     if json:
         console.answer({"folder": out, **text})
@@ -102,6 +104,16 @@ def _entry(T: Transport, done: Compensation, low: float, high: float) -> dict[st
         "error": done.error,
         "channels": report.solution(solutions),
     }
+
+
+def _under(done: Compensation, dark: np.ndarray | None) -> dict[str, float]:
+    """The share of the target that is no brighter than the background: no light at all is left for it."""
+    if dark is None:
+        return {"under_background": 0.0}
+    target = done.target
+    if target.ndim != dark.ndim:
+        target, dark = (part.reshape(*part.shape[:2], -1) for part in (target, dark))
+    return {"under_background": float(np.mean(target <= dark * np.float32(1 + 1e-6)))}
 
 
 def _write(folder: Path, name: str, done: Compensation, high: float) -> dict[str, Any]:
@@ -135,15 +147,28 @@ def _show(out: Path, entries: list[dict[str, Any]]) -> None:
 
 def _advise(entry: dict[str, Any]) -> None:
     """Say what would keep a pattern within the projector's light."""
-    if entry["too_dark"] > _MANY:
+    under = entry["under_background"]
+    if under > _MANY:
         console.note(
-            f"{entry['file']}: {100 * entry['too_dark']:.0f} % of it is darker than the light that bounces "
+            f"{entry['file']}: {100 * under:.0f} % of it is no brighter than the background; "
+            "darken the room, or brighten the picture"
+        )
+    bounced = entry["too_dark"] - under
+    if bounced > _MANY:
+        console.note(
+            f"{entry['file']}: {100 * bounced:.0f} % of it is darker than the light that bounces "
             "there from the rest of the picture; brighten its dark parts"
         )
-    if entry["too_bright"] > _MANY:
+    if entry["too_bright"] > _MANY and entry["brightest"] > 0:
         high = entry["pattern"]["png_scale"]
         gain = entry["gain"] * high / entry["brightest"]
         console.note(
             f"{entry['file']}: the pattern needs light of {entry['brightest']:.3g}, "
-            f"the projector gives {high:g}; try --gain {gain:.2g}"
+            f"the projector gives {high:g}; try --gain {_rounded_down(gain)}"
         )
+
+
+def _rounded_down(value: float) -> str:
+    """Two digits of a positive number, never above it: a gain that is to clip nothing."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return f"{math.floor(value / step * (1 + 1e-9)) * step:.2g}"

@@ -44,6 +44,12 @@ _ARGUMENT = re.compile(
     r"\b(grid|camera_grid|on_dark|first_bounce|method|rtol)=(?:'([\w-]+)'|\((\w+), (\w+)\)|([\d.e-]+))"
 )
 
+_WORDS = {
+    "rtol and atol are both 0; one of them must be positive": "--rtol is 0; it must be above 0",
+    "bounds[0] is": "--low is",
+    "bounds[1] is": "--high is",
+}
+
 
 def as_options(message: str) -> str:
     """A message of the library in the words of the command line.
@@ -57,6 +63,8 @@ def as_options(message: str) -> str:
         value = word or number or f"{rows}x{columns}".replace("hxw", "HxW")
         return f"--{name.replace('_', '-')} {value}"
 
+    for words, shown in _WORDS.items():
+        message = message.replace(words, shown)
     return _ARGUMENT.sub(option, message)
 
 
