@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What happened, as plain data: the `report.json` beside every result, and what ``--json`` prints."""
+"""What happened, as plain data: the JSON report beside every result, and what ``--json`` prints."""
 
 from __future__ import annotations
 

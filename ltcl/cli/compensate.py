@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,9 +11,8 @@ import numpy as np
 import typer
 
 from ltcl import report
-from ltcl.cli import console, options, pictures, transports
+from ltcl.cli import console, options, pictures, results, transports
 from ltcl.compensation import Compensation
-from ltcl.files import fill_folder
 from ltcl.transport import Transport
 
 _GAIN = Annotated[float, typer.Option(metavar="FACTOR", help="Match FACTOR times the picture.")]
@@ -50,7 +50,7 @@ def run(
     """Find the projector patterns that make a scene look like PICTURE.
 
     Writes for each picture the pattern and how the scene will look under it, exactly as .exr and for the eye
-    as .png, and a report.json.
+    as .png, and compensate.json.
     """
     from ltcl.compensation import compensate
 
@@ -58,17 +58,33 @@ def run(
     reader = pictures.Reader(T.grid, "the projector", encoding, resize)
     desired = reader.read_all(picture)
     dark = None if background is None else reader.read(background)
+    text = transports.heading(
+        "compensate",
+        transport,
+        T,
+        grid=grid,
+        method=method,
+        rtol=rtol,
+        first_bounce=first_bounce,
+        on_dark=on_dark,
+        gain=gain,
+        low=low,
+        high=high,
+        background=background,
+        resize=resize,
+        encoding=encoding,
+        device=device,
+    )
     settings = {"bounds": (low, high), "gain": gain, "method": method, "rtol": rtol}
-    text = transports.heading("compensate", transport, T, background=background, **settings)
     entries = text["pictures"] = []
-    with console.Steps(len(desired), T.channels) as steps, fill_folder(out) as folder:
+    with console.Steps(len(desired), T.channels) as steps, results.fill(out, text) as folder:
         for (name, wanted), file in zip(desired.items(), picture, strict=True):
             steps.item(file.name)
             done = compensate(T, wanted, background=dark, callback=steps.solve(rtol), **settings)
             entries.append(
-                {"file": str(file), **_entry(T, done, low, high)} | _write(folder, name, done, high)
+                {"file": str(file), **_entry(T, done, low, high), **_under(done, dark)}
+                | _write(folder, name, done, high)
             )
-        report.write(folder / "report.json", text)
     if json:
         console.answer({"folder": out, **text})
     else:
@@ -90,6 +106,16 @@ def _entry(T: Transport, done: Compensation, low: float, high: float) -> dict[st
     }
 
 
+def _under(done: Compensation, dark: np.ndarray | None) -> dict[str, float]:
+    """The share of the target that is no brighter than the background: no light at all is left for it."""
+    if dark is None:
+        return {"under_background": 0.0}
+    target = done.target
+    if target.ndim != dark.ndim:
+        target, dark = (part.reshape(*part.shape[:2], -1) for part in (target, dark))
+    return {"under_background": float(np.mean(target <= dark * np.float32(1 + 1e-6)))}
+
+
 def _write(folder: Path, name: str, done: Compensation, high: float) -> dict[str, Any]:
     # Appearance / gain compares with the picture that was asked for, whatever the units of T.
     return {
@@ -103,32 +129,46 @@ def _show(out: Path, entries: list[dict[str, Any]]) -> None:
         ("picture", "method", "products", "residual", "clipped", "error", "pattern"),
         [
             (
-                entry["file"],
+                Path(entry["file"]).name,
                 ", ".join(sorted({channel["method"] for channel in entry["channels"]})),
                 sum(channel["products"] for channel in entry["channels"]),
                 max(channel["residual"] for channel in entry["channels"]),
                 f"{100 * entry['clipped']:.1f} %",
                 f"{100 * entry['error']:.2f} %",
-                out / entry["pattern"]["exr"],
+                entry["pattern"]["exr"],
             )
             for entry in entries
         ],
     )
+    typer.echo(f"\npatterns and appearances as .exr and .png in {out}")
     for entry in entries:
         _advise(entry)
 
 
 def _advise(entry: dict[str, Any]) -> None:
     """Say what would keep a pattern within the projector's light."""
-    if entry["too_dark"] > _MANY:
+    under = entry["under_background"]
+    if under > _MANY:
         console.note(
-            f"{entry['file']}: {100 * entry['too_dark']:.0f} % of it is darker than the light that bounces "
+            f"{entry['file']}: {100 * under:.0f} % of it is no brighter than the background; "
+            "darken the room, or brighten the picture"
+        )
+    bounced = entry["too_dark"] - under
+    if bounced > _MANY:
+        console.note(
+            f"{entry['file']}: {100 * bounced:.0f} % of it is darker than the light that bounces "
             "there from the rest of the picture; brighten its dark parts"
         )
-    if entry["too_bright"] > _MANY:
+    if entry["too_bright"] > _MANY and entry["brightest"] > 0:
         high = entry["pattern"]["png_scale"]
         gain = entry["gain"] * high / entry["brightest"]
         console.note(
             f"{entry['file']}: the pattern needs light of {entry['brightest']:.3g}, "
-            f"the projector gives {high:g}; try --gain {gain:.2g}"
+            f"the projector gives {high:g}; try --gain {_rounded_down(gain)}"
         )
+
+
+def _rounded_down(value: float) -> str:
+    """Two digits of a positive number, never above it: a gain that is to clip nothing."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return f"{math.floor(value / step * (1 + 1e-9)) * step:.2g}"

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import typer
+from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -18,6 +19,7 @@ from rich.text import Text
 
 from ltcl import report
 
+_GAP = "   "  # between columns
 _PATIENCE = 2.0  # seconds without a terminal before progress is worth a line
 
 
@@ -31,18 +33,41 @@ def note(text: str) -> None:
     typer.echo(f"ltcl: {text}", err=True)
 
 
+def error(text: str) -> None:
+    """Say on stderr, in one line, what was refused or failed."""
+    typer.echo(f"ltcl: error: {' '.join(text.split())}", err=True)
+
+
 def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table on stdout; columns of numbers stand right."""
-    # Without a terminal rich assumes 80 columns and folds file names.
-    console = Console() if sys.stdout.isatty() else Console(width=240)
+    """Print a table on stdout; columns of numbers stand right.
+
+    Nothing is broken: where a terminal is too narrow for the table, each row becomes a list of its own.
+    """
     shown = [[_cell(value) for value in row] for row in rows]
-    frame = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="bold")
+    widths = [max(map(cell_len, (name, *values))) for name, *values in zip(columns, *shown, strict=True)]
+    needed = sum(widths) + len(_GAP) * (len(columns) - 1)
+    if not sys.stdout.isatty():
+        console = Console(width=max(needed, 80))  # rich would assume 80 columns
+    elif needed > (console := Console()).width:
+        _list(columns, shown)
+        return
+    frame = Table(box=None, pad_edge=False, padding=(0, len(_GAP), 0, 0), header_style="bold")
     for name, values in zip(columns, zip(*shown, strict=True), strict=False):
         right = all(_is_number(value) for value in values)
-        frame.add_column(name, justify="right" if right else "left", overflow="fold")
+        frame.add_column(name, justify="right" if right else "left", no_wrap=True)
     for row in shown:
         frame.add_row(*(Text(value) for value in row))
     console.print(frame)
+
+
+def _list(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """A line a cell, its column's name in front; an empty line between rows."""
+    width = max(map(cell_len, columns))
+    blocks = [
+        "\n".join(f"{name:<{width}}{_GAP}{value}".rstrip() for name, value in zip(columns, row, strict=True))
+        for row in rows
+    ]
+    typer.echo("\n\n".join(blocks))
 
 
 def _cell(value: Any) -> str:
@@ -60,19 +85,22 @@ def _is_number(text: str) -> bool:
 class Steps:
     """Progress through several items and the solves in each, on stderr.
 
-    On a terminal a bar; elsewhere a line an item, once the whole has taken longer than two seconds.
+    On a terminal a bar; elsewhere a line an item, by default once the whole has taken longer than two
+    seconds.
 
     Parameters
     ----------
     items : int
     solves : int
         Of each item, for the length of the bar.
+    patient : bool
+        Say nothing in the first two seconds; otherwise every item gets its line.
     """
 
-    def __init__(self, items: int, solves: int = 1) -> None:
+    def __init__(self, items: int, solves: int = 1, *, patient: bool = True) -> None:
         self._items, self._solves = items, solves
         self._item = self._solve = 0
-        self._began = time.monotonic()
+        self._quiet_until = time.monotonic() + _PATIENCE if patient else 0.0
         console = Console(stderr=True)
         self._is_terminal = console.is_terminal
         columns = (
@@ -99,7 +127,7 @@ class Steps:
         counted = f"{self._item}/{self._items} {name}" if self._items > 1 else name
         done = (self._item - 1) * self._solves
         self._bar.update(self._task, description=counted, completed=done, text="")
-        if not self._is_terminal and time.monotonic() - self._began > _PATIENCE:
+        if not self._is_terminal and time.monotonic() >= self._quiet_until:
             note(counted)
 
     def solve(self, rtol: float) -> Callable[[int, float], None]:

@@ -33,11 +33,15 @@ def run(
             record = dataclasses.replace(record, grid=checks.grid("grid", grid, columns))
         if camera_grid is not None:
             record = dataclasses.replace(record, camera_grid=checks.grid("camera_grid", camera_grid, rows))
+        facts = info.describe(target, record)  # refuses what could not be loaded again
     formats.write(target, record)
+    if record.grid is None:
+        console.note(f"{target}: does not tell the grid; give --grid HxW here, or wherever you use it")
+    elif rows != columns and record.camera_grid is None:
+        console.note(f"{target}: does not tell the camera's grid; give --camera-grid HxW here, or to relight")
     if record.grid is not None and target.suffix.lower() == ".npy":
         grid_text = "x".join(map(str, record.grid))
         console.note(f"{target}: .npy does not keep the grid; give --grid {grid_text} wherever you use it")
-    facts = info.describe(target, record)
     if json:
         console.answer({"source": source, **facts})
     else:

@@ -30,7 +30,7 @@ def run(
     opened = open_device(device)
     from ltcl import demo  # brings OpenCV and matplotlib
 
-    with console.Steps(len(demo.STEPS)) as steps:
+    with console.Steps(len(demo.STEPS), patient=False) as steps:
         done = demo.run(out, size, device=opened, progress=steps.item)
     if json:
         console.answer({"folder": done.folder, "files": done.files, **done.report})

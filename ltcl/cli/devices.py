@@ -8,12 +8,13 @@ import os
 from ltcl import checks
 from ltcl.cli import console, options
 from ltcl.device import discovery
+from ltcl.errors import DeviceError
 
 
 def run(json: options.Json = False) -> None:
     """List the OpenCL devices, the best first; the arrow marks the one that would be chosen."""
     devices = discovery.list_devices()
-    chosen = discovery.choose(devices, os.environ.get("LTCL_DEVICE") or None)
+    chosen = _chosen(devices)
     if json:
         console.answer([_facts(device) | {"chosen": device is chosen} for device in devices])
         return
@@ -31,6 +32,18 @@ def run(json: options.Json = False) -> None:
         for device in devices
     ]
     console.table(("", "index", "name", "kind", "driver", "units", "memory", "largest buffer"), rows)
+
+
+def _chosen(devices: list[discovery.Description]) -> discovery.Description | None:
+    """What a command would take; None, with a note, where it would refuse all there is."""
+    wanted = os.environ.get("LTCL_DEVICE") or None
+    try:
+        return discovery.choose(devices, wanted)
+    except DeviceError as error:
+        if not devices:
+            raise
+        console.note(str(error) if wanted is None else f"LTCL_DEVICE={wanted} matches none of these")
+        return None
 
 
 def _facts(device: discovery.Description) -> dict:

@@ -18,7 +18,8 @@ import typer
 from ltcl import __version__
 from ltcl.cli import console, device_checks, options
 from ltcl.device import open_device
-from ltcl.errors import LtclError
+from ltcl.device.discovery import suspects
+from ltcl.errors import FileError, LtclError
 
 # What pyproject.toml asks for, where ltcl runs from a checkout and so has no metadata.
 _DEPENDENCIES = """
@@ -59,13 +60,11 @@ def examine(device: str | None) -> Iterator[Finding]:
     """Every check in turn; those that need a device only where one opens."""
     yield attempt("ltcl and Python", _python, "pip install --upgrade ltcl")
     yield attempt("dependencies", _dependencies, "pip install --upgrade ltcl")
-    yield attempt(
-        "cache folder", device_checks.cache_folder, "chmod 700 the folder, or set LTCL_CACHE to another one"
-    )
+    yield attempt("cache folder", device_checks.cache_folder, _cache_fix)
     yield attempt(
         "drivers", device_checks.drivers, "remove or update the driver that crashes; see ltcl devices"
     )
-    opening = attempt("device", lambda: str(open_device(device)), _OPENING)
+    opening = attempt("device", lambda: str(open_device(device)), _opening_fix)
     yield opening
     if not opening.passed:
         return
@@ -76,14 +75,27 @@ def examine(device: str | None) -> Iterator[Finding]:
     yield attempt("tuning", device_checks.tuning, "make the cache folder writable, or set LTCL_CACHE")
 
 
-def attempt(check: str, action: Callable[[], str], fix: str) -> Finding:
+def _cache_fix(error: Exception) -> str:
+    """A mode can be changed; a read-only disk, or a file in the way, cannot."""
+    elsewhere = "set LTCL_CACHE=DIR to a folder that can be written"
+    changeable = isinstance(error, (FileError, PermissionError))
+    return f"chmod 700 the folder, or {elsewhere}" if changeable else elsewhere
+
+
+def _opening_fix(error: Exception) -> str:
+    hiding = suspects() if str(error).startswith("no OpenCL device") else []
+    return f"unset {' and '.join(hiding)}; or {_OPENING}" if hiding else _OPENING
+
+
+def attempt(check: str, action: Callable[[], str], fix: str | Callable[[Exception], str]) -> Finding:
     """Run one check. Whatever it raises is a finding: a doctor does not die of the disease."""
     try:
         return Finding(check, True, action())
     except (LtclError, OSError) as error:
-        return Finding(check, False, _one_line(error), fix)
+        found, cause = _one_line(error), error
     except Exception as error:  # noqa: BLE001 - a broken driver may raise anything
-        return Finding(check, False, f"{type(error).__name__}: {_one_line(error)}", fix)
+        found, cause = f"{type(error).__name__}: {_one_line(error)}", error
+    return Finding(check, False, found, fix if isinstance(fix, str) else fix(cause))
 
 
 def _one_line(error: Exception) -> str:

@@ -7,24 +7,45 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 
 from ltcl import checks
 from ltcl.cli import console, options
+from ltcl.errors import InputError, LtclError
 from ltcl.store import Record, formats
 
 
 def run(files: options.Matrices, json: options.Json = False) -> None:
-    """Tell what transport files hold: size, channels, grid, entries, first bounce. Needs no device."""
-    found = []
+    """Tell what transport files hold: size, channels, grid, entries, first bounce. Needs no device.
+
+    A bad file does not keep the others from being told; the exit code is then 1.
+    """
+    found, errors = [], []
     with console.Steps(len(files)) as steps:
         for file in files:
             steps.item(str(file))
-            record = formats.read(file)
-            with formats.about(file):
-                found.append(describe(file, record))
+            try:
+                found.append(_facts(file))
+            except (LtclError, MemoryError) as error:
+                errors.append(str(error) or f"{file}: the host has no memory left")
+                found.append({"file": str(file), "error": errors[-1]})
     if json:
         console.answer(found)
-        return
+    elif len(errors) < len(found):
+        _show([entry for entry in found if "error" not in entry])
+    for message in errors:
+        console.error(message)
+    if errors:
+        raise typer.Exit(1)
+
+
+def _facts(file: Path) -> dict[str, Any]:
+    record = formats.read(file)
+    with formats.about(file):
+        return describe(file, record)
+
+
+def _show(found: list[dict[str, Any]]) -> None:
     console.table(
         (
             "file",
@@ -44,7 +65,7 @@ def run(files: options.Matrices, json: options.Json = False) -> None:
                 _times(entry["shape"]),
                 entry["channels"],
                 _times(entry["grid"]) or "not told",
-                _times(entry["camera_grid"]) or "the same",
+                _times(entry["camera_grid"]) or _untold(entry["shape"]),
                 f"{entry['stored']} {entry['dtype']}",
                 entry["entries"],
                 checks.size(entry["nbytes"]),
@@ -57,10 +78,11 @@ def run(files: options.Matrices, json: options.Json = False) -> None:
 
 
 def describe(file: Path, record: Record) -> dict[str, Any]:
-    """Facts about a transport file, in plain types."""
+    """Facts about a transport file, in plain types; refuses what could not be loaded."""
     parts = [_values(T) for T in record.matrices]
     for values in parts:
         checks.finite("T", values)
+    _check_extras(record)
     F = _first_bounce(record)
     return {
         "file": str(file),
@@ -76,6 +98,17 @@ def describe(file: Path, record: Record) -> dict[str, Any]:
         "first_bounce_from": "diagonal" if record.first_bounce is None else "file",
         "dark_pixels": None if F is None else int(np.count_nonzero((F <= 0).any(axis=0))),
     }
+
+
+def _check_extras(record: Record) -> None:
+    rows, columns = record.shape
+    for name, pixels in (("grid", columns), ("camera_grid", rows)):
+        if getattr(record, name) is not None:
+            checks.grid(name, getattr(record, name), pixels)
+    if record.first_bounce is not None:
+        checks.finite("first_bounce", record.first_bounce)
+        if rows != columns:
+            raise InputError(f"first_bounce is given, but T is {record.shape}; only a square T has one")
 
 
 def _values(T: Any) -> np.ndarray:
@@ -97,6 +130,10 @@ def _first_bounce(record: Record) -> np.ndarray | None:
 
 def _times(shape: Any) -> str:
     return "" if shape is None else f"{shape[0]} x {shape[1]}"
+
+
+def _untold(shape: Any) -> str:
+    return "the same" if shape[0] == shape[1] else "not told"
 
 
 def _range(limits: Any) -> str | None:

@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from ltcl import __version__
-from ltcl.cli import analyze, compensate, convert, demo, devices, doctor, info, relight, separate
+from ltcl.cli import analyze, compensate, console, convert, demo, devices, doctor, info, relight, separate
 from ltcl.errors import LtclError
 
 
@@ -35,7 +35,7 @@ class _Commands(TyperGroup):
 
 
 def _failed(message: str, code: int) -> typer.Exit:
-    typer.echo(f"ltcl: error: {' '.join(as_options(message).split())}", err=True)
+    console.error(as_options(message))
     return typer.Exit(code)
 
 
@@ -43,6 +43,12 @@ def _failed(message: str, code: int) -> typer.Exit:
 _ARGUMENT = re.compile(
     r"\b(grid|camera_grid|on_dark|first_bounce|method|rtol)=(?:'([\w-]+)'|\((\w+), (\w+)\)|([\d.e-]+))"
 )
+
+_WORDS = {
+    "rtol and atol are both 0; one of them must be positive": "--rtol is 0; it must be above 0",
+    "bounds[0] is": "--low is",
+    "bounds[1] is": "--high is",
+}
 
 
 def as_options(message: str) -> str:
@@ -57,6 +63,8 @@ def as_options(message: str) -> str:
         value = word or number or f"{rows}x{columns}".replace("hxw", "HxW")
         return f"--{name.replace('_', '-')} {value}"
 
+    for words, shown in _WORDS.items():
+        message = message.replace(words, shown)
     return _ARGUMENT.sub(option, message)
 
 

@@ -19,6 +19,12 @@ def _grid(text: str) -> tuple[int, int]:
     return grid
 
 
+def _folder(text: str) -> Path:
+    if not text.strip():
+        raise typer.BadParameter("the name is empty; write . for this folder")
+    return Path(text)
+
+
 def _method(name: str) -> str:
     if name not in METHODS:
         raise typer.BadParameter(f"{name!r} is no method; choose one of {', '.join(METHODS)}")
@@ -32,8 +38,18 @@ Matrices = Annotated[
 Pictures = Annotated[
     list[Path], typer.Argument(metavar="PICTURE...", help="Pictures: .png, .jpg, .tif, .bmp or .exr.")
 ]
+Patterns = Annotated[
+    list[Path], typer.Argument(metavar="PATTERN...", help="Pictures: .png, .jpg, .tif, .bmp or .exr.")
+]
 Out = Annotated[
-    Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results; filled only on success.")
+    Path,
+    typer.Option(
+        "--out",
+        "-o",
+        parser=_folder,
+        metavar="DIR",
+        help="Folder for the results; filled only on success.",
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Device = Annotated[
@@ -73,7 +89,10 @@ OnDark = Annotated[
     Literal["raise", "mask"],
     typer.Option(help="Projector pixels without direct light: refuse, or leave unlit."),
 ]
-Resize = Annotated[bool, typer.Option("--resize", help="Scale pictures of another size to the grid.")]
+Resize = Annotated[
+    bool,
+    typer.Option("--resize", help="Scale pictures of another size to the grid, without keeping proportions."),
+]
 Encoding = Annotated[
     Literal["auto", "srgb", "linear"],
     typer.Option(help="What picture files hold; auto: integers sRGB, floats linear."),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,17 +51,20 @@ class Reader:
 
 
 def names(paths: Sequence[Path]) -> dict[str, Path]:
-    """A name for the results of each file: its stem, with a number where two files share one.
+    """A name for the results of each file: its stem; where stems clash its extension, too, then a number.
 
-    >>> list(names([Path("a/sky.png"), Path("b/sky.exr"), Path("sea.png")]))
-    ['sky', 'sky_2', 'sea']
+    >>> list(names([Path("sky.png"), Path("sky.exr"), Path("a/sky.exr"), Path("sea.png")]))
+    ['sky_png', 'sky_exr', 'sky_exr_2', 'sea']
     """
     found: dict[str, Path] = {}
+    stems = Counter(path.stem.lower() for path in paths)  # some file systems ignore case
     for path in paths:
-        name, number = path.stem, 1
-        while name.lower() in {taken.lower() for taken in found}:  # some file systems ignore case
+        whole = stems[path.stem.lower()] > 1
+        base = f"{path.stem}_{path.suffix[1:]}" if whole and path.suffix else path.stem
+        name, number = base, 1
+        while name.lower() in {taken.lower() for taken in found}:
             number += 1
-            name = f"{path.stem}_{number}"
+            name = f"{base}_{number}"
         found[name] = path
     return found
 

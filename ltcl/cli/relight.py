@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
-from ltcl import report
-from ltcl.cli import console, options, pictures, transports
-from ltcl.files import fill_folder
+import typer
+
+from ltcl.cli import console, options, pictures, results, transports
 
 
 def run(
     transport: options.Matrix,
-    pattern: options.Pictures,
+    pattern: options.Patterns,
     out: options.Out,
     grid: options.Grid = None,
     camera_grid: options.CameraGrid = None,
@@ -24,25 +25,37 @@ def run(
 ) -> None:
     """Show what the camera will see when PATTERN is projected.
 
-    Writes each picture exactly as .exr and for the eye as .png, at its own brightness, which report.json
-    tells.
+    Writes each picture exactly as .exr and for the eye as .png, at its own brightness, which
+    relight.json tells.
     """
     from ltcl.relighting import relight
 
-    T = transports.load(transport, device, grid=grid, camera_grid=camera_grid, on_dark=on_dark)
+    T = transports.load(transport, device, square=False, grid=grid, camera_grid=camera_grid, on_dark=on_dark)
     patterns = pictures.Reader(T.grid, "the projector", encoding, resize).read_all(pattern)
-    text = transports.heading("relight", transport, T)
+    text = transports.heading(
+        "relight",
+        transport,
+        T,
+        grid=grid,
+        camera_grid=camera_grid,
+        on_dark=on_dark,
+        resize=resize,
+        encoding=encoding,
+        device=device,
+    )
     entries: list[dict[str, Any]] = []
     text["pictures"] = entries
-    with console.Steps(len(patterns)) as steps, fill_folder(out) as folder:
+    with console.Steps(len(patterns)) as steps, results.fill(out, text) as folder:
         for (name, light), file in zip(patterns.items(), pattern, strict=True):
             steps.item(file.name)
             seen = relight(T, light)
             files = pictures.write(folder, f"{name}_relit", seen, pictures.brightness(seen))
             entries.append({"file": str(file), "brightest": float(seen.max()), **files})
-        report.write(folder / "report.json", text)
     if json:
         console.answer({"folder": out, **text})
         return
-    rows = [(entry["file"], entry["brightest"], entry["png_scale"], out / entry["exr"]) for entry in entries]
+    rows = [
+        (Path(entry["file"]).name, entry["brightest"], entry["png_scale"], entry["exr"]) for entry in entries
+    ]
     console.table(("pattern", "brightest", "white in png", "picture"), rows)
+    typer.echo(f"\npictures as .exr and .png in {out}")

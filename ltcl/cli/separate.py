@@ -10,8 +10,7 @@ import numpy as np
 import typer
 
 from ltcl import report
-from ltcl.cli import console, options, pictures, transports
-from ltcl.files import fill_folder
+from ltcl.cli import console, options, pictures, results, transports
 from ltcl.separation import Separation
 
 _BOUNCES = Annotated[int, typer.Option(metavar="N", min=0, help="Indirect bounces to tell apart.")]
@@ -35,23 +34,35 @@ def run(
     """Split PICTURE, taken of the scene under projector light, into direct light and bounces.
 
     Writes direct, indirect, bounce_1, bounce_2, ... and the rest exactly as .exr (measured ones may be a
-    little negative) and for the eye as .png, each at its own brightness, which report.json tells. Several
+    little negative) and for the eye as .png, each at its own brightness, which separate.json tells. Several
     pictures get a folder each.
     """
     from ltcl.separation import separate
 
     T = transports.load(transport, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
     seen = pictures.Reader(T.grid, "the camera", encoding, resize).read_all(picture)
-    text = transports.heading("separate", transport, T, bounces=bounces, method=method, rtol=rtol)
+    text = transports.heading(
+        "separate",
+        transport,
+        T,
+        bounces=bounces,
+        grid=grid,
+        method=method,
+        rtol=rtol,
+        first_bounce=first_bounce,
+        on_dark=on_dark,
+        resize=resize,
+        encoding=encoding,
+        device=device,
+    )
     entries = text["pictures"] = []
-    with console.Steps(len(seen), T.channels * (bounces + 1)) as steps, fill_folder(out) as folder:
+    with console.Steps(len(seen), T.channels * (bounces + 1)) as steps, results.fill(out, text) as folder:
         for (name, image), file in zip(seen.items(), picture, strict=True):
             steps.item(file.name)
             done = separate(T, image, bounces, method=method, rtol=rtol, callback=steps.solve(rtol))
             # Several pictures get a folder each.
             place = f"{name}/" if len(seen) > 1 else ""
             entries.append({"file": str(file), "parts": _write(folder, place, done, image)})
-        report.write(folder / "report.json", text)
     if json:
         console.answer({"folder": out, **text})
     else:
@@ -85,18 +96,19 @@ def _light(part: np.ndarray) -> float:
 
 def _show(out: Path, entries: list[dict[str, Any]]) -> None:
     console.table(
-        ("picture", "part", "share of light", "products", "residual", "white in png", "file"),
+        ("picture", "part", "share of light", "products", "residual", "white in png"),
         [
             (
-                entry["file"],
+                Path(entry["file"]).name,
                 part["part"],
                 None if part["share"] is None else f"{100 * part['share']:.2f} %",
                 sum(channel["products"] for channel in part["channels"]) if part["channels"] else None,
                 max((channel["residual"] for channel in part["channels"]), default=None),
                 part["png_scale"],
-                out / part["exr"],
             )
             for entry in entries
             for part in entry["parts"]
         ],
     )
+    places = [out / Path(entry["parts"][0]["exr"]).parent for entry in entries]
+    typer.echo(f"\neach part as .exr and .png in {', '.join(map(str, places))}")

@@ -7,17 +7,42 @@ from pathlib import Path
 from typing import Any
 
 from ltcl import report, store
+from ltcl.cli import console
 from ltcl.device import open_device
+from ltcl.errors import FileError
+from ltcl.store import formats
 from ltcl.transport import Transport
 
 
-def load(path: Path, device: str | None, **options: Any) -> Transport:
-    """Open the device, then load: a mistyped device should not wait for a large file."""
-    return store.load(path, device=open_device(device), **options)
+def load(path: Path, device: str | None, *, square: bool = True, **options: Any) -> Transport:
+    """Open the device, then load: a mistyped device should not wait for a large file.
+
+    Raises
+    ------
+    FileError
+        As `store.load`; or `square` is asked for, and T maps to another number of pixels.
+    """
+    opened = open_device(device)
+    try:
+        T = store.load(path, device=opened, **options)
+    except FileError as error:
+        if square and "grid=(" in str(error):  # no grid helps where T is rectangular
+            _require_square(path)
+        raise
+    dark = int(T.masked.sum())
+    if dark and square:  # relighting needs no first bounce
+        console.note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
+    return T
+
+
+def _require_square(path: Path) -> None:
+    rows, columns = formats.read(path).shape
+    if rows != columns:
+        raise FileError(f"{path}: T is {rows} x {columns}; only relight can use it")
 
 
 def heading(command: str, path: Path, T: Transport, **options: Any) -> dict[str, Any]:
-    """The beginning of every report: who made it, from what, how."""
+    """The beginning of every report: who made it, from what, how; `options` by their names here."""
     return {
         "command": command,
         "versions": report.versions(),

@@ -20,7 +20,7 @@ from ltcl.demo import target
 from ltcl.demo.target import Target
 from ltcl.scenes import Scene
 from ltcl.separation import Separation, separate
-from ltcl.solvers import Solution, solve
+from ltcl.solvers import Solution, auto, solve
 from ltcl.transport import Transport
 
 ALBEDO = ((0.97, 0.25, 0.15), (0.96, 0.80, 0.30), (0.97, 0.45, 0.80))
@@ -75,7 +75,9 @@ def compute(size: int, device: Any, begin: Callable[[str], object]) -> Experimen
     begin(next(steps))
     wanted = target.reachable(scene, T, RTOL)
     begin(next(steps))
-    compensation = compensate(T, wanted.picture, gain=1.0 / wanted.brightest, rtol=RTOL)
+    # What the demo is about, also where so few pixels would make "auto" factorize.
+    method = "chebyshev" if T.shape[0] <= auto.SMALL else "auto"
+    compensation = compensate(T, wanted.picture, gain=1.0 / wanted.brightest, method=method, rtol=RTOL)
     uncompensated = _look(T @ wanted.picture, wanted.picture)
     begin(next(steps))
     separation = separate(T, uncompensated.seen, BOUNCES, rtol=RTOL)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The demo's folder: views of the corner, linear pictures on the walls' grid, plots, the report.
 
-Views are exposed to compare: each at the brightness at which it comes closest to the target, bounces at that
-of the uncompensated picture times the factor in their note. The files in ``linear/`` hold
-the values as they are.
+Views are exposed to compare: each at the brightness at which it comes closest to the target, with that factor
+in its note; bounces at that of the uncompensated picture times the factor in theirs. The files in ``linear/``
+hold the values as they are.
 """
 
 from __future__ import annotations
@@ -117,14 +117,17 @@ def _view(scene: Scene, picture: np.ndarray, coverage: np.ndarray) -> np.ndarray
 
 def _captions(found: Experiment) -> dict[str, tuple[str, str, float]]:
     """Label, note and exposure of each picture."""
-    captions = {"target": ("Desired", "", 1.0)}
+    mist = found.target.mist
+    captions = {"target": ("Desired", f"{100 * mist:.0f} % mist added" if mist >= 0.005 else "", 1.0)}
     for name, label in (
-        ("uncompensated", "Projected as it is"),
+        ("uncompensated", "As it is"),
         ("compensated", "Compensated"),
-        ("colours_only", "Wall colours undone"),
+        ("colours_only", "Colours only"),
     ):
         look = getattr(found, name)
-        captions[name] = (label, f"{100 * look.error:.1f} % error", look.exposure)
+        shown = "" if name == "colours_only" else "shown "  # its panel has less room
+        note = f"{100 * look.error:.1f} % error, {shown}\u00d7 {look.exposure:.2g}"
+        captions[name] = (label, note, look.exposure)
     captions["pattern"] = ("Pattern", "what is projected", 1.0)
     parts = [found.separation.direct, *found.separation.bounces]
     strength = [float(np.linalg.norm(part)) for part in parts]
@@ -143,8 +146,8 @@ def _subtitle(found: Experiment) -> str:
     solutions = found.compensation.solution
     steps = solutions if isinstance(solutions, tuple) else (solutions,)
     products = " + ".join(str(solution.products) for solution in steps)
-    methods = " and ".join(sorted({solution.method for solution in steps}))
     return (
-        f"Undoing the light that bounces between the walls took {products} products ({methods}); "
-        f"\u03c1(R) = {_rho(found):.2f} in {COLOURS[found.worst]}, where the plain iteration diverges."
+        f"Bounces undone in {products} products, at {100 * found.compensation.gain:.0f} % of the wanted "
+        f"brightness; \u03c1(R) = {_rho(found):.2f} in {COLOURS[found.worst]}, "
+        "where the plain iteration diverges."
     )

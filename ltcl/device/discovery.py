@@ -24,7 +24,7 @@ _FIXES = {
     "darwin": "macOS brings OpenCL; on newer machines: conda install -c conda-forge pocl",
     "win32": "install the GPU vendor's driver, or Intel's CPU Runtime for OpenCL Applications",
 }
-
+_HIDING = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")
 
 _opened: weakref.WeakValueDictionary[str, Device] = weakref.WeakValueDictionary()
 
@@ -99,7 +99,9 @@ def choose(devices: list[Description], select: str | None) -> Description:
     """The one of `devices`, best first, that `select` means."""
     fix = _FIXES.get(sys.platform, _FIXES["linux"])
     if not devices:
-        raise DeviceError(f"no OpenCL device was found; install a driver: {fix}")
+        named = " and ".join(suspects())
+        unset = f" with {named}; unset that, or" if named else ";"
+        raise DeviceError(f"no OpenCL device was found{unset} install a driver: {fix}")
     if select is None:
         real = [device for device in devices if device.kind != "simulator"]
         if not real:
@@ -110,11 +112,25 @@ def choose(devices: list[Description], select: str | None) -> Description:
     matches = [device for device in devices if _means(select, device)]
     if not matches:
         known = "; ".join(f"{device.index} {device.name} ({device.kind})" for device in devices)
+        kind = select.strip().lower()
+        if kind in KINDS:
+            raise DeviceError(f"no {kind} here; there are: {known}")
         raise DeviceError(
             f"device is {select!r}; it must be gpu, cpu, accelerator, an index or part of a name; "
             f"there are: {known}"
         )
     return matches[0]
+
+
+def suspects() -> list[str]:
+    """Variables set by the user that can hide every driver, as NAME=value."""
+    found = [(name, os.environ.get(name, "")) for name in _HIDING]
+    # ltcl points them at folders of its own, too: see `trial`.
+    return [
+        f"{name}={value}"
+        for name, value in found
+        if value and not os.path.basename(value).startswith(("ltcl-", "vendors-"))
+    ]
 
 
 def _means(select: str, device: Description) -> bool:

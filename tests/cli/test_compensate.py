@@ -9,6 +9,7 @@ import pytest
 
 import ltcl
 from ltcl import images, scenes, store
+from ltcl.cli import compensate
 
 from .conftest import Program
 
@@ -46,7 +47,7 @@ def test_report_tells_what_happened(
         "exact",
     ]
     assert program("compensate", transport, picture, large_picture, *arguments).code == 0
-    report = json.loads((out / "report.json").read_text())
+    report = json.loads((out / "compensate.json").read_text())
     assert report["versions"]["ltcl"] == ltcl.__version__
     assert report["options"]["gain"] == 0.5
     assert [entry["file"] for entry in report["pictures"]] == [str(picture), str(large_picture)]
@@ -96,7 +97,7 @@ def test_pictures_of_one_name_do_not_collide(
     copy.write_bytes(picture.read_bytes())
     out = tmp_path / "out"
     assert program("compensate", transport, picture, copy, "--out", out).code == 0
-    assert {"sky_pattern.exr", "sky_2_pattern.exr"} <= {path.name for path in out.iterdir()}
+    assert {"sky_exr_pattern.exr", "sky_exr_2_pattern.exr"} <= {path.name for path in out.iterdir()}
 
 
 def test_clipping_comes_with_advice(program: Program, transport: Path, tmp_path: Path) -> None:
@@ -104,7 +105,32 @@ def test_clipping_comes_with_advice(program: Program, transport: Path, tmp_path:
     images.write(bright, np.full((5, 10), 2.0, np.float32))
     outcome = program("compensate", transport, bright, "--out", tmp_path / "out")
     assert outcome.code == 0
-    assert "try --gain 0." in outcome.err
+    advised = outcome.err.rpartition("--gain ")[2].strip()
+    assert float(advised) < 1
+    outcome = program("compensate", transport, bright, "--out", tmp_path / "out", "--gain", advised, "--json")
+    assert outcome.json["pictures"][0]["too_bright"] == 0
+    assert outcome.json["pictures"][0]["brightest"] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(0.6666, "0.66"), (0.999, "0.99"), (12.9, "12"), (0.5, "0.5"), (0.00129, "0.0012")]
+)
+def test_gains_are_rounded_down(value: float, shown: str) -> None:
+    assert compensate._rounded_down(value) == shown
+
+
+def test_a_background_brighter_than_the_picture_is_named(
+    program: Program, transport: Path, picture: Path, tmp_path: Path
+) -> None:
+    out = ["--out", tmp_path / "out"]
+    outcome = program("compensate", transport, picture, "--background", picture, *out)
+    assert "100 % of it is no brighter than the background" in outcome.err
+    assert "bounces" not in outcome.err
+    dark = np.full((5, 10), 0.01, np.float32)
+    dark[:, :5] = 0.5
+    images.write(tmp_path / "dark.exr", dark)
+    outcome = program("compensate", transport, tmp_path / "dark.exr", *out)
+    assert "darker than the light that bounces there" in outcome.err
 
 
 def test_divergence_is_one_line_and_touches_nothing(
@@ -114,10 +140,10 @@ def test_divergence_is_one_line_and_touches_nothing(
     store.save(closed, scenes.box(3, albedo=0.8).transport())
     out = tmp_path / "out"
     out.mkdir()
-    (out / "report.json").write_text("old")
+    (out / "compensate.json").write_text("old")
     outcome = program("compensate", closed, large_picture, "--resize", "--out", out, "--method", "jacobi")
     outcome.refused("jacobi: diverged", "--method chebyshev")
-    assert (out / "report.json").read_text() == "old"
+    assert (out / "compensate.json").read_text() == "old"
     assert len(list(out.iterdir())) == 1
 
 
@@ -126,10 +152,10 @@ def test_earlier_results_give_way_to_new_ones(
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    (out / "report.json").write_text("old")
+    (out / "compensate.json").write_text("old")
     (out / "mine.txt").write_text("mine")
     assert program("compensate", transport, picture, "--out", out).code == 0
-    assert json.loads((out / "report.json").read_text())["command"] == "compensate"
+    assert json.loads((out / "compensate.json").read_text())["command"] == "compensate"
     assert (out / "mine.txt").read_text() == "mine"
 
 
@@ -143,8 +169,9 @@ def test_earlier_results_give_way_to_new_ones(
         (["{transport}", "{picture}", "--device", "nonsense"], ["device is 'nonsense'"]),
         (["{transport}", "{picture}", "--grid", "7x7"], ["h * w must be 50"]),
         (["{transport}", "{picture}", "--gain", "0"], ["gain is 0.0", "above 0"]),
-        (["{transport}", "{picture}", "--low", "1", "--high", "0"], ["bounds[1] is 0.0", "above 1"]),
+        (["{transport}", "{picture}", "--low", "1", "--high", "0"], ["--high is 0.0", "above 1"]),
         (["{transport}", "{picture}", "--rtol", "nan"], ["rtol is nan"]),
+        (["{transport}", "{picture}", "--rtol", "0"], ["--rtol is 0; it must be above 0"]),
         (["{transport}", "{picture}", "--background", "{large}"], ["20 x 30", "--resize"]),
     ],
 )

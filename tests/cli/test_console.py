@@ -26,6 +26,20 @@ def test_numbers_stand_right_and_words_left(capsys: pytest.CaptureFixture[str]) 
     ]
 
 
+def test_a_narrow_terminal_breaks_no_number(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console.sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    name = "folder/" * 9 + "name.npz"
+    console.table(("file", "rho"), [("a.npz", 0.123456), (name, 7)])
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    console.table(("file", "first number"), [("a.npz", 0.123456), (name, 7)])
+    assert capsys.readouterr().out == (
+        f"file           a.npz\nfirst number   0.1235\n\nfile           {name}\nfirst number   7\n"
+    )
+
+
 def test_answer_is_strict_json(capsys: pytest.CaptureFixture[str]) -> None:
     console.answer({"rho": np.float32(0.5), "products": float("inf"), "name": "Größe"})
     out = capsys.readouterr().out

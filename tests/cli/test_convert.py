@@ -44,3 +44,21 @@ def test_refusals_leave_the_old_file(program: Program, transport: Path, tmp_path
     program("convert", transport, target, "--grid", "6x10").refused("h * w must be 50")
     assert target.read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["T.npz"]
+
+
+def test_what_could_not_be_loaded_is_not_written(program: Program, tmp_path: Path) -> None:
+    np.save(tmp_path / "nan.npy", np.full((4, 4), np.nan))
+    program("convert", tmp_path / "nan.npy", tmp_path / "out.npz").refused("nan.npy: T has 16 NaN")
+    np.savez(tmp_path / "rect.npz", T=np.ones((6, 4)), first_bounce=np.ones(4))
+    program("convert", tmp_path / "rect.npz", tmp_path / "out.npz").refused("rect.npz", "only a square T")
+    assert not (tmp_path / "out.npz").exists()
+
+
+def test_a_grid_that_nobody_told_is_missed(program: Program, tmp_path: Path) -> None:
+    np.save(tmp_path / "T.npy", np.ones((6, 4)))
+    there = tmp_path / "T.npz"
+    assert "does not tell the grid; give --grid HxW" in program("convert", tmp_path / "T.npy", there).err
+    outcome = program("convert", tmp_path / "T.npy", there, "--grid", "2x2")
+    assert "give --camera-grid HxW" in outcome.err
+    outcome = program("convert", tmp_path / "T.npy", there, "--grid", "2x2", "--camera-grid", "2x3")
+    assert outcome.err == ""

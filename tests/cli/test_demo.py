@@ -36,6 +36,7 @@ def test_json(program: Program, monkeypatch: pytest.MonkeyPatch, done: demo.Demo
     outcome = run(program, monkeypatch, done, "--json")
     assert outcome.code == 0
     assert outcome.json["errors"] == done.report["errors"]
+    assert outcome.err.splitlines() == [f"ltcl: {k}/7 {step}" for k, step in enumerate(demo.STEPS, 1)]
     assert all((Path(outcome.json["folder"]) / name).is_file() for name in outcome.json["files"])
 
 

@@ -25,11 +25,16 @@ def test_json(program: Program, device: Device) -> None:
     assert chosen["max_allocation"] > 0
 
 
-def test_unknown_ltcl_device_names_those_there_are(
+def test_unknown_ltcl_device_still_lists_those_there_are(
     program: Program, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("LTCL_DEVICE", "nonsense")
-    program("devices").refused("nonsense", device.name)
+    outcome = program("devices")
+    assert outcome.code == 0
+    assert device.name in outcome.out
+    assert "->" not in outcome.out
+    assert outcome.err == "ltcl: LTCL_DEVICE=nonsense matches none of these\n"
+    assert not any(entry["chosen"] for entry in program("devices", "--json").json)
 
 
 def test_without_devices_the_fix_is_told(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import pytest
 
 from ltcl.cli import device_checks, doctor
-from ltcl.device import Device, sources
-from ltcl.errors import DeviceError
+from ltcl.device import Device, discovery, sources
+from ltcl.errors import DeviceError, FileError
 
 from .conftest import Program
 
@@ -73,3 +74,23 @@ def test_whatever_is_raised_is_a_finding() -> None:
     finding = doctor.attempt("x", lambda: str(1 / 0), "no fix")
     assert not finding.passed
     assert finding.found.startswith("ZeroDivisionError")
+
+
+def test_chmod_is_no_advice_for_a_read_only_disk() -> None:
+    def fail() -> str:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    finding = doctor.attempt("cache folder", fail, doctor._cache_fix)
+    assert finding.fix == "set LTCL_CACHE=DIR to a folder that can be written"
+    assert doctor._cache_fix(FileError("mode 755")).startswith("chmod 700")
+
+
+def test_a_variable_that_hides_the_drivers_is_named(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(discovery, "list_devices", list)
+    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
+    outcome = program("doctor", "--json")
+    (failed,) = [check for check in outcome.json["checks"] if check["check"] == "device"]
+    assert "OCL_ICD_VENDORS=/nowhere" in failed["found"]
+    assert failed["fix"].startswith("unset OCL_ICD_VENDORS=/nowhere")

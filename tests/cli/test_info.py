@@ -58,3 +58,39 @@ def test_refusals(program: Program, transport: Path, tmp_path: Path) -> None:
     bad = tmp_path / "nan.npy"
     np.save(bad, np.full((4, 4), np.nan))
     program("info", bad).refused("nan.npy", "NaN")
+
+
+@pytest.fixture
+def bad_grid(tmp_path: Path) -> Path:
+    path = tmp_path / "badgrid.npz"
+    np.savez(path, T=np.eye(32), grid=(5, 5))
+    return path
+
+
+def test_a_grid_of_other_pixels_is_refused(program: Program, bad_grid: Path, tmp_path: Path) -> None:
+    program("info", bad_grid).refused("badgrid.npz", "grid is 5 x 5 = 25", "must be 32")
+    program("convert", bad_grid, tmp_path / "out.npz").refused("badgrid.npz", "must be 32")
+    assert not (tmp_path / "out.npz").exists()
+    assert program("convert", bad_grid, tmp_path / "out.npz", "--grid", "4x8").code == 0
+
+
+def test_rectangular_without_camera_grid_is_not_the_same(program: Program, tmp_path: Path) -> None:
+    path = tmp_path / "nonsq.npz"
+    np.savez(path, T=np.ones((40, 32)), grid=(4, 8))
+    outcome = program("info", path)
+    assert "not told" in outcome.out
+    assert "the same" not in outcome.out
+
+
+def test_a_bad_file_does_not_hide_the_good_ones(program: Program, transport: Path, bad_grid: Path) -> None:
+    outcome = program("info", transport, bad_grid, transport)
+    assert outcome.code == 1
+    assert outcome.out.count("50 x 50") == 2
+    assert outcome.err.startswith("ltcl: error: ")
+    assert outcome.err.count("\n") == 1
+    outcome = program("info", transport, bad_grid, "--json")
+    assert outcome.code == 1
+    good, bad = outcome.json
+    assert good["shape"] == [50, 50]
+    assert bad["file"] == str(bad_grid)
+    assert "must be 32" in bad["error"]

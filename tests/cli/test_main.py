@@ -104,6 +104,9 @@ def test_what_a_command_raises_becomes_a_line(
         ("try method='chebyshev' or 'direct'", "try --method chebyshev or 'direct'"),
         ("rtol=1e-07 is below", "--rtol 1e-07 is below"),
         ("the grid is (4, 5)", "the grid is (4, 5)"),
+        ("bounds[0] is nan", "--low is nan"),
+        ("bounds[1] is 0.0; it must be above 1", "--high is 0.0; it must be above 1"),
+        ("rtol and atol are both 0; one of them must be positive", "--rtol is 0; it must be above 0"),
     ],
 )
 def test_arguments_are_named_as_options(message: str, shown: str) -> None:

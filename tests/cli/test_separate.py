@@ -58,7 +58,7 @@ def test_several_pictures_get_a_folder_each(
     assert outcome.code == 0
     assert (out / "photo" / "direct.exr").is_file()
     assert (out / "sky" / "rest.png").is_file()
-    assert str(out / "sky" / "rest.exr") in outcome.out
+    assert str(out / "sky") in outcome.out
 
 
 def test_wrong_size_is_refused(

@@ -62,11 +62,16 @@ def test_selection(select, found):
     assert discovery.choose(ALL, select) is found
 
 
-@pytest.mark.parametrize("select", ["9:0", "tpu", "cpu"])
+@pytest.mark.parametrize("select", ["9:0", "tpu"])
 def test_selection_of_nothing_lists_what_there_is(select):
     with pytest.raises(DeviceError, match=f"device is '{select}'; it must be gpu, cpu") as error:
         discovery.choose([BIG, SIMULATOR], select)
     assert "4:1 Radeon (gpu); 0:0 Oclgrind Simulator (simulator)" in str(error.value)
+
+
+def test_a_kind_that_is_missing_is_said():
+    with pytest.raises(DeviceError, match=r"^no cpu here; there are: 4:1 Radeon \(gpu\)$"):
+        discovery.choose([BIG], "cpu")
 
 
 @pytest.mark.parametrize(
@@ -80,9 +85,21 @@ def test_selection_of_nothing_lists_what_there_is(select):
 )
 def test_no_device_at_all_tells_the_fix_of_the_system(monkeypatch, system, fix):
     monkeypatch.setattr(sys, "platform", system)
+    for name in discovery._HIDING:
+        monkeypatch.delenv(name, raising=False)
     with pytest.raises(DeviceError, match=r"^no OpenCL device was found; install a driver: ") as error:
         discovery.choose([], "gpu")
     assert fix in str(error.value)
+
+
+def test_no_device_at_all_names_the_variables_that_may_hide_it(monkeypatch):
+    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
+    monkeypatch.setenv("POCL_CACHE_DIR", "/somewhere/ltcl-abc")  # our own
+    monkeypatch.delenv("OCL_ICD_FILENAMES", raising=False)
+    with pytest.raises(
+        DeviceError, match="found with OCL_ICD_VENDORS=/nowhere; unset that, or install a driver"
+    ):
+        discovery.choose([], None)
 
 
 def test_simulator_is_never_taken_unasked():
