@@ -65,6 +65,15 @@ def as_path(path: Any) -> Path:
         ) from None
 
 
+def unknown_extension(path: Path) -> str:
+    """What is wrong with the extension of `path`, for a refusal.
+
+    >>> unknown_extension(Path("T.xyz")), unknown_extension(Path("T"))
+    ('extension .xyz is unknown', 'has no extension')
+    """
+    return f"extension {path.suffix} is unknown" if path.suffix else "has no extension"
+
+
 @contextlib.contextmanager
 def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file under a temporary name; put it at `path` only when the block ends well.

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ltcl import checks
 from ltcl.errors import FileError, InputError, MemoryLimitError
-from ltcl.files import as_path, input_file, replace_file
+from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.images import exr, raster
 from ltcl.images.pictures import as_picture
 from ltcl.images.scaling import resize
@@ -131,9 +131,7 @@ def _bits(path: Path) -> tuple[int, ...]:
     try:
         return BITS[path.suffix.lower()]
     except KeyError:
-        raise FileError(
-            f"{path}: extension {path.suffix or 'missing'} is unknown; pictures are {', '.join(BITS)}"
-        ) from None
+        raise FileError(f"{path}: {unknown_extension(path)}; pictures are {', '.join(BITS)}") from None
 
 
 def _linear(stored: np.ndarray, encoding: Encoding) -> np.ndarray:

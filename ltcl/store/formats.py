@@ -15,7 +15,7 @@ from types import ModuleType
 import numpy as np
 
 from ltcl.errors import FileError, InputError, InputTypeError, MemoryLimitError
-from ltcl.files import as_path, input_file, replace_file
+from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.store import mtx, npy, npz
 from ltcl.store.record import Record
 
@@ -73,9 +73,7 @@ def find(path: Path) -> ModuleType:
         return FORMATS[path.suffix.lower()]
     except KeyError:
         known = ", ".join(FORMATS)
-        raise FileError(
-            f"{path}: extension {path.suffix or 'missing'} is unknown; transports are {known}"
-        ) from None
+        raise FileError(f"{path}: {unknown_extension(path)}; transports are {known}") from None
 
 
 @contextlib.contextmanager

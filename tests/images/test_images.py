@@ -178,7 +178,7 @@ def test_nan_in_a_file_is_refused(tmp_path, suffix):
         ("a.png", np.zeros((2, 2)), {"encoding": "gamma"}, "encoding is 'gamma'"),
         ("a.exr", np.full((2, 2), 1e5), {"bits": 16}, "65504"),
         ("a.gif", np.zeros((2, 2)), {}, ".gif is unknown; pictures are .png, .jpg"),
-        ("a", np.zeros((2, 2)), {}, "missing is unknown"),
+        ("a", np.zeros((2, 2)), {}, "has no extension"),
     ],
 )
 def test_what_cannot_be_written_is_refused_and_the_earlier_file_stays(tmp_path, name, image, options, text):
