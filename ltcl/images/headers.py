@@ -14,6 +14,7 @@ from itertools import pairwise
 from ltcl import checks
 from ltcl.errors import FileError
 
+TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # little- and big-endian, classic and BigTIFF
 PNG = b"\x89PNG\r\n\x1a\n"
 MOST_PIXELS = 1 << 30  # OpenCV's own limit
 # Deflate reaches 1032 bytes for one, and a byte holds 8 pixels at best; eight times that is a lie.
@@ -50,7 +51,7 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
             w, h = (abs(v) for v in struct.unpack_from("<ii", data, 18))  # h < 0: rows from the top
         elif data.startswith(b"\xff\xd8"):
             return _jpeg_size(data)
-        elif data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        elif data[:4] in TIFF:
             return _tiff_size(data)
         else:
             return None

@@ -53,8 +53,8 @@ _silence = _Silence()
 def read(path: Path) -> np.ndarray:
     """Return the codes in a file: (h, w) or (h, w, 3) RGB; uint8, uint16, float32 or float64.
 
-    An EXIF rotation is not applied: a picture must stay on the camera's pixels. Of several pages the first
-    counts.
+    An EXIF rotation is not applied: a picture must stay on the camera's pixels. Several pages are refused:
+    nobody can tell which was meant.
 
     Raises
     ------
@@ -67,6 +67,11 @@ def read(path: Path) -> np.ndarray:
     if data.startswith(headers.PNG):
         headers.check_png_chunks(data)
     stored = _decode(data)
+    if data[:4] in headers.TIFF:
+        with _silence:
+            pages = cv2.imcount(str(path))
+        if pages > 1:
+            raise FileError(f"holds {pages} pages; it must hold one picture, so save each to a file")
     if stored.dtype.name not in _STORED:
         raise FileError(f"holds {stored.dtype} pixels; they must be one of {', '.join(_STORED)}")
     if stored.ndim == 3 and stored.shape[2] == 4:

@@ -193,3 +193,11 @@ def test_what_cannot_be_written_is_refused_and_the_earlier_file_stays(tmp_path, 
 def test_complex_pictures_are_refused(tmp_path):
     with pytest.raises(InputTypeError, match="image holds complex128"):
         images.write(tmp_path / "a.png", np.zeros((2, 2), complex))
+
+
+def test_a_file_of_several_pages_is_refused(tmp_path):
+    done, data = cv2.imencodemulti(".tif", [np.zeros((4, 5), np.uint8), np.ones((4, 5), np.uint8)])
+    assert done
+    (tmp_path / "pages.tif").write_bytes(data.tobytes())
+    with pytest.raises(FileError, match=r"pages\.tif: holds 2 pages; it must hold one picture"):
+        images.read(tmp_path / "pages.tif")
