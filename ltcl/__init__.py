@@ -37,7 +37,7 @@ from ltcl.store import load, save
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
-    from ltcl import images, plots, scenes
+    from ltcl import images, operators, plots, scenes, solvers, theory
 
 __version__ = "0.1.0"
 __all__ = [
@@ -55,12 +55,15 @@ __all__ = [
     "list_devices",
     "load",
     "open_device",
+    "operators",
     "plots",
     "relight",
     "save",
     "scenes",
     "separate",
     "solve",
+    "solvers",
+    "theory",
 ]
 
 _LAZY = ("images", "plots", "scenes")  # they bring OpenCV or matplotlib, which not everybody needs

@@ -42,6 +42,9 @@ class ChannelAnalysis:
         diverges, NaN where there is no forecast.
     certificates : dict
         What each forecast rests on; see `theory.Forecast`.
+    series : tuple of theory.Terms
+        What 1, 2, 4, 8 and 16 terms of the series leave undone (eq. 13, 15, 16), with m from the upper bound
+        on rho(R), in the norm in which a reciprocal T makes A self-adjoint.
     first_bounce : (smallest, median, largest)
     reciprocity_defect : float
         0 of a Lambertian scene without noise; see `ltcl.reciprocity`.
@@ -59,6 +62,7 @@ class ChannelAnalysis:
     bounds: tuple[float, float]
     products: dict[str, float]
     certificates: dict[str, str]
+    series: tuple[theory.Terms, ...]
     first_bounce: tuple[float, float, float]
     reciprocity_defect: float
     energy: Energy
@@ -150,7 +154,14 @@ def _channel(T: Any, F: np.ndarray, S: IdentityPlus, rtol: float) -> ChannelAnal
         bounds=bounds,
         products={name: forecast.products for name, forecast in forecasts.items()},
         certificates={name: forecast.certificate for name, forecast in forecasts.items()},
+        series=theory.after_terms(_albedo(rho)),
         first_bounce=(float(lit.min()), float(np.median(lit)), float(lit.max())),
         reciprocity_defect=reciprocity.defect(T, F),
         energy=energy.check(T, F, S),
     )
+
+
+def _albedo(rho: theory.SpectralRadius) -> float:
+    """m with rho(R) <= m / (1 - m) (eq. 14), safely so where rho has an upper bound."""
+    most = rho.upper if math.isfinite(rho.upper) else rho.value
+    return most / (1.0 + most)

@@ -73,6 +73,10 @@ def _show(found: list[dict[str, Any]], rtol: float) -> None:
     for name in methods:
         certificates = {channel["certificates"][name] for entry in found for channel in entry["channels"]}
         typer.echo(f"  {name}: by {', '.join(sorted(certificates))}")
+    orders = tuple(f"n = {terms['n']}" for terms in found[0]["channels"][0]["series"])
+    typer.echo("\nError of n terms of the series at most: inverse (eq. 16), forward (eq. 15)")
+    console.table(("file", "channel", *orders), _rows(found, _series))
+    typer.echo("  n terms cancel bounces 2 to n and leave bounce n + 1 with the sign (-1)^n (eq. 13)")
     typer.echo("\nChecks of the measurement")
     columns = (
         "reciprocity defect",
@@ -111,6 +115,15 @@ def _forecast(channel: dict[str, Any]) -> tuple:
         "diverges" if products is None and channel["certificates"][name] != "none" else products
         for name, products in channel["products"].items()
     )
+
+
+def _series(channel: dict[str, Any]) -> tuple:
+    return tuple(f"{_bound(terms['inverse'])}, {_bound(terms['forward'])}" for terms in channel["series"])
+
+
+def _bound(value: float | None) -> str:
+    """Eq. 16 has none from an albedo of 1/2 on."""
+    return "no bound" if value is None else f"{value:.2g}"
 
 
 def _checks(channel: dict[str, Any]) -> tuple:

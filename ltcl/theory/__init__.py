@@ -14,12 +14,21 @@ from ltcl.theory.forecast import (
     richardson_products,
     series_products,
 )
-from ltcl.theory.series import bounce_coefficients, forward_error_bound, inverse_error_bound, norm_bound
+from ltcl.theory.series import (
+    Terms,
+    after_terms,
+    bounce_coefficients,
+    forward_error_bound,
+    inverse_error_bound,
+    norm_bound,
+)
 from ltcl.theory.spectrum import SpectralRadius, free_bounds, spectral_radius
 
 __all__ = [
     "Forecast",
     "SpectralRadius",
+    "Terms",
+    "after_terms",
     "bounce_coefficients",
     "chebyshev_products",
     "forecasts",

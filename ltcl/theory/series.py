@@ -9,7 +9,9 @@ m bounds the albedo, so that ||A|| <= m; the norm is any induced p-norm (footnot
 
 from __future__ import annotations
 
-from math import comb
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from ltcl import checks
 from ltcl.errors import InputError
@@ -50,7 +52,51 @@ def bounce_coefficients(n: int, bounces: int) -> tuple[int, ...]:
 
 def _coefficient(n: int, j: int) -> int:
     """Of A^j, j >= 1; R^0 = I has none."""
-    return sum((-1) ** k * comb(j - 1, k - 1) for k in range(1, min(j, n) + 1))
+    return sum((-1) ** k * math.comb(j - 1, k - 1) for k in range(1, min(j, n) + 1))
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What n terms leave undone of a scene whose bounces keep at most a share m of the light.
+
+    Attributes
+    ----------
+    n : int
+    next_bounce : int
+        Coefficient of bounce n + 1 in the inverse, of which bounces 2 to n are gone: (-1)^n (eq. 13).
+    forward, inverse : float
+        Bounds on the errors of S_n (eq. 15) and S_n^-1 (eq. 16); NaN where eq. 16 knows none, m >= 1/2.
+    """
+
+    n: int
+    next_bounce: int
+    forward: float
+    inverse: float
+
+
+def after_terms(m: float, orders: Sequence[int] = (1, 2, 4, 8, 16)) -> tuple[Terms, ...]:
+    """Eq. 13, 15 and 16 for several numbers of terms.
+
+    Raises
+    ------
+    InputError
+        m outside [0, 1), an order below 1.
+
+    Examples
+    --------
+    >>> after_terms(0.25, [1, 2])[1]
+    Terms(n=2, next_bounce=1, forward=0.020833333333333332, inverse=0.05555555555555555)
+    """
+    m = _albedo(m)
+    return tuple(
+        Terms(
+            checks.count("orders", n),
+            bounce_coefficients(n, n + 1)[-1],
+            forward_error_bound(m, n),
+            inverse_error_bound(m, n) if m < 0.5 else math.nan,
+        )
+        for n in orders
+    )
 
 
 def norm_bound(m: float) -> float:

@@ -47,12 +47,22 @@ def test_refusals(program: Program, dark_transport: Path, tmp_path: Path) -> Non
 def test_everything_is_in_the_tables_and_in_json(program: Program, transport: Path) -> None:
     outcome = program("analyze", transport)
     assert outcome.code == 0
-    for part in ("between", "collatz-wielandt", "gauss_seidel", "richardson", "reciprocity defect", "0 %"):
+    for part in (
+        "eq. 16",
+        "cancel bounces",
+        "between",
+        "collatz-wielandt",
+        "gauss_seidel",
+        "richardson",
+        "reciprocity defect",
+        "0 %",
+    ):
         assert part in outcome.out
     (channel,) = program("analyze", transport, "--json").json[0]["channels"]
     assert channel["reciprocity_defect"] < 1e-5
     assert 0 < channel["energy"]["bounce_highest"] < 0.6  # the albedo
     assert channel["certificates"]["chebyshev"] == "free bounds"
+    assert [terms["n"] for terms in channel["series"]] == [1, 2, 4, 8, 16]
     lower, upper = channel["spectral_radius_bounds"]
     assert lower <= channel["spectral_radius"] <= upper
 

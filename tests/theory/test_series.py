@@ -108,3 +108,27 @@ def test_an_albedo_outside_its_range_is_refused(bound, m):
 def test_counts_are_whole_numbers(n, bounces):
     with pytest.raises(InputError, match="must be a whole number of at least 0"):
         theory.bounce_coefficients(n, bounces)
+
+
+@pytest.mark.parametrize("m", [0.2, 0.45, 0.6])
+def test_what_terms_leave_is_never_less_than_measured(m):
+    """||S - S_n|| and ||S^-1 - S_n^-1|| of an enclosure, whose A has the norm m in the weighted 2-norm."""
+    scene = enclosure(12, m)
+    A, weight = scene.A, np.sqrt(scene.weights)
+
+    def norm(M: np.ndarray) -> float:
+        return float(np.linalg.norm(weight[:, None] * M / weight, 2))
+
+    S, identity = np.linalg.inv(np.eye(12) - A), np.eye(12)
+    for terms in theory.after_terms(norm(A), (1, 3, 6)):
+        forward = sum((np.linalg.matrix_power(A, k) for k in range(terms.n + 1)), np.zeros_like(A))
+        assert norm(S - forward) <= terms.forward * (1 + 1e-9)
+        error = norm(np.linalg.inv(S) - inverse_series(S - identity, terms.n))
+        assert np.isnan(terms.inverse) == (norm(A) >= 0.5)
+        assert np.isnan(terms.inverse) or error <= terms.inverse * (1 + 1e-9)
+        assert terms.next_bounce == (-1) ** terms.n
+
+
+def test_orders_below_one_are_refused():
+    with pytest.raises(InputError, match="orders is 0"):
+        theory.after_terms(0.3, [0])
