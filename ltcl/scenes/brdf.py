@@ -101,7 +101,8 @@ def _blinn(u: np.ndarray, v: np.ndarray, exponent: float) -> np.ndarray:
 
 def _bin_means(vectors: np.ndarray, places: np.ndarray, exponent: float) -> np.ndarray:
     """p of directions (N, 3) averaged over each bin, (N, M)."""
-    return np.stack([_blinn(v, places, exponent).mean(axis=1) for v in vectors])
+    means = [_blinn(v, places, exponent).mean(axis=1) for v in vectors]
+    return np.reshape(means, (len(vectors), len(places)))
 
 
 def _symmetric_scale(matrix: np.ndarray) -> np.ndarray:

@@ -108,7 +108,7 @@ def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, Viewer]:
     """Walls, name, and who looks: the scene's viewer, or one at the camera who looks at the walls' middle."""
     if isinstance(room, Scene):
         return room.walls, f"glossy {room.name}", room.viewer
-    walls = tuple(room)
+    walls = tuple(room) if isinstance(room, Sequence) else ()
     if not walls or not all(isinstance(wall, Wall) for wall in walls):
         raise InputTypeError(f"room is {room!r}; it must be a scene, or one or more walls")
     if camera is None:
