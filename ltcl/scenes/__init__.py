@@ -7,5 +7,6 @@ from ltcl.scenes.box import box
 from ltcl.scenes.dihedral import dihedral
 from ltcl.scenes.landscape import landscape
 from ltcl.scenes.scene import Scene
+from ltcl.scenes.trihedral import trihedral
 
-__all__ = ["Scene", "box", "dihedral", "landscape"]
+__all__ = ["Scene", "box", "dihedral", "landscape", "trihedral"]

@@ -12,13 +12,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from ltcl import checks
 from ltcl.errors import InputError
+from ltcl.scenes.assembly import assemble
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
-from ltcl.scenes.walls import Wall, form_factors, spread_albedo
+from ltcl.scenes.walls import Wall
 
 WALLS = (
     Wall("left", corner=(1, 0, 1), right=(-1, 0, 0), down=(0, 0, -1)),
@@ -75,15 +74,4 @@ def box(n: int, sides: int = 6, albedo: Any = 0.7) -> Scene:
         raise InputError(f"sides is {sides}; it must be at most {len(WALLS)}")
     # From above a ceiling would show its back, and walls alone look best at eye level.
     viewer = _ABOVE if sides == 3 else _LEVEL
-    return cube_faces(f"box with {sides} side(s)", WALLS[:sides], n, albedo, viewer)
-
-
-def cube_faces(name: str, walls: tuple[Wall, ...], n: int, albedo: Any, viewer: Viewer) -> Scene:
-    """Scene of faces of the unit cube, n x n patches each; what `box` and `dihedral` share."""
-    n = checks.count("n", n)
-    pixels = n * n * len(walls)
-    # Form factors, transport, its copy for the device, and room to work.
-    checks.fits_host(f"{name}, {pixels} x {pixels}, with its transport,", 4 * 8 * pixels**2)
-    patches = spread_albedo(albedo, len(walls), n)
-    area = np.full(pixels, 1 / n**2)
-    return Scene(name, (n, len(walls) * n), form_factors(walls, n), patches, area, walls, viewer)
+    return assemble(f"box with {sides} side(s)", WALLS[:sides], n, albedo, viewer)

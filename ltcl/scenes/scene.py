@@ -16,7 +16,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes import exchange
+from ltcl.scenes import crossing, exchange
 from ltcl.scenes import viewer as viewing
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall, check_albedo
@@ -30,7 +30,7 @@ _LONGEST = 32766  # pixels along an image that OpenCV can still address
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Patches that light each other; made by `dihedral`, `box`, or from form factors of your own.
+    """Patches that light each other; made by `dihedral`, `trihedral`, `box`, or from own form factors.
 
     Parameters
     ----------
@@ -53,7 +53,8 @@ class Scene:
     ------
     InputError
         If shapes disagree, a value is NaN, infinite or negative, an albedo is not below 1, rows of the
-        form factors sum to more than 1, they break reciprocity, or the viewer sees no wall.
+        form factors sum to more than 1, they break reciprocity, two walls cut through each other, or the
+        viewer sees no wall.
 
     Examples
     --------
@@ -89,6 +90,7 @@ class Scene:
             object.__setattr__(self, name, value)
         check_albedo(self.albedo)
         exchange.check(self.form_factors, self.area)
+        crossing.refuse(self.walls)
         viewing.frame(self.viewer, self.walls)
 
     @property

@@ -23,7 +23,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Wall:
-    """A rectangle in space that carries part of a picture; z points up.
+    """A parallelogram in space that carries part of a picture; z points up.
 
     Parameters
     ----------
@@ -57,6 +57,11 @@ class Wall:
         """Unit normal of the side that carries the picture, (3,): down x right."""
         normal = np.cross(self.down, self.right).astype(np.float64)
         return normal / np.linalg.norm(normal)
+
+    @property
+    def area(self) -> float:
+        """Area of the parallelogram."""
+        return float(np.linalg.norm(np.cross(self.down, self.right)))
 
 
 def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
