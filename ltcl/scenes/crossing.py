@@ -31,14 +31,12 @@ def refuse(walls: Sequence[Wall]) -> None:
     >>> screen = Wall("screen", corner=(0.5, 0, 1), right=(0, 1, 0), down=(0, 0, -2))
     >>> refuse([floor, screen])
     Traceback (most recent call last):
-    ltcl.errors.InputError: walls 'floor' and 'screen' cut through each other; move or shorten one ...
+    ltcl.errors.InputError: walls 'floor' and 'screen' cut through each other; move or shorten one
     """
     for first, second in itertools.combinations(walls, 2):
         what = _overlap(_corners(first), _corners(second), same=bool(first.normal @ second.normal > 0))
         if what:
-            raise InputError(
-                f"walls {first.name!r} and {second.name!r} {what}; move or shorten one until they only touch"
-            )
+            raise InputError(f"walls {first.name!r} and {second.name!r} {what}; move or shorten one")
 
 
 def _corners(wall: Wall) -> np.ndarray:
@@ -51,7 +49,7 @@ def _overlap(first: np.ndarray, second: np.ndarray, same: bool) -> str:
     touch = _TOUCH * max(np.abs(np.diff(corners, axis=0)).max() for corners in (first, second))
     over, under = _heights(first, second), _heights(second, first)
     if same and max(np.abs(over).max(), np.abs(under).max()) <= touch:
-        return "lie on top of each other" if _cover(first, second, touch) else ""
+        return "lie on top of each other" if cover(first, second, touch) else ""
     if min(-over.min(), over.max(), -under.min(), under.max()) <= touch:
         return ""
     # Both planes are cut. On their common line each wall fills an interval.
@@ -80,11 +78,11 @@ def _span(corners: np.ndarray, height: np.ndarray, line: np.ndarray) -> tuple[fl
     return float(along.min()), float(along.max())
 
 
-def _cover(first: np.ndarray, second: np.ndarray, touch: float) -> bool:
-    """Whether walls in one plane overlap: no line along an edge of one parts them."""
+def cover(first: np.ndarray, second: np.ndarray, touch: float) -> bool:
+    """Whether convex outlines (4, 3) in one plane overlap: no line along an edge of one parts them."""
     normal = _normal(first)
     for corners in (first, second):
-        for edge in (corners[1] - corners[0], corners[3] - corners[0]):
+        for edge in np.roll(corners, -1, axis=0) - corners:
             across = np.cross(normal, edge) / np.linalg.norm(edge)
             one, other = first @ across, second @ across
             if min(one.max(), other.max()) - max(one.min(), other.min()) <= touch:

@@ -17,7 +17,7 @@ from ltcl.scenes import oblique
 from ltcl.scenes.assembly import assemble
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
-from ltcl.scenes.walls import Vector, Wall
+from ltcl.scenes.walls import Wall, vector
 
 
 def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
@@ -57,7 +57,7 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     angle = checks.number("angle", angle, above=0, below=120)
     edges = _edges(angle)
     middle = np.sum(edges, axis=0)
-    viewer = Viewer(_vector(middle / 3 + 3.3 * middle / np.linalg.norm(middle)), _vector(middle / 3))
+    viewer = Viewer(vector(middle / 3 + 3.3 * middle / np.linalg.norm(middle)), vector(middle / 3))
     return assemble(
         f"trihedral of {angle:g} degrees", _walls(*edges), n, albedo, viewer, oblique.form_factors
     )
@@ -78,12 +78,7 @@ def _edges(angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _walls(left: np.ndarray, right: np.ndarray, up: np.ndarray) -> tuple[Wall, Wall, Wall]:
     return (
-        Wall("left", corner=_vector(left + up), right=_vector(-left), down=_vector(-up)),
-        Wall("right", corner=_vector(up), right=_vector(right), down=_vector(-up)),
-        Wall("floor", corner=(0.0, 0.0, 0.0), right=_vector(right), down=_vector(left)),
+        Wall("left", corner=vector(left + up), right=vector(-left), down=vector(-up)),
+        Wall("right", corner=vector(up), right=vector(right), down=vector(-up)),
+        Wall("floor", corner=(0.0, 0.0, 0.0), right=vector(right), down=vector(left)),
     )
-
-
-def _vector(array: np.ndarray) -> Vector:
-    x, y, z = (float(v) for v in array)
-    return x, y, z

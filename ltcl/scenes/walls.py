@@ -21,6 +21,12 @@ from ltcl.scenes.form_factors import parallel, perpendicular
 Vector = tuple[float, float, float]
 
 
+def vector(array: np.ndarray) -> Vector:
+    """Three floats of an array (3,)."""
+    x, y, z = (float(v) for v in array)
+    return x, y, z
+
+
 @dataclass(frozen=True)
 class Wall:
     """A parallelogram in space that carries part of a picture; z points up.
