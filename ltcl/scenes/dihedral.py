@@ -38,7 +38,7 @@ def dihedral(n: int, albedo: Any = 0.7) -> Scene:
 
     Notes
     -----
-    Figure 9 of the paper. Exact form factors, see `ltcl.scenes.form_factors`.
+    Figure 9 of the paper. Exact form factors, see `ltcl.scenes.cube_tables`.
 
     Examples
     --------
