@@ -5,8 +5,21 @@ from __future__ import annotations
 
 from ltcl.scenes.box import box
 from ltcl.scenes.dihedral import dihedral
+from ltcl.scenes.form_factor import FormFactor
 from ltcl.scenes.landscape import landscape
+from ltcl.scenes.patches import Patches, cut
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.trihedral import trihedral
+from ltcl.scenes.visibility import visibility
 
-__all__ = ["Scene", "box", "dihedral", "landscape", "trihedral"]
+__all__ = [
+    "FormFactor",
+    "Patches",
+    "Scene",
+    "box",
+    "cut",
+    "dihedral",
+    "landscape",
+    "trihedral",
+    "visibility",
+]

@@ -62,7 +62,7 @@ def box(n: int, sides: int = 6, albedo: Any = 0.7) -> Scene:
 
     Notes
     -----
-    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.form_factors`.
+    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.cube_tables`.
 
     Examples
     --------

@@ -45,7 +45,7 @@ def dihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
 
     Notes
     -----
-    Figure 9 of the paper. Exact form factors, see `ltcl.scenes.form_factors` for the right angle and
+    Figure 9 of the paper. Exact form factors, see `ltcl.scenes.cube_tables` for the right angle and
     `ltcl.scenes.oblique` for others.
 
     Examples

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ltcl.scenes.contours import clip, exchange, outline
-from ltcl.scenes.form_factors import parallel, perpendicular
+from ltcl.scenes.cube_tables import parallel, perpendicular
 
 X, Y, Z = np.eye(3)
 
