@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from ltcl.scenes.blocks import Block
 from ltcl.scenes.box import box
 from ltcl.scenes.dihedral import dihedral
 from ltcl.scenes.form_factor import FormFactor
@@ -13,6 +14,7 @@ from ltcl.scenes.trihedral import trihedral
 from ltcl.scenes.visibility import visibility
 
 __all__ = [
+    "Block",
     "FormFactor",
     "Patches",
     "Scene",

@@ -71,7 +71,7 @@ class Block:
         return np.all((points > self.low) & (points < self.high), axis=-1)
 
     def blocks(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Whether the straight ways from points `start` (..., 3) to `end` (3,) pass through it, (...) bool.
+        """Whether the straight ways from points `start` to `end`, both (..., 3), pass through it, (...) bool.
 
         A way along a face, or one that ends there, passes.
         """

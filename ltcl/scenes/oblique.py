@@ -9,7 +9,7 @@ for walls that meet, n^2 for walls that face each other.
 
 A pair farther apart than it is large takes Gauss-Legendre points on both patches: the kernel is smooth
 there and every term positive. Nearer pairs, and those where the plane of one patch cuts the other,
-take the integral over both outlines, see `contours`. Tests hold both to 1e-9 of the closed forms at right
+take the integral over both outlines, see `contours`. Tests hold both to 1e-7 of the closed forms at right
 angles, and closed rooms of slanted walls to rows that sum to 1. Both ways of a pair come from one number,
 so reciprocity is exact.
 
@@ -27,11 +27,11 @@ from ltcl import checks
 from ltcl.scenes import contours
 from ltcl.scenes.walls import Wall
 
-_TIERS = ((8.0, 4), (3.0, 6), (1.5, 10))
+_TIERS = ((12.0, 3), (4.0, 4), (2.5, 5), (2.0, 6), (1.5, 8))
 """Distance of the centres in radii of both patches from which on so many points a side are enough."""
 
 _TOUCH = 1e-12  # of the patches' size: heights above a plane that are rounding errors
-_SLAB = 1 << 22  # pairs of quadrature points at a time
+_SLAB = 1 << 18  # pairs of quadrature points at a time, so that they stay in the cache
 
 
 def exchange(first: Wall, second: Wall, n: int) -> np.ndarray:
@@ -84,14 +84,17 @@ def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
     """
     size = n * n * len(walls)
     checks.fits_host(f"a {size} x {size} matrix of form factors", 8 * size**2)
-    matrix = np.zeros((size, size))
-    blocks = matrix.reshape(n, len(walls), n, n, len(walls), n)
-    area = [wall.area / n**2 for wall in walls]
+    matrix = np.zeros((n, len(walls), n, n, len(walls), n))
     for i, j in itertools.combinations(range(len(walls)), 2):
-        both = exchange(walls[i], walls[j], n)
-        blocks[:, i, :, :, j, :] = both / area[i]
-        blocks[:, j, :, :, i, :] = both.transpose(2, 3, 0, 1) / area[j]
-    return matrix
+        fill(matrix, walls, n, i, j)
+    return matrix.reshape(size, size)
+
+
+def fill(matrix: np.ndarray, walls: Sequence[Wall], n: int, i: int, j: int) -> None:
+    """Write the form factors between walls i and j, both ways, in a matrix (n, walls, n, n, walls, n)."""
+    both = exchange(walls[i], walls[j], n) * n**2
+    matrix[:, i, :, :, j, :] = both / walls[i].area
+    matrix[:, j, :, :, i, :] = both.transpose(2, 3, 0, 1) / walls[j].area
 
 
 def _offset_code(first: np.ndarray, second: np.ndarray, n: int) -> np.ndarray:

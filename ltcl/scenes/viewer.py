@@ -191,7 +191,8 @@ def _hit(homography: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
     """Where on a wall points of the image plane (..., 3) lie, (..., 2), and 1 / depth there; 0 beside it."""
     place = points @ np.linalg.inv(homography).T
     nearness = place[..., 2]
-    place = place[..., :2] / nearness[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # where the wall's plane lies edge-on
+        place = place[..., :2] / nearness[..., None]
     inside = np.all((place >= -_EDGE) & (place <= 1 + _EDGE), axis=-1)
     return place, np.where(inside, nearness, 0)
 

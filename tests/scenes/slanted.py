@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ltcl.scenes.blocks import Block
 from ltcl.scenes.walls import Wall
 
 
@@ -20,7 +21,9 @@ def closed_room(*edges: tuple[float, float, float]) -> list[Wall]:
     return walls
 
 
-def sampled_exchange(first: Wall, second: Wall, samples: int) -> tuple[float, float]:
+def sampled_exchange(
+    first: Wall, second: Wall, samples: int, block: Block | None = None
+) -> tuple[float, float]:
     """a_i F_ij between whole walls by random pairs of points, and its standard error."""
     rng = np.random.default_rng(0)
     x, y = (
@@ -31,4 +34,6 @@ def sampled_exchange(first: Wall, second: Wall, samples: int) -> tuple[float, fl
     r2 = np.einsum("ki,ki->k", ray, ray)
     kernel = np.maximum(ray @ first.normal, 0) * np.maximum(-ray @ second.normal, 0) / (np.pi * r2**2)
     kernel *= first.area * second.area
+    if block is not None:
+        kernel[block.blocks(x, y)] = 0
     return float(kernel.mean()), float(kernel.std() / np.sqrt(samples))
