@@ -21,11 +21,14 @@ RTOL = 1e-2  # residual at which a solve counts as done
 
 
 def coloured_box(n: int) -> tuple[Scene, np.ndarray]:
-    """The box, n x n patches a wall, seen through its front wall, and its direct light l_d, (3, N)."""
-    scene = replace(
-        box(n, sides=6, albedo=ALBEDO), viewer=Viewer(eye=(2.36, 0.5, 0.52), target=(0, 0.5, 0.52))
-    )
+    """The closed box, n x n patches a wall, and its direct light l_d, (3, N)."""
+    scene = from_the_front(box(n, sides=6, albedo=ALBEDO))
     return scene, scene.albedo * np.broadcast_to(np.array(LIGHT)[:, None], (n, 6, n)).reshape(-1)
+
+
+def from_the_front(scene: Scene) -> Scene:
+    """The scene seen through its sixth wall, the red one on the left and the green one on the right."""
+    return replace(scene, viewer=Viewer(eye=(2.36, 0.5, 0.52), target=(0, 0.5, 0.52)))
 
 
 def bounce(scene: Scene, light: np.ndarray) -> np.ndarray:

@@ -151,7 +151,8 @@ def draw_parts(figure: Figure, parts: Parts, top: float, text: str) -> None:
     figures.label_at(figure, lefts[-1], top - 22, text, size=10, color=figures.FAINT, linespacing=1.5)
     for k, (left, bounce) in enumerate(zip(lefts, parts.separation.bounces, strict=True), start=1):
         own = 0.9 / np.quantile(bounce, 0.999)
-        seen, note = figures.light(parts.scene, bounce, own), f"shown \u00d7 {float(f'{own / gain:.2g}'):g}"
+        times = float(f"{own / gain:.2g}")
+        seen, note = figures.light(parts.scene, bounce, own), f"\u00d7 {times:g}, error {parts.off[k]:.1g}"
         figures.picture(figure, (left, top + 196, width), seen, f"bounce {k}", note)
 
 
@@ -161,7 +162,7 @@ def draw(plain: Parts, board: Parts) -> Figure:
         965,
         "Figure 9: a picture taken apart into its bounces of light",
         "A corner of white walls, green light cast on the left one only. From one picture and the measured",
-        "transport: the direct light, all the rest together, and every bounce of it.",
+        "transport: the direct light, all the rest together, and every bounce of it, brighter as told.",
     )
     text = "Bounces light the two\nwalls in turn, as they\nmust: no wall sees itself."
     draw_parts(figure, plain, 130, text)
