@@ -89,10 +89,11 @@ def glossy(
     walls, name, viewer = _room(room, camera)
     blocks, boxes = _blocks(room, blocks)
     n, k = checks.count("n", n), hemisphere.side(directions)
+    size, slots = n * n * len(walls), k * k + 1
+    needed = 8 * size * slots**2 + 4 * 8 * size**2  # reflectances; form factors and room to work
+    checks.fits_host(f"{name}, {size} patches of {slots} x {slots} reflectances,", needed)
     albedos = spread_albedo(albedo, len(walls), n)
     materials = _materials(gloss, exponent, len(walls), k)
-    size, slots = n * n * len(walls), k * k + 1
-    checks.fits_host(f"{name}, {size} patches of {slots} x {slots} reflectances,", 8 * size * slots**2)
     patches = cut(walls, n)
     lights = sight("projector", projector, walls, patches, boxes)
     sees = sight("camera", viewer.eye if camera is None else camera, walls, patches, boxes)

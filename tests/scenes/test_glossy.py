@@ -80,6 +80,7 @@ def test_adjoint_of_the_bounce(scene: GlossyScene) -> None:
 def test_bounces_add_up_to_the_picture_and_follow_equation_29(scene: GlossyScene) -> None:
     pattern = np.random.default_rng(1).random(scene.grid)
     bounces = scene.bounces(pattern, 40)
+    assert bounces.dtype == np.float64
     (T,) = scene.matrices()
     assert bounces.sum(axis=0).ravel() == pytest.approx(T @ pattern.ravel(), rel=1e-6)
     light = scene.K @ (scene.Q @ pattern.ravel())
