@@ -30,6 +30,7 @@ import scipy.stats
 
 from ltcl import checks
 from ltcl.scenes import directions as hemisphere
+from ltcl.scenes.geometry import check_blocks
 from ltcl.scenes.patches import Patches, cut
 from ltcl.scenes.rays import cast
 from ltcl.scenes.walls import Wall
@@ -53,7 +54,7 @@ def exchange(
     rays : int
         Followed from each beam.
     blocks : array_like, (B, 2, 3)
-        Opaque black boxes, see `ltcl.scenes.rays`.
+        Opaque boxes along the axes, lowest and highest corner.
     seed : int
         Of the rays' places.
 
@@ -72,7 +73,7 @@ def exchange(
     ((384, 384), True)
     """
     k, rays = hemisphere.side(directions), checks.count("rays", rays)
-    seed = checks.count("seed", seed, least=0)
+    seed, boxes = checks.count("seed", seed, least=0), check_blocks(blocks)
     patches = cut(walls, n)
     beams = len(patches) * k * k
     checks.fits_host(f"an exchange of {beams} beams by {rays} rays each", _BYTES * beams * rays)
@@ -82,7 +83,7 @@ def exchange(
     generator = np.random.default_rng(seed)
     for start in range(0, len(patches), step):
         some = np.arange(start, min(start + step, len(patches)))
-        met = met + _met(walls, n, patches, some, _places(len(some), k, rays, generator), blocks)
+        met = met + _met(walls, n, patches, some, _places(len(some), k, rays, generator), boxes)
     E = scipy.sparse.diags_array(share / rays) @ met
     settled = _settle((E + E.T) / 2, share, lost=share - E.sum(axis=1))
     return scipy.sparse.csr_array(scipy.sparse.diags_array(1 / share) @ settled)

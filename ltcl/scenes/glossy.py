@@ -13,12 +13,13 @@ from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.scenes import beams, brdf
 from ltcl.scenes import directions as hemisphere
+from ltcl.scenes.blocks import Block, point
 from ltcl.scenes.light_field import GlossyScene
 from ltcl.scenes.patches import cut
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.sight import Sight, sight
 from ltcl.scenes.viewer import Viewer
-from ltcl.scenes.walls import Wall, spread_albedo
+from ltcl.scenes.walls import Wall, spread_albedo, vector
 
 
 def glossy(
@@ -32,7 +33,7 @@ def glossy(
     camera: Any = None,
     directions: int = 64,
     rays: int = 64,
-    blocks: Any = (),
+    blocks: Sequence[Block] = (),
     seed: int = 0,
 ) -> GlossyScene:
     """A room of glossy walls, n x n patches each, with the place of one projector and one camera.
@@ -40,7 +41,8 @@ def glossy(
     Parameters
     ----------
     room : Scene or sequence of Wall
-        The walls of a scene, or any walls: faces of a glossy block stand among them as walls of their own.
+        The walls and blocks of a scene, or any walls. The faces of a block reflect where they are among the
+        walls, as in ``box(1, sides=3, occluder=Block(..., albedo=0.5))``.
     n : int
         Patches along each side of a wall.
     albedo : array_like in [0, 1)
@@ -55,8 +57,8 @@ def glossy(
         Bins over each patch, M: a square number of at least 4.
     rays : int
         Followed from each bin of each patch.
-    blocks : array_like, (B, 2, 3)
-        Opaque black boxes, lowest and highest corner.
+    blocks : sequence of Block
+        What else stands in the room. Faces that are not among the walls are black.
     seed : int
         Of the rays.
 
@@ -85,18 +87,20 @@ def glossy(
     ((3, 9), 16, (27, 459))
     """
     walls, name, viewer = _room(room, camera)
+    blocks, boxes = _blocks(room, blocks)
     n, k = checks.count("n", n), hemisphere.side(directions)
+    size, slots = n * n * len(walls), k * k + 1
+    needed = 8 * size * slots**2 + 4 * 8 * size**2  # reflectances; form factors and room to work
+    checks.fits_host(f"{name}, {size} patches of {slots} x {slots} reflectances,", needed)
     albedos = spread_albedo(albedo, len(walls), n)
     materials = _materials(gloss, exponent, len(walls), k)
-    size, slots = n * n * len(walls), k * k + 1
-    checks.fits_host(f"{name}, {size} patches of {slots} x {slots} reflectances,", 8 * size * slots**2)
     patches = cut(walls, n)
-    lights = sight("projector", projector, walls, patches, blocks)
-    sees = sight("camera", viewer.eye if camera is None else camera, walls, patches, blocks)
-    exchange = beams.exchange(walls, n, directions, rays, blocks, seed)
+    lights = sight("projector", projector, walls, patches, boxes)
+    sees = sight("camera", viewer.eye if camera is None else camera, walls, patches, boxes)
+    exchange = beams.exchange(walls, n, directions, rays, boxes, seed)
     form_factors = _form_factors(exchange, patches.area)
     return GlossyScene(
-        Scene(name, (n, n * len(walls)), form_factors, albedos, patches.area, walls, viewer),
+        Scene(name, (n, n * len(walls)), form_factors, albedos, patches.area, walls, viewer, blocks),
         _with_slots(exchange, slots),
         _reflectance(n, materials, lights, sees),
         P=_last_slots((sees.share > 0).astype(np.float64), slots),
@@ -113,10 +117,17 @@ def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, Viewer]:
         raise InputTypeError(f"room is {room!r}; it must be a scene, or one or more walls")
     if camera is None:
         raise InputError("camera is None; it must be a place (x, y, z) where room is walls only")
-    x, y, z = checks.shape("camera", checks.finite("camera", checks.real("camera", camera)), (3,)).tolist()
-    middle_x, middle_y, middle_z = cut(walls, 1).centre.mean(axis=0).tolist()
-    viewer = Viewer((x, y, z), (middle_x, middle_y, middle_z))
+    viewer = Viewer(point("camera", camera), vector(cut(walls, 1).centre.mean(axis=0)))
     return walls, f"glossy room of {len(walls)} wall(s)", viewer
+
+
+def _blocks(room: Any, more: Any) -> tuple[tuple[Block, ...], np.ndarray]:
+    """All blocks, and their corners (B, 2, 3)."""
+    given = tuple(more) if isinstance(more, Sequence) else (more,)
+    if not all(isinstance(block, Block) for block in given):
+        raise InputTypeError(f"blocks is {more!r}; it must be a sequence of ltcl.scenes.Block")
+    every = (*(room.blocks if isinstance(room, Scene) else ()), *given)
+    return every, np.array([(block.low, block.high) for block in every]).reshape(-1, 2, 3)
 
 
 def _materials(gloss: Any, exponent: Any, walls: int, k: int) -> list[tuple[float, brdf.Lobe]]:

@@ -54,6 +54,15 @@ class GlossyScene:
         What the camera sees; 0 for patches hidden from it.
     Q : csr_array, (N (M + 1), N)
         Light of the projector; the part of each patch that is not in shadow.
+
+    Examples
+    --------
+    >>> from ltcl.scenes import dihedral, glossy
+    >>> scene = glossy(dihedral(2), 2, albedo=0.5, gloss=0.3, projector=(2, 1.5, 0.6), directions=16)
+    >>> light = scene.K @ (scene.Q @ np.ones(8))  # F Q l_in
+    >>> first_bounce = scene.P @ (scene.A @ light)
+    >>> bool(np.allclose(first_bounce, scene.bounces(np.ones(scene.grid), 1)[1].ravel()))
+    True
     """
 
     matte: Scene
@@ -171,7 +180,7 @@ class GlossyScene:
 
         Returns
         -------
-        ndarray, (count + 1, ...), float32
+        ndarray, (count + 1, ...), float64
             One after another, as `ltcl.relight` shapes pictures.
 
         Raises

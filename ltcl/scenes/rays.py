@@ -10,16 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ltcl import checks
-from ltcl.errors import InputError
 from ltcl.scenes.walls import Wall
 
 _EDGE = 1e-9  # of a wall's side: rays that aim at a seam must not slip through it
 _START = 1e-9  # of a ray's length: a ray does not meet the surface it starts from
+_FACE = 1e-9  # of a ray's length: walls are in front of the face of a block that they lie on
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +40,12 @@ class Hits:
     distance: np.ndarray
 
 
-def cast(walls: Sequence[Wall], origins: np.ndarray, directions: np.ndarray, blocks: Any = ()) -> Hits:
+def cast(
+    walls: Sequence[Wall],
+    origins: np.ndarray,
+    directions: np.ndarray,
+    blocks: Sequence[np.ndarray] | np.ndarray = (),
+) -> Hits:
     """Follow rays to the nearest wall or block.
 
     Parameters
@@ -50,8 +53,9 @@ def cast(walls: Sequence[Wall], origins: np.ndarray, directions: np.ndarray, blo
     walls : sequence of Wall
     origins, directions : ndarray, (R, 3)
         Directions need not be unit vectors.
-    blocks : array_like, (B, 2, 3)
-        Opaque axis-aligned boxes: lowest and highest corner.
+    blocks : ndarray, (B, 2, 3)
+        Opaque boxes along the axes, lowest and highest corner, as `ltcl.scenes.geometry.check_blocks` returns
+        them. Walls on their faces reflect.
 
     Examples
     --------
@@ -60,36 +64,17 @@ def cast(walls: Sequence[Wall], origins: np.ndarray, directions: np.ndarray, blo
     >>> hits = cast([floor], np.array([[0.25, 0.5, 2.0]]), down)
     >>> int(hits.wall[0]), float(hits.u[0]), float(hits.v[0]), float(hits.distance[0])
     (0, 0.5, 0.25, 2.0)
-    >>> int(cast([floor], np.array([[0.25, 0.5, 2.0]]), down, [[(0, 0, 1), (1, 1, 1.5)]]).wall[0])
+    >>> block = np.array([[(0, 0, 1), (1, 1, 1.5)]])
+    >>> int(cast([floor], np.array([[0.25, 0.5, 2.0]]), down, block).wall[0])
     -1
     """
     rays = len(origins)
     found = Hits(np.full(rays, -1), np.zeros(rays), np.zeros(rays), np.full(rays, np.inf))
     for number, wall in enumerate(walls):
         _meet_wall(found, number, wall, origins, directions)
-    for low, high in check_blocks(blocks):
+    for low, high in blocks:
         _meet_block(found, low, high, origins, directions)
     return found
-
-
-def check_blocks(blocks: Any) -> np.ndarray:
-    """The blocks as (B, 2, 3) float64.
-
-    Raises
-    ------
-    InputError
-        If the shape is another, a value is not finite, or a block has no volume.
-    """
-    boxes = checks.finite("blocks", checks.real("blocks", blocks)).astype(np.float64)
-    boxes = boxes.reshape(0, 2, 3) if boxes.size == 0 else boxes
-    checks.shape("blocks", boxes, (len(boxes), 2, 3))
-    flat = np.flatnonzero((boxes[:, 1] <= boxes[:, 0]).any(axis=1))
-    if len(flat):
-        low, high = boxes[flat[0]].tolist()
-        raise InputError(
-            f"blocks[{flat[0]}] goes from {low} to {high}; the second corner must be above in x, y and z"
-        )
-    return boxes
 
 
 def _meet_wall(found: Hits, number: int, wall: Wall, origins: np.ndarray, directions: np.ndarray) -> None:
@@ -116,10 +101,10 @@ def _meet_block(
     """Enter the rays that meet this block first: the method of slabs."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.stack([(low - origins) / directions, (high - origins) / directions])
-    # Rays that run within a face give 0 / 0: they graze the block and pass.
     enter, leave = np.min(ends, axis=0).max(axis=1), np.max(ends, axis=0).min(axis=1)
     with np.errstate(invalid="ignore"):
-        met = (enter < leave) & (leave > _START) & (enter < found.distance)
+        # Rays that run within a face give 0 / 0: they graze the block and pass.
+        met = (enter < leave) & (leave > _START) & (enter < found.distance * (1 - _FACE))
     found.distance[met] = np.maximum(enter[met], 0.0)
     found.wall[met] = -1
-    found.u[met] = found.v[met] = 0.0
+    found.u[met], found.v[met] = 0.0, 0.0

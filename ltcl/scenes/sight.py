@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import checks
 from ltcl.errors import InputError
+from ltcl.scenes.blocks import point
+from ltcl.scenes.geometry import check_blocks
 from ltcl.scenes.patches import Patches
-from ltcl.scenes.rays import cast, check_blocks
+from ltcl.scenes.rays import cast
 from ltcl.scenes.walls import Wall
 
 _POINTS = 4  # along a patch
@@ -35,8 +36,8 @@ class Sight:
     share: np.ndarray
 
 
-def sight(name: str, point: Any, walls: Sequence[Wall], patches: Patches, blocks: Any = ()) -> Sight:
-    """What a projector or camera at `point` (3,) sees of the patches of walls.
+def sight(name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks: Any = ()) -> Sight:
+    """What a projector or camera that stands at `stand` (3,) sees of the patches of walls.
 
     Raises
     ------
@@ -52,16 +53,15 @@ def sight(name: str, point: Any, walls: Sequence[Wall], patches: Patches, blocks
     >>> seen.towards.tolist(), seen.share.tolist()
     ([[0.0, 0.0, 1.0]], [1.0])
     """
-    place = checks.finite(name, checks.real(name, point)).astype(np.float64)
-    checks.shape(name, place, (3,))
-    _refuse_inside(name, place, walls, blocks)
+    place, boxes = np.array(point(name, stand)), check_blocks(blocks)
+    _refuse_inside(name, place, walls, boxes)
     towards = place - patches.centre
     towards = np.einsum("nij,nj->ni", patches.frames, towards / np.linalg.norm(towards, axis=1)[:, None])
     step = (np.arange(_POINTS) + 0.5) / _POINTS - 0.5
     v, u = (part.ravel()[:, None] for part in np.meshgrid(step, step, indexing="ij"))
     origins = patches.centre[:, None] + u * patches.right[:, None] + v * patches.down[:, None]
     origins = origins.reshape(-1, 3)
-    free = cast(walls, origins, place - origins, blocks).distance >= 1.0
+    free = cast(walls, origins, place - origins, boxes).distance >= 1.0
     share = np.where(towards[:, 2] > 0, free.reshape(len(patches), -1).mean(axis=1), 0.0)
     if not share.any():
         raise InputError(
@@ -71,13 +71,13 @@ def sight(name: str, point: Any, walls: Sequence[Wall], patches: Patches, blocks
     return Sight(towards, share)
 
 
-def _refuse_inside(name: str, place: np.ndarray, walls: Sequence[Wall], blocks: Any) -> None:
+def _refuse_inside(name: str, place: np.ndarray, walls: Sequence[Wall], blocks: np.ndarray) -> None:
     for wall in walls:
         edges = np.stack([wall.right, wall.down, wall.normal], axis=1).astype(np.float64)
         u, v, height = np.linalg.solve(edges, place - wall.corner)
         if abs(height) <= _NEAR * np.linalg.norm(wall.right) and 0 <= u <= 1 and 0 <= v <= 1:
             raise InputError(f"{name} is at {_text(place)}, on the wall {wall.name!r}; it must stand off it")
-    for low, high in check_blocks(blocks):
+    for low, high in blocks:
         if ((place >= low) & (place <= high)).all():
             raise InputError(f"{name} is at {_text(place)}, in a block; it must stand outside")
 

@@ -16,13 +16,13 @@ import ltcl
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.reciprocity import defect
-from ltcl.scenes import GlossyScene, box, dihedral, glossy
+from ltcl.scenes import Block, GlossyScene, box, dihedral, glossy, trihedral
 from ltcl.scenes.box import WALLS
 from ltcl.scenes.brdf import lobe
 from ltcl.scenes.walls import Wall
 
 PROJECTOR, CAMERA = (1.5, 0.9, 0.8), (0.8, 1.6, 0.4)
-BLOCK = ((0.3, 0.3, 0.0), (0.6, 0.6, 0.4))
+BLOCK = Block(corner=(0.3, 0.3, 0.0), size=(0.3, 0.3, 0.4), albedo=0.5)
 
 
 def corner(n: int = 3, gloss: Any = 0.6, exponent: Any = 10, **options: Any) -> GlossyScene:
@@ -80,6 +80,7 @@ def test_adjoint_of_the_bounce(scene: GlossyScene) -> None:
 def test_bounces_add_up_to_the_picture_and_follow_equation_29(scene: GlossyScene) -> None:
     pattern = np.random.default_rng(1).random(scene.grid)
     bounces = scene.bounces(pattern, 40)
+    assert bounces.dtype == np.float64
     (T,) = scene.matrices()
     assert bounces.sum(axis=0).ravel() == pytest.approx(T @ pattern.ravel(), rel=1e-6)
     light = scene.K @ (scene.Q @ pattern.ravel())
@@ -179,20 +180,45 @@ def test_compensation_is_exact_of_glossy_scenes(scene: GlossyScene) -> None:
 
 
 def test_glossy_block_casts_a_shadow_and_shows_a_highlight() -> None:
-    """Faces of a block as walls of their own size; what it hides is dark."""
-    (x0, y0, _), (x1, y1, top) = BLOCK
-    lid = Wall("lid", corner=(x0, y0, top), right=(0, y1 - y0, 0), down=(x1 - x0, 0, 0))
-    inside = [[(x0, y0, 0), (x1, y1, top - 1e-6)]]
-    walls = (WALLS[0], WALLS[1], WALLS[2], lid)
-    place: dict[str, Any] = {"projector": (1.9, 1.9, 1.5), "camera": (1.5, 1.5, 1.9)}
-    room = glossy(walls, 5, 0.5, [0, 0, 0, 0.8], 100, **place, blocks=inside, directions=36, rays=16)
-    direct = room.picture(room.first_bounce)
-    assert direct[1, 10 + 1] == 0  # the floor behind the block
-    assert direct[4, 10 + 4] == pytest.approx(0.5)
+    """Faces of a block are walls of their own size; what the block hides is dark."""
+    cube = box(1, sides=3, occluder=BLOCK)
+    gloss = [0.8 if wall.name.startswith("block") else 0.0 for wall in cube.walls]
+    place: dict[str, Any] = {"projector": (0.9, 0.2, 1.4), "camera": (0.15, 0.75, 1.4)}
+    room = glossy(cube, 5, 0.5, gloss, 100, **place, directions=36, rays=16)
+    direct = room.picture(room.first_bounce).reshape(5, len(cube.walls), 5)
+    names = [wall.name for wall in cube.walls]
+    floor, top = direct[:, names.index("floor")], direct[:, names.index("block top")]
+    assert floor[2, 2] == 0  # below the block
+    assert floor[4, 4] == pytest.approx(0.5)
+    assert (direct[:, names.index("block -x")] == 0).all()
+    assert top.max() > 20 * 0.5 * (1 - 0.8)  # of the matte part
+    # Halfway between projector and camera, which are as high above it.
+    assert np.unravel_index(np.argmax(top), top.shape) == (3, 2)
     T = room.transport(room.first_bounce, on_dark="mask")
     assert T.masked.sum() == (direct == 0).sum() > 0
-    assert room.matte.area.reshape(5, 4, 5)[0, 3, 0] == pytest.approx(0.3**2 / 25)
-    assert room.view(direct, size=64).max() > 0
+    assert room.matte.area.reshape(direct.shape)[0, names.index("block top"), 0] == pytest.approx(0.3**2 / 25)
+    assert room.matte.blocks == (BLOCK,)
+
+
+def test_black_block_takes_light_away() -> None:
+    options: dict[str, Any] = {"projector": PROJECTOR, "camera": CAMERA, "directions": 16, "rays": 16}
+    free = glossy(WALLS[:3], 4, **options)
+    beside = glossy(WALLS[:3], 4, blocks=[BLOCK], **options)
+    of_scene = glossy(box(1, sides=3, occluder=Block(BLOCK.corner, BLOCK.size)), 4, **options)
+    assert (of_scene.matrices()[0] == beside.matrices()[0]).all()
+    lost = free.matte.form_factors.sum(axis=1) - beside.matte.form_factors.sum(axis=1)
+    assert lost.max() > 0.1
+    assert (beside.first_bounce == 0).sum() > 0
+    with pytest.raises(InputTypeError, match=r"blocks is .* it must be a sequence of ltcl.scenes.Block"):
+        glossy(WALLS[:3], 4, blocks=cast(Any, [[(0, 0, 0), (1, 1, 1)]]), **options)
+
+
+def test_walls_at_any_angle() -> None:
+    """Form factors of slanted rhombs by rays, beside the exact ones of `trihedral`."""
+    sharp = trihedral(3, angle=70)
+    room = glossy(sharp, 3, projector=sharp.viewer.eye, directions=16, rays=256)
+    error = np.linalg.norm(room.matte.form_factors - sharp.form_factors)
+    assert error < 0.03 * np.linalg.norm(sharp.form_factors)
 
 
 def test_scene_and_walls_make_the_same_room() -> None:

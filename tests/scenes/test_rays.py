@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from ltcl.errors import InputError
+from ltcl.scenes.blocks import Block
 from ltcl.scenes.box import WALLS
-from ltcl.scenes.rays import cast, check_blocks
+from ltcl.scenes.rays import cast
 from ltcl.scenes.walls import Wall
 
 FLOOR = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
@@ -65,7 +63,7 @@ def test_nearest_of_many_walls_wins_whatever_their_order() -> None:
 
 
 def test_blocks_stop_rays() -> None:
-    block = [[(0.4, 0.4, 0.2), (0.6, 0.6, 0.5)]]
+    block = np.array([[(0.4, 0.4, 0.2), (0.6, 0.6, 0.5)]])
     origins = np.array([[0.5, 0.5, 1], [0.5, 0.5, 0.1], [0.1, 0.5, 1], [0.5, 0.5, 0.3], [0.4, 0.5, 1.0]])
     down = np.broadcast_to([0.0, 0.0, -1.0], (5, 3))
     hits = cast([FLOOR], origins, down, block)
@@ -73,14 +71,16 @@ def test_blocks_stop_rays() -> None:
     assert hits.distance == pytest.approx([0.5, 0.1, 1, 0, 1])
 
 
-@pytest.mark.parametrize(
-    ("blocks", "part"),
-    [
-        ([[(0, 0, 0), (1, 1, 0)]], r"blocks\[0\] goes from .* the second corner must be above"),
-        ([(0, 0, 0), (1, 1, 1)], "blocks has shape"),
-        ([[(0, 0, 0), (1, 1, np.nan)]], "NaN"),
-    ],
-)
-def test_bad_blocks_are_refused(blocks: Any, part: str) -> None:
-    with pytest.raises(InputError, match=part):
-        check_blocks(blocks)
+def test_wall_on_the_face_of_a_block_is_in_front_of_it() -> None:
+    block = Block(corner=(0.1, 0.2, 0.0), size=(0.3, 0.7, 0.3))
+    rng = np.random.default_rng(4)
+    origins = rng.uniform(-2, 3, (2000, 3))
+    origins = origins[~block.covers(origins)]
+    aims = rng.uniform(block.low, block.high, (len(origins), 3))
+    corners = np.array([(block.low, block.high)])
+    hits = cast(block.faces(), origins, aims - origins, corners)
+    assert (hits.wall >= 0).all()
+    alone = cast((), origins, aims - origins, corners)
+    assert hits.distance == pytest.approx(alone.distance)
+    away = cast(block.faces(), origins + hits.distance[:, None] * (aims - origins), origins - aims, corners)
+    assert np.isinf(away.distance).all()

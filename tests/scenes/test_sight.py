@@ -52,9 +52,9 @@ def test_walls_hide_each_other_from_both_sides() -> None:
         ((0.5, 0.5, 0), "projector is at (0.5, 0.5, 0), on the wall 'floor'; it must stand off it"),
         ((0.5, 0.5, -1), "projector is at (0.5, 0.5, -1), where it faces none of 1 wall(s) in plain view"),
         ((3, 3, 3.5), "projector is at (3, 3, 3.5), in a block; it must stand outside"),
-        ((1, 2), "projector has shape (2,); it must be (3,)"),
-        ((1, 2, np.nan), "projector has 1 NaN"),
-        ("here", "projector holds"),
+        ((1, 2), "projector is (1, 2); it must be three finite numbers (x, y, z)"),
+        ((1, 2, np.nan), "it must be three finite numbers (x, y, z)"),
+        ("here", "projector is 'here'; it must be three numbers (x, y, z)"),
     ],
 )
 def test_bad_places_are_refused_in_one_line(point: Any, part: str) -> None:
