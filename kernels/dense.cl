@@ -15,10 +15,7 @@
 #include "common/lanes.h"
 #include "common/reduce.h"
 #include "common/row_sums.h"
-
-#ifndef LANES
-#error "dense.cl needs -DLANES=<columns one item of dense_rmatvec sums: 1 or 8>"
-#endif
+#include "common/stretch.h"
 
 kernel void dense_matvec(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
@@ -74,14 +71,6 @@ kernel void dense_matvec_group(
             LTCL_STORE(out, i + c, total, scale, adds, add);
     }
 }
-
-#if LANES == 8
-typedef real8 stretch;
-#define LOAD_STRETCH(a) LOAD8(a)
-#else
-typedef real stretch;
-#define LOAD_STRETCH(a) (*(a))
-#endif
 
 typedef union {
     stretch vector;

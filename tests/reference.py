@@ -148,6 +148,67 @@ def southwell_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray,
     )
 
 
+def form_factor_pair(p: np.ndarray, q: np.ndarray, n: np.ndarray, m: np.ndarray) -> np.ndarray:
+    """cos cos / (pi r^2) of all points p (M, 3) with normals n and points q (N, 3) with normals m: (M, N)."""
+    d = q[None] - p[:, None]
+    r2 = (d**2).sum(axis=2)
+    here, there = np.einsum("mnc,mc->mn", d, n), -np.einsum("mnc,nc->mn", d, m)
+    faces = (here > 1e-6) & (there > 1e-6)
+    return np.divide(here * there, np.pi * r2**2, out=np.zeros_like(r2), where=faces)
+
+
+def form_factor_entries(geometry: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6)."""
+    centre, right, down, normal = (geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4))
+    angle = np.arange(8) * np.pi / 4
+    place = np.sqrt(2 / 3) / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # on a circle, in edges
+    points = [centre + u * right + v * down for u, v in place]
+
+    def between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return form_factor_pair(p, q, normal, normal) * ~blocked(p[:, None], q[None], blocks)
+
+    close = sum(between(points[k], points[3 * k % 8]) for k in range(8)) / 8
+    r2 = ((centre[None] - centre[:, None]) ** 2).sum(axis=2)
+    return np.where(r2 < geometry[12] + geometry[12][:, None], close, between(centre, centre))
+
+
+def form_factor_weigh(right: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """diag(right) x, each of k right-hand sides as a row: (k, N)."""
+    return (right * np.asarray(x, np.float64).T).reshape(-1, len(right))
+
+
+def form_factor_matvec(
+    G: np.ndarray, left: np.ndarray, right: np.ndarray, x: np.ndarray, scale: float, add: np.ndarray | None
+) -> np.ndarray:
+    """out = scale * diag(left) G diag(right) x + add."""
+    return dense_matvec(left[:, None] * G * right, x, scale, add)
+
+
+def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Whether the way from p to q (..., 3) passes through a box (B, 6) given as centre and half sides.
+
+    By slabs: the stretches of the way within each pair of faces have a part in common.
+    """
+    p, q = np.broadcast_arrays(np.asarray(p, np.float64), np.asarray(q, np.float64))
+    result = np.zeros(p.shape[:-1], bool)
+    for box in np.asarray(blocks, np.float64):
+        low, high = box[:3] - box[3:], box[:3] + box[3:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (low - p) / (q - p), (high - p) / (q - p)
+        along = q == p  # never leaves the slab, or never enters it
+        inside = (low <= p) & (p <= high)
+        enter = np.where(along, np.where(inside, -np.inf, np.inf), np.minimum(a, b)).max(axis=-1)
+        leave = np.where(along, np.where(inside, np.inf, -np.inf), np.maximum(a, b)).min(axis=-1)
+        result |= np.maximum(enter, 0) <= np.minimum(leave, 1)
+    return result
+
+
+def visibility_rows(starts: np.ndarray, ends: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Share of the rays from starts (rays, 3, M) to ends (rays, 3, N) that meet no box, (M, N)."""
+    rays = zip(starts, ends, strict=True)
+    return np.mean([~blocked(a.T[:, None], b.T[None], blocks) for a, b in rays], axis=0)
+
+
 def gamma(roundings: float) -> float:
     """Relative error of that many roundings in a row.
 
