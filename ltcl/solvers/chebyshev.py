@@ -3,8 +3,8 @@
 
 Where the paper's series needs rho(R) < 1, this converges for every albedo below one: of a Lambertian scene
 the spectrum of S lies in [1/2, 1 + max row sum of R], which costs nothing to know (`theory.free_bounds`).
-No inner products after the start, so nothing is read back between products but the residual. Not for spectra
-with large imaginary parts, nor for eigenvalues on both sides of 0; there the monitor sees the residual grow.
+No inner products after the start, so nothing is read back but the residual, every few products. Not for
+spectra with large imaginary parts, nor with eigenvalues on both sides of 0: the monitor sees residuals grow.
 
 Of other scenes the bounds may leave out eigenvalues, and then the residual grows by their eigenvectors. A few
 steps of GMRES take those out and tell their eigenvalues; the bounds are widened and the iteration goes on.
@@ -96,11 +96,12 @@ def _run(
     radius = max((upper - lower) / 2, 1e-6 * centre)
     sigma = centre / radius  # 2.
     rho = 1.0 / sigma
+    monitor.factor = 1.0 / (sigma + math.sqrt(sigma**2 - 1.0))
     d = vectors.axpby(1.0 / centre, r, 0.0, r, r.like())
     while True:  # 3.
         vectors.axpy(1.0, d, x)  # 4.
         system.residual(x, r)  # 5., from x itself instead of by recursion: same cost, no drift
-        if monitor.done(x, r):
+        if monitor.done(x, r, lazy=True):
             return False
         if monitor.residuals[-1] > growth * first:
             return True
