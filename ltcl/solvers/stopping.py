@@ -95,7 +95,7 @@ class Monitor:
         self._trusted = np.maximum(self._target, _DRIFT * norms)
         self.norms = norms
         self.unsolved = np.ones(norms.shape, bool)
-        self._lowest = np.inf
+        self.lowest = np.inf
         self._lowest_at = 0
         self._rises = 0
 
@@ -151,7 +151,7 @@ class Monitor:
             self._ahead = self._foresee(target)
         if self._history.waiting + 1 >= self._ahead:
             return False
-        self._history.queue(x, r, self._lowest, self.best)
+        self._history.queue(x, r, self.lowest, self.best)
         return True
 
     def _foresee(self, target: np.ndarray) -> int:
@@ -173,8 +173,8 @@ class Monitor:
     def _judge(self, norms: np.ndarray) -> Status | None:
         """Record the norms of one iterate; what is wrong with it, if anything."""
         self._record(norms)
-        if self.residuals[-1] < self._lowest:
-            self._lowest, self._lowest_at = self.residuals[-1], self.iterations
+        if self.residuals[-1] < self.lowest:
+            self.lowest, self._lowest_at = self.residuals[-1], self.iterations
         return self._trouble()
 
     def _record(self, norms: np.ndarray) -> None:
@@ -186,7 +186,7 @@ class Monitor:
         self._rises = self._rises + 1 if residual > previous else 0
 
     def _keep(self, x: Array) -> None:
-        if self.residuals[-1] == self._lowest:  # again, where one column is stuck while others improve
+        if self.residuals[-1] == self.lowest:  # again, where one column is stuck while others improve
             self.best = (x.like() if self.best is None else self.best).copy_from(x)
 
     def _trouble(self) -> Status | None:
@@ -197,7 +197,7 @@ class Monitor:
         if not self._reachable and residual <= _ROUNDING:
             return Status.STAGNATED  # all that float32 can tell
         waited = self.iterations - self._lowest_at
-        if (waited >= _PATIENCE and self._lowest < _DRIFT) or self._stalled():
+        if (waited >= _PATIENCE and self.lowest < _DRIFT) or self._stalled():
             return Status.STAGNATED
         return Status.MAXITER if self.iterations >= self.rule.maxiter else None
 
