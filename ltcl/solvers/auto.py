@@ -29,9 +29,6 @@ from ltcl.solvers.survey import Survey, known, survey
 SMALL = 512  # pixels: below, a dense factorization takes less time than launching kernels
 LARGEST_DIRECT = 8192  # pixels: above, a dense factorization is no help in need any more
 _PRECISE = 1e-6  # relative residual that float32 products reach for certain
-_SELF_ADJOINT = 0.02  # defect of R up to which cg works as in theory
-_ONE_SIDED = 0.5  # defect beyond which R sends light one way: its eigenvalues are hardly real
-_SLENDER = 0.25  # of the smallest real part: imaginary parts that an interval may leave out
 
 # Rough, for the choice between them only: float64 LAPACK on a few cores, and what memory gives.
 _FLOPS = 5e10
@@ -79,7 +76,7 @@ def _surveyed(S: Operator, rtol: float, columns: int) -> Iterator[Choice]:
     """The method with the fewest products after a survey of S, then those that ask for less."""
     spent = 0 if known(S) else None
     found = survey(S)
-    first, why, products = _fewest(S, found, rtol)
+    first, why, products = _fewest(found, rtol)
     spent = found.products if spent is None else spent
     part = _direct_part(S, products, columns)
     if part < 1.0:
@@ -95,20 +92,19 @@ def _surveyed(S: Operator, rtol: float, columns: int) -> Iterator[Choice]:
         yield Choice(Direct())
 
 
-def _fewest(S: Operator, found: Survey, rtol: float) -> tuple[Any, str, float]:
+def _fewest(found: Survey, rtol: float) -> tuple[Any, str, float]:
     """The method, the reason and the products foreseen."""
     krylov = found.krylov_products(rtol)
     least, most = np.min(np.real(found.ritz), initial=np.inf), np.max(np.real(found.ritz), initial=-np.inf)
     seen = f"{found.products} Arnoldi steps see eigenvalues of S from {least:.2g} to {most:.2g}"
-    if least <= 0.0 or found.imaginary > _SLENDER * least or found.defect > _ONE_SIDED:
+    if not found.in_an_interval:
         shape = f"imaginary parts up to {found.imaginary:.2g}, {found.defect:.0%} of R not self-adjoint"
         return GMRES(), f"{seen}, {shape}: gmres needs no bounds on them", krylov
     chebyshev, products = _chebyshev(found, rtol)
-    symmetric = found.defect <= _SELF_ADJOINT
-    other = CG() if symmetric else GMRES()
+    other = CG() if found.self_adjoint else GMRES()
     how = (
         f"R is self-adjoint to {found.defect:.1g}"
-        if symmetric
+        if found.self_adjoint
         else f"{found.defect:.0%} of R is not self-adjoint"
     )
     forecast = f"chebyshev {products} products, {other.name} {krylov:g}"

@@ -23,6 +23,9 @@ from ltcl.solvers.hessenberg import Hessenberg
 STEPS = 3
 _MARGIN = 0.25  # of the width of the Ritz values, added on both sides: the outermost are not found at once
 _SAFETY = 0.05
+_SELF_ADJOINT = 0.02  # defect of R up to which inner products are nearly those of a self-adjoint one
+_ONE_SIDED = 0.5  # defect beyond which R sends light one way: its eigenvalues are hardly real
+_SLENDER = 0.25  # of the smallest real part: imaginary parts that an interval may leave out
 _found: weakref.WeakKeyDictionary[Operator, Survey] = weakref.WeakKeyDictionary()
 
 
@@ -55,6 +58,17 @@ class Survey:
     def imaginary(self) -> float:
         """Largest imaginary part."""
         return float(np.max(np.abs(np.imag(self.ritz)), initial=0.0))
+
+    @property
+    def in_an_interval(self) -> bool:
+        """Whether all eigenvalues seem to lie near some interval of positive numbers."""
+        least = float(np.min(np.real(self.ritz), initial=np.inf))
+        return least > 0.0 and self.imaginary <= _SLENDER * least and self.defect <= _ONE_SIDED
+
+    @property
+    def self_adjoint(self) -> bool:
+        """Whether cg will work as in theory."""
+        return self.defect <= _SELF_ADJOINT
 
     def krylov_products(self, rtol: float) -> float:
         """Products of a Krylov method to `rtol`, one to confirm the end included; infinite where it stalls.
