@@ -73,15 +73,17 @@ inline real largest(int k, global const real *weights, global const real *square
     return worst;
 }
 
-// best = x where row `slot` of squares (slot + 1, k), weighted as above, is below `lowest` and no row before
-// it is lower: the best iterate stays, and the host need not know which it was. Each item copies every
-// get_global_size(0)-th value.
+// best = x where row `slot` of squares (slot + 1, k), weighted as above, is at most `lowest` and no row before
+// it is lower: the best iterate stays, and the host need not know which it was. Nothing counts after a row
+// that is not finite. Each item copies every get_global_size(0)-th value.
 kernel void vector_keep(
     int count, int k, int slot, real lowest, global const real *weights, global const real *squares,
     global const real *x, global real *best)
 {
     for (int s = 0; s < slot; s++) {
         const real before = largest(k, weights, squares + s * k);
+        if (!isfinite(before))
+            return;
         lowest = before < lowest ? before : lowest;
     }
     if (!(largest(k, weights, squares + slot * k) <= lowest))

@@ -97,7 +97,8 @@ def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
 def keep(weights: Array, squares: Array, slot: int, lowest: float, x: Array, best: Array) -> Array:
     """best = x, where ``max(weights * squares[slot])`` is at most `lowest` and that of every row before.
 
-    `weights` are (k,), `squares` (slots, k), the columns of `x`; nothing is read back, and NaN is no best.
+    `weights` are (k,), `squares` (slots, k), for the columns of `x`; nothing is read back. What comes after a
+    row that is not finite is no best.
     """
     _same_shape(x, best)
     items = min(_COPIERS, x.size)

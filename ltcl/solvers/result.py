@@ -39,7 +39,7 @@ class Solution:
 
     Attributes
     ----------
-    x : (N,) or (N, k) float32 (float64 of method "direct")
+    x : (N,) or (N, k) float32 (float64 of method "direct", and of values beyond float32)
         The solution; where `converged` is False, the iterate with the smallest residual.
     status : Status
     iterations : int

@@ -199,7 +199,7 @@ def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule
     best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
     assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
     return Solution(
-        (best.get() * unit).astype(np.float32),
+        _in_units(best.get(), unit),
         monitor.status,
         monitor.iterations,
         system.products,
@@ -214,6 +214,12 @@ def _unit(b: np.ndarray) -> np.ndarray:
     """A power of two for each column, near its largest value: in such units norms stay inside float32."""
     largest = np.max(np.abs(b, dtype=np.float64), axis=0)
     return np.exp2(np.floor(np.log2(np.where(largest > 0.0, largest, 1.0))))
+
+
+def _in_units(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """x times its unit in float32, or in float64 where it is beyond float32."""
+    wide = x * unit
+    return wide if np.any(np.abs(wide) > np.finfo(np.float32).max) else wide.astype(np.float32)
 
 
 def _start(system: System, guess: np.ndarray | None) -> tuple[Array, Array]:

@@ -98,6 +98,7 @@ class Monitor:
         self.lowest = np.inf
         self._lowest_at = 0
         self._rises = 0
+        self._finite = True
 
     @property
     def iterations(self) -> int:
@@ -116,10 +117,10 @@ class Monitor:
             norms = vectors.norm(self.system.residual(x, r if replace else r.like()))
         self.norms = norms
         self.unsolved = self.above(norms)
-        troubles = [self._judge(earlier) for earlier in waiting]
-        troubles.append(self._judge(norms))
-        self._keep(x)
-        if self._reachable and not self.unsolved.any():
+        troubles = [self._judge(found) for found in (*waiting, norms)]
+        if self._finite:
+            self._keep(x)
+        if self._finite and self._reachable and not self.unsolved.any():
             self.status = Status.CONVERGED
         else:
             self.status = next((trouble for trouble in troubles if trouble is not None), None)
@@ -173,7 +174,8 @@ class Monitor:
     def _judge(self, norms: np.ndarray) -> Status | None:
         """Record the norms of one iterate; what is wrong with it, if anything."""
         self._record(norms)
-        if self.residuals[-1] < self.lowest:
+        self._finite &= bool(np.isfinite(self.residuals[-1]))  # what comes after an overflow is no iterate
+        if self._finite and self.residuals[-1] < self.lowest:
             self.lowest, self._lowest_at = self.residuals[-1], self.iterations
         return self._trouble()
 

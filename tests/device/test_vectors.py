@@ -123,13 +123,14 @@ def test_many_dots_wait_once(device, shape, monkeypatch):
 
 
 @pytest.mark.parametrize("shape", [*SHAPES, (5000, 3)])
-def test_the_best_iterate_is_kept_without_the_host(device, shape):
-    """Rows are residuals of three iterates; NaN and infinity among them are never the best."""
+@pytest.mark.parametrize("last", [0.7, np.nan, np.inf])
+def test_the_best_iterate_is_kept_without_the_host(device, shape, last):
+    """Rows are residuals of iterates in turn; NaN and infinity are never the best, nor what follows them."""
     x, y, X, Y = operands(device, shape)
     k = X.columns
     weights = gallery.vectors(k, None, 4) ** 2 + 0.1
-    rows = np.array([4.0, 2.0, 2.0, np.nan, 1.0, np.inf, 3.0])[:, None] * np.ones(k)
-    rows[3, 1:] = 1.0  # one column's NaN is enough
+    rows = np.array([4.0, 2.0, 2.0, 3.0, 1.0, last, 0.5])[:, None] * np.ones(k)
+    rows[5, 1:] = 1.0  # one column is enough
     squares = device.upload(rows)
     for slot in range(len(rows)):
         for lowest in (np.inf, 3.0 * np.max(weights), 0.0):
