@@ -28,7 +28,7 @@ RTOL = 1e-2
 PRODUCTS_TARGET = 4.0  # times fewer than Neumann
 NEUMANN_TARGET, GMRES_TARGET = 10.0, 5.0  # times faster
 DIVERGENT_TARGET = 8  # products at rho(R) = 4
-REPEATS = 5
+REPEATS = 3
 
 
 @dataclass(frozen=True)

@@ -158,18 +158,20 @@ class Monitor:
     def _foresee(self, target: np.ndarray) -> int:
         """Steps until the next reading: half of those until the tolerance, or divergence, is reached.
 
-        Half, since residuals may fall faster than they did: no product is to be made in vain but one.
+        Half, since residuals may fall faster than they did, and no more than were made so far: products made
+        in vain cost more than readings.
         """
         done, residual = self.iterations, self.residuals[-1]
         if done == 0 or not residual > 0.0:
             return 1
-        last = residual / self.residuals[-2]
-        factor = min(last, (residual / self.residuals[0]) ** (1.0 / done), self.factor)
+        recent = np.array(self.residuals[-SLOTS - 1 :])
+        ratios = recent[1:] / recent[:-1]
+        factor = min(float(np.min(ratios)), self.factor)
         wanted = np.maximum(target, _ROUNDING * self._scale)
         left = _steps(float(np.max(self.norms / wanted)), 1.0 / factor)
-        growth = _steps(_GROWTH * self.residuals[0] / residual, last)
+        growth = _steps(_GROWTH * self.residuals[0] / residual, float(ratios[-1]))
         most = min(left, growth, 2.0 * SLOTS, 2.0 * (self.rule.maxiter - done))
-        return max(1, int((most + 1.0) / 2.0))
+        return max(1, min(int((most + 1.0) / 2.0), done))
 
     def _judge(self, norms: np.ndarray) -> Status | None:
         """Record the norms of one iterate; what is wrong with it, if anything."""
