@@ -61,27 +61,24 @@ def plan(S: Operator, rtol: float, columns: int = 1) -> Iterator[Choice]:
     if not math.isfinite(rho):
         yield Choice(GMRES(), "row sums of S leave float32")
         return
-    plain, chebyshev = (
-        theory.series_products(rho, rtol),
-        theory.chebyshev_products(*theory.free_bounds(S), rtol),
-    )
+    plain = theory.series_products(rho, rtol)
+    chebyshev = theory.chebyshev_products(*theory.free_bounds(S), rtol)
     if plain <= chebyshev:
-        yield Choice(
-            Jacobi(), f"row sums of R are at most {rho:.2g}: {plain} products, chebyshev {chebyshev}"
-        )
+        why = f"row sums of R are at most {rho:.2g}: {plain} products, chebyshev {chebyshev}"
+        yield Choice(Jacobi(), why)
     yield from _surveyed(S, rtol, columns)
 
 
 def _surveyed(S: Operator, rtol: float, columns: int) -> Iterator[Choice]:
     """The method with the fewest products after a survey of S, then those that ask for less."""
-    spent = 0 if known(S) else None
+    before = known(S)
     found = survey(S)
+    spent = 0 if before else found.products
     first, why, products = _fewest(found, rtol)
-    spent = found.products if spent is None else spent
     part = _direct_part(S, products, columns)
     if part < 1.0:
         share = f"a factorization takes {part:.2g} of the time of {products:g} products for each"
-        yield Choice(Direct(), f"{columns} right-hand side(s): {share}", spent)
+        yield Choice(Direct(), f"{why}; {columns} right-hand side(s): {share}", spent)
         why, spent = "", 0
     yield Choice(first, why, spent)
     if not isinstance(first, GMRES):
@@ -119,11 +116,9 @@ def _chebyshev(found: Survey, rtol: float) -> tuple[Chebyshev, int]:
         return Chebyshev(found.spectrum), plain
     left = rtol / found.falls[2] if found.falls[2] > rtol else 1.0
     begun = 3 + (theory.chebyshev_products(*found.spectrum, left) if left < 1.0 else 0)
-    return (
-        (Chebyshev(found.spectrum), plain)
-        if plain <= begun
-        else (Chebyshev(found.spectrum, arnoldi=2), begun)
-    )
+    if plain <= begun:  # of equals the one without inner products
+        return Chebyshev(found.spectrum), plain
+    return Chebyshev(found.spectrum, arnoldi=2), begun
 
 
 def _direct_part(S: Operator, products: float, columns: int) -> float:
