@@ -71,6 +71,15 @@ def vector_dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.atleast_1d(np.sum(np.asarray(x, np.float64) * np.asarray(y, np.float64), axis=0))
 
 
+def vector_keep(
+    weights: np.ndarray, squares: np.ndarray, slot: int, lowest: float, x: np.ndarray, best: np.ndarray
+) -> np.ndarray:
+    """x where the weighted residual of row `slot` is at most `lowest` and those before, all finite."""
+    worst = np.max(np.float32(weights) * np.float32(squares[: slot + 1]), axis=1)  # NaN comes through
+    whole = np.isfinite(worst[:-1]).all()
+    return x if whole and worst[-1] <= min([np.float32(lowest), *worst[:-1]]) else best
+
+
 def vector_triad(a: float, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return vector_axpby(a, b, 1.0, c)
 
