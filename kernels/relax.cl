@@ -13,8 +13,10 @@
 //   _stream                 the same in wide loads; for CPUs, where a row is a stream
 //   _group                  one work-group a row, its items side by side along the row; for GPUs
 // The first `lead` work-groups finish A, in one of two ways:
-//   in sequence  a single work-item goes through the rows of A. Row i is in `weights` from starts[i] on: 1 / D_ii,
-//                then the entries left of it within A, over D_ii, in columns `places` of the matrix.
+//   in sequence  where chained >= 0: a single work-item goes through the rows of A that have entries left of the
+//                diagonal within A, while others correct the rest. `places` are first the rows of A, those
+//                `chained` ones before the others, and `weights` 1 / D_ii there. From starts[p] on follow the
+//                columns of row p of these, and its entries over the D of their columns.
 //   by inverse   as rows of a dense product: `weights` is [-P_AA^-1 S_AO, P_AA^-1] in rows; starts and places are
 //                any valid buffers and are not read.
 //
@@ -47,32 +49,40 @@
         y[i] = x[i] + correction; \
     } while (0)
 
+// In s, rows become D / omega times their correction, which rows without entries are from the start.
 inline void relax_in_sequence(
-    int start, int count, int stride, real omega, global const int *starts, global const int *places,
-    global const real *weights, global const real *x, global real *y, global const real *s, global real *delta)
+    int count, int chained, int stride, real omega, global const int *starts, global const int *places,
+    global const real *weights, global const real *x, global real *y, global real *s)
 {
-    for (int row = 0; row < count; ++row) {
-        const int diagonal = starts[row], i = (start + row) * stride;
+    const int other = chained + (int)get_global_id(0) - (int)get_local_size(0);  // not for the first group
+    if (get_group_id(0) > 0 && other < count)
+        for (int c = 0, i = places[other] * stride; c < K; ++c)
+            y[i + c] = x[i + c] + omega * weights[other] * s[i + c];
+    if (get_global_id(0) > 0)
+        return;
+    for (int row = 0; row < chained; ++row) {
+        const int i = places[row] * stride, end = starts[row + 1];
         real sum[K];
         for (int c = 0; c < K; ++c)
-            sum[c] = weights[diagonal] * s[i + c];
-        for (int j = diagonal + 1; j < starts[row + 1]; ++j)
+            sum[c] = 0;
+        for (int j = starts[row]; j < end; ++j)
             for (int c = 0; c < K; ++c)
-                sum[c] -= weights[j] * delta[places[j] * stride + c];
-        for (int c = 0; c < K; ++c)
-            RELAX_CORRECT(i + c, omega * sum[c]);
+                sum[c] = weights[j] * s[places[j] * stride + c] + sum[c];
+        for (int c = 0; c < K; ++c) {
+            s[i + c] -= omega * sum[c];
+            y[i + c] = x[i + c] + omega * weights[row] * s[i + c];
+        }
     }
 }
 
 // Work-items that each have a row of their own.
 inline void relax_finish(
-    int item, int start, int count, int before, int sequential, int stride, real omega,
+    int item, int start, int count, int before, int chained, int stride, real omega,
     global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global const real *s, global real *delta)
+    global real *y, global real *s, global real *delta)
 {
-    if (sequential) {
-        if (item == 0)
-            relax_in_sequence(start, count, stride, omega, starts, places, weights, x, y, s, delta);
+    if (chained >= 0) {
+        relax_in_sequence(count, chained, stride, omega, starts, places, weights, x, y, s);
         return;
     }
     if (item >= count)
@@ -88,14 +98,13 @@ inline void relax_finish(
 
 // A work-group with a row of its own.
 inline void relax_finish_group(
-    int item, int start, int count, int before, int sequential, int stride, real omega,
+    int item, int start, int count, int before, int chained, int stride, real omega,
     global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global const real *s, global real *delta, local real *scratch)
+    global real *y, global real *s, global real *delta, local real *scratch)
 {
     const int me = get_local_id(0), step = get_local_size(0), known = start - before;
-    if (sequential) {
-        if (me == 0)
-            relax_in_sequence(start, count, stride, omega, starts, places, weights, x, y, s, delta);
+    if (chained >= 0) {
+        relax_in_sequence(count, chained, stride, omega, starts, places, weights, x, y, s);
         return;
     }
     global const real *a = weights + (size_t)item * (known + count);
@@ -113,7 +122,7 @@ inline void relax_finish_group(
 }
 
 kernel void relax_csr(
-    int rows, int begin, int first, int lead, int start, int count, int before, int sequential, int stride,
+    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
     int offset, real shift, real scale, real omega, global const int *pointers, global const int *columns,
     global const real *values, global const int *middle,
     global const int *starts, global const int *places, global const real *weights, global const real *x,
@@ -124,7 +133,7 @@ kernel void relax_csr(
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish(
-            get_global_id(0), start, count, before, sequential, stride, omega, starts, places, weights, x, y, s,
+            get_global_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
             delta);
         return;
     }
@@ -142,7 +151,7 @@ kernel void relax_csr(
 }
 
 kernel void relax_dense(
-    int rows, int begin, int first, int lead, int start, int count, int before, int sequential, int stride,
+    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
     int offset, real shift, real scale, real omega, int width, global const real *matrix,
     global const int *starts, global const int *places, global const real *weights, global const real *x,
     global real *y, global const real *b, global real *s, global real *delta, global real *r,
@@ -152,7 +161,7 @@ kernel void relax_dense(
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish(
-            get_global_id(0), start, count, before, sequential, stride, omega, starts, places, weights, x, y, s,
+            get_global_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
             delta);
         return;
     }
@@ -171,7 +180,7 @@ kernel void relax_dense(
 }
 
 kernel void relax_csr_stream(
-    int rows, int begin, int first, int lead, int start, int count, int before, int sequential, int stride,
+    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
     int offset, real shift, real scale, real omega, global const int *pointers, global const int *columns,
     global const real *values, global const int *middle,
     global const int *starts, global const int *places, global const real *weights, global const real *x,
@@ -182,7 +191,7 @@ kernel void relax_csr_stream(
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish(
-            get_global_id(0), start, count, before, sequential, stride, omega, starts, places, weights, x, y, s,
+            get_global_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
             delta);
         return;
     }
@@ -197,7 +206,7 @@ kernel void relax_csr_stream(
 }
 
 kernel void relax_dense_stream(
-    int rows, int begin, int first, int lead, int start, int count, int before, int sequential, int stride,
+    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
     int offset, real shift, real scale, real omega, int width, global const real *matrix,
     global const int *starts, global const int *places, global const real *weights, global const real *x,
     global real *y, global const real *b, global real *s, global real *delta, global real *r,
@@ -207,7 +216,7 @@ kernel void relax_dense_stream(
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish(
-            get_global_id(0), start, count, before, sequential, stride, omega, starts, places, weights, x, y, s,
+            get_global_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
             delta);
         return;
     }
@@ -224,7 +233,7 @@ kernel void relax_dense_stream(
 }
 
 kernel void relax_csr_group(
-    int rows, int begin, int first, int lead, int start, int count, int before, int sequential, int stride,
+    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
     int offset, real shift, real scale, real omega, global const int *pointers, global const int *columns,
     global const real *values, global const int *middle,
     global const int *starts, global const int *places, global const real *weights, global const real *x,
@@ -235,7 +244,7 @@ kernel void relax_csr_group(
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish_group(
-            get_group_id(0), start, count, before, sequential, stride, omega, starts, places, weights, x, y, s,
+            get_group_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
             delta, scratch);
         return;
     }
@@ -255,7 +264,7 @@ kernel void relax_csr_group(
 }
 
 kernel void relax_dense_group(
-    int rows, int begin, int first, int lead, int start, int count, int before, int sequential, int stride,
+    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
     int offset, real shift, real scale, real omega, int width, global const real *matrix,
     global const int *starts, global const int *places, global const real *weights, global const real *x,
     global real *y, global const real *b, global real *s, global real *delta, global real *r,
@@ -265,7 +274,7 @@ kernel void relax_dense_group(
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish_group(
-            get_group_id(0), start, count, before, sequential, stride, omega, starts, places, weights, x, y, s,
+            get_group_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
             delta, scratch);
         return;
     }

@@ -54,10 +54,10 @@ class Block:
 
 @dataclass(frozen=True)
 class Finish:
-    """What finishes a block: its rows, and the arguments of the kernels for it."""
+    """What finishes a block: its rows, how many of them in sequence or -1, and arguments of the kernels."""
 
     block: Block
-    sequential: bool
+    chained: int
     arguments: tuple[Array, Array, Array]
 
 
@@ -98,27 +98,23 @@ def middle(M: CSR, blocks: list[Block]) -> np.ndarray:
 
 
 def in_sequence(rows: Rows, blocks: list[Block]) -> Iterator[Finish]:
-    """The triangles of a sparse matrix: 1 / D_ii, then the entries left of it within the block over D_ii."""
+    """The triangles of a sparse matrix: rows that others in the block must precede, and the rest."""
     M, diagonal = rows.M, rows.diagonal()
     assert isinstance(M, CSR)  # noqa: S101 - dense ones are inverted
     for block in blocks:
-        pointers = M.pattern.indptr[block.start : block.stop + 1]
+        count, pointers = block.stop - block.start, M.pattern.indptr[block.start : block.stop + 1]
         row = np.repeat(np.arange(block.start, block.stop), np.diff(pointers))
         columns = M.pattern.indices[pointers[0] : pointers[-1]]
         kept = (columns >= block.start) & (columns < row)
-        counts = 1 + np.bincount(row[kept] - block.start, minlength=block.stop - block.start)
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        own = np.zeros(starts[-1], bool)
-        own[starts[:-1]] = True
-        places, weights = np.empty(len(own), np.int32), np.empty(len(own))
-        places[own], weights[own] = (
-            np.arange(block.start, block.stop),
-            1.0 / diagonal[block.start : block.stop],
-        )
-        values = rows.scale * M.data[pointers[0] : pointers[-1]][kept]
-        places[~own], weights[~own] = columns[kept], values / diagonal[row[kept]]
+        columns, values = columns[kept], rows.scale * M.data[pointers[0] : pointers[-1]][kept]
+        found = np.bincount(row[kept] - block.start, minlength=count)
+        order = block.start + np.argsort(found == 0, stable=True)
+        starts = count + np.concatenate([[0], np.cumsum(found[found > 0])])
+        places = np.concatenate([order, columns])
+        weights = np.concatenate([1.0 / diagonal[order], values / diagonal[columns]])
         upload = M.device.upload
-        yield Finish(block, True, (upload(starts, np.int32), upload(places, np.int32), upload(weights)))
+        arguments = (upload(starts, np.int32), upload(places, np.int32), upload(weights))
+        yield Finish(block, len(starts) - 1, arguments)
 
 
 def by_inverse(rows: Rows, blocks: list[Block], omega: float | None, method: str) -> Iterator[Finish]:
@@ -148,7 +144,7 @@ def by_inverse(rows: Rows, blocks: list[Block], omega: float | None, method: str
                 f"{block.stop - 1}, is singular; choose another block= or use method='direct'"
             )
         weights = np.hstack([-inverse @ part[:, :known], inverse])
-        yield Finish(block, False, (unused, unused, M.device.upload(weights)))
+        yield Finish(block, -1, (unused, unused, M.device.upload(weights)))
 
 
 def _inverse(own: np.ndarray, omega: float | None) -> np.ndarray | None:

@@ -29,6 +29,7 @@ from ltcl.operators.csr import CSR
 from ltcl.operators.dense import Dense
 
 _ITEMS = 8  # rows of a work-group on a CPU: few, so that cores end a block together
+_CORRECTED = 256  # rows of a work-group that only corrects them
 
 
 class Sweep:
@@ -70,7 +71,7 @@ class Relaxation:
         self.rows, self.omega = rows, omega
         self.device: Device = rows.M.device
         self.block = max((f.block.stop - f.block.start for f in finishes), default=1)
-        self.in_place = any(finish.sequential for finish in finishes)
+        self.in_place = any(finish.chained >= 0 for finish in finishes)
         self._slabs = self._arguments(finishes)
         self._steps = list(self._plan(finishes))
 
@@ -104,13 +105,15 @@ class Relaxation:
 
         def launch(step: Step) -> None:
             block, finish = step.finish.block, step.finish
-            count = block.stop - block.start
-            lead = min(count, 1) if finish.sequential else -(-count // taken)
+            count, size = block.stop - block.start, group
+            lead, work = -(-count // taken), -(-step.rows // taken)
+            if self.in_place and count:  # a launch of its own: one group in sequence, the others beside it
+                size = min(_CORRECTED, self.device.max_group)
+                lead = 1 - (finish.chained - count) // size
             place = (step.rows, step.begin, rows.M.slabs[step.slab].first, lead)
-            finished = (step.start, count, block.before, finish.sequential)
-            items = group * (lead - (-step.rows // taken))
-            slab = self._slabs[step.slab]
-            kernel(items, group, *place, *finished, *numbers, *slab, *finish.arguments, *vectors, *local)
+            finished = (step.start, count, block.before, finish.chained)
+            arguments = (*place, *finished, *numbers, *self._slabs[step.slab], *finish.arguments, *vectors)
+            kernel(size * (lead + work), size, *arguments, *local)
 
         return launch
 
@@ -130,7 +133,7 @@ class Relaxation:
     def _plan(self, finishes: list[Finish]) -> Iterator[Step]:
         """Blocks are those of the matrix: one that crosses slabs has its product in several launches."""
         unused = self.device.upload([0], np.int32)
-        waiting = nothing = Finish(Block(0, 0, 0), True, (unused, unused, unused))
+        waiting = nothing = Finish(Block(0, 0, 0), -1, (unused, unused, unused))
         for finish in finishes:
             for number, slab in enumerate(self.rows.M.slabs):
                 begin = max(finish.block.start, slab.first)
