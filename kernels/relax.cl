@@ -28,6 +28,7 @@
 // of the matrix from row `start`, O ends there and starts at row `before`. x, y, b, s, delta, r and carry are
 // row-major with `stride` reals a row; a launch works on columns offset .. offset + K - 1.
 // CSR: middle[i] is the first entry of row i of the slab in a column from `start` on.
+// With K = 3 the fourth lane of a load may be a value that another work-item writes; nothing is made of it.
 
 #include "common/lanes.h"
 #include "common/reduce.h"
