@@ -29,9 +29,7 @@ kernel void dense_matvec(
     real sum[K];
     for (int c = 0; c < K; ++c)
         sum[c] = 0;
-    for (int j = 0; j < width; ++j)
-        for (int c = 0; c < K; ++c)
-            sum[c] = a[j] * x[j * stride + offset + c] + sum[c];
+    dense_add(sum, a, x + offset, stride, 0, width, 1);
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c)
         LTCL_STORE(out, i + c, sum[c], scale, adds, add);
@@ -61,9 +59,7 @@ kernel void dense_matvec_group(
     real sum[K];
     for (int c = 0; c < K; ++c)
         sum[c] = 0;
-    for (int j = get_local_id(0); j < width; j += get_local_size(0))
-        for (int c = 0; c < K; ++c)
-            sum[c] = a[j] * x[j * stride + offset + c] + sum[c];
+    dense_add(sum, a, x + offset, stride, get_local_id(0), width, get_local_size(0));
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c) {
         const real total = group_sum(sum[c], scratch);

@@ -85,13 +85,19 @@ def vector_triad(a: float, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def relax_dense(
-    M: np.ndarray, rows: slice, shift: float, scale: float, x: np.ndarray, b: np.ndarray, carry: np.ndarray
+    M: np.ndarray,
+    start: int,
+    shift: float,
+    scale: float,
+    x: np.ndarray,
+    y: np.ndarray,
+    b: np.ndarray,
+    carry: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """s, r and the next carry of a block of rows; S = shift I + scale M."""
-    M, x = np.asarray(M, np.float64), np.asarray(x, np.float64)
-    upper = scale * (np.triu(M, 1) @ x)[rows]
-    s = (b - shift * x - scale * (M @ x))[rows]
-    return s, carry[rows] - upper, upper
+    """s, r and the next carry of all rows; S = shift I + scale M, times y before column `start`."""
+    M, x, y = (np.asarray(values, np.float64) for values in (M, x, y))
+    lower, upper = scale * (M[:, :start] @ y[:start]), shift * x + scale * (M[:, start:] @ x[start:])
+    return b - lower - upper, carry - upper, b - lower
 
 
 def relax_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
@@ -102,20 +108,25 @@ def relax_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *ar
     )
 
 
-def relax_dense_triangle(
-    M: np.ndarray, rows: slice, shift: float, scale: float, omega: float, s: np.ndarray
+def relax_finish(
+    S: np.ndarray, omega: float | None, before: int, start: int, stop: int, s: np.ndarray, delta: np.ndarray
 ) -> np.ndarray:
-    """delta of (D / omega + L)_BB delta = s_B."""
-    block = scale * np.asarray(M, np.float64)[rows, rows]
-    np.fill_diagonal(block, shift + block.diagonal())
-    return np.linalg.solve(np.tril(block, -1) + np.diag(block.diagonal() / omega), s)
+    """delta of P_AA delta_A = s_A - S_AO delta_O; P is the triangle with D / omega, or S (omega None)."""
+    own = np.asarray(S, np.float64)[start:stop, start:stop]
+    P = own if omega is None else np.tril(own, -1) + np.diag(own.diagonal() / omega)
+    return np.linalg.solve(P, s[start:stop] - S[start:stop, before:start] @ delta[before:start])
 
 
-def relax_csr_triangle(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
-    """The same of a sparse M."""
-    n = len(pointers) - 1
-    matrix = scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray()
-    return relax_dense_triangle(matrix, *arguments)
+def block_gauss_seidel(
+    S: np.ndarray, x: np.ndarray, b: np.ndarray, block: int, sweeps: int = 1
+) -> np.ndarray:
+    """Sweeps of block Gauss-Seidel as in a textbook, block after block in place."""
+    x = np.array(x, np.float64)
+    for _ in range(sweeps):
+        for start in range(0, len(x), block):
+            B = slice(start, start + block)
+            x[B] += np.linalg.solve(S[B, B], b[B] - S[B] @ x)
+    return x
 
 
 def sor(S: np.ndarray, x: np.ndarray, b: np.ndarray, omega: float = 1.0, sweeps: int = 1) -> np.ndarray:

@@ -17,6 +17,7 @@ from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
 from ltcl.solvers import auto
 from ltcl.solvers.bicgstab import BiCGStab
+from ltcl.solvers.block_gauss_seidel import BlockGaussSeidel
 from ltcl.solvers.cg import CG
 from ltcl.solvers.chebyshev import Chebyshev
 from ltcl.solvers.direct import Direct
@@ -39,6 +40,7 @@ ITERATIVE = {
         Chebyshev,
         GaussSeidel,
         SOR,
+        BlockGaussSeidel,
         Southwell,
         CG,
         GMRES,
@@ -71,8 +73,8 @@ def solve(
     b : (N,) or (N, k)
         k right-hand sides are solved together, each to its own tolerance.
     method : str
-        "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor", "southwell", "cg", "gmres",
-        "bicgstab", "direct" or "auto".
+        "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor",
+        "block_gauss_seidel", "southwell", "cg", "gmres", "bicgstab", "direct" or "auto".
     rtol, atol : float
         Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column.
     maxiter : int, optional

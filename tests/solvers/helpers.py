@@ -10,6 +10,7 @@ ITERATIVE = tuple(_ITERATIVE)
 READS_ROWS = (
     "gauss_seidel",
     "sor",
+    "block_gauss_seidel",
     "southwell",
 )  # methods that refuse operators whose entries cannot be read
 
