@@ -39,7 +39,7 @@ class Transport:
         of the same by products on the device, opened at once, which "exact" becomes where a dense inverse
         does not fit the host; or F itself.
     camera_grid : (h, w), optional
-        Of the camera where T is rectangular, M = h * w; S then does not exist and T only relights.
+        Of the camera where T is rectangular, M = h * w; S then does not exist: T relights and compensates.
     device : Device or str, optional
         As `open_device` takes it; opened at the first product only.
     on_dark : "raise" or "mask"
@@ -208,7 +208,7 @@ class Transport:
             (h, w), (rows, columns) = self.grid, self.camera_grid
             raise InputError(
                 f"T maps a projector of {h} x {w} pixels to a camera of {rows} x {columns}; S = T F^-1 needs "
-                "both on one grid, this T can only relight"
+                "both on one grid, this T can only relight and compensate"
             )
         return self._first_bounce
 

@@ -8,7 +8,7 @@ a step is
 
 with beta that makes p conjugate to the last d, alpha the step of Barzilai and Borwein, and lambda exact along
 d' or as far as the bounds allow. On a face of the box these are conjugate gradients, which need few products
-because R has few large eigenvalues; the clipping changes many active bounds at once, as projected gradients do
+because R has few large eigenvalues; clipping changes many active bounds at once, as projected gradients do
 (Moré and Toraldo, SIAM J. Optimization 1, 1991, take the two in turns). Where p does not descend, or the last
 lambda was short, p = z. Every step lowers the error and takes two products: in closed boxes of rho(R) = 0.8
 and 4, with 5 to 50 % of the pixels at a bound, 14 and 36 of them to a certificate of 0.1 %, where accelerated
