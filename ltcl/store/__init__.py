@@ -76,7 +76,7 @@ def load(
             wanted = camera_grid or _unknown("camera_grid", rows, "camera")
             camera_grid = checks.grid("camera_grid", wanted, rows)
         if first_bounce is None:
-            # On another camera grid T only relights, and the file's first bounce means nothing.
+            # On another camera grid there is no S, and the file's first bounce means nothing.
             stored = record.first_bounce if camera_grid in (None, grid) else None
             first_bounce = "diagonal" if stored is None else stored
         return Transport(
