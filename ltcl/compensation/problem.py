@@ -2,7 +2,8 @@
 """Compensation as least squares: min ||w (A x - b)||, x = scale * p within the projector's bounds.
 
 Where T = S F, A is S and the scale F, the first bounce: columns near 1, so that few products are needed.
-Elsewhere the columns of T are brought to norm 1. Colour channels are one system each.
+Elsewhere the columns of T are brought to norm 1. Colour channels are one system each, or all of them one
+where T couples them: then (3 N, k) arrays hold channel below channel, as `Transport.join` puts them.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl.operators import Operator, ScaledColumns
+from ltcl.device import Device
+from ltcl.operators import Operator, ScaledColumns, as_operator
 from ltcl.solvers.bounded import Bounded, minimise
 from ltcl.transport import Transport
 
@@ -101,23 +103,34 @@ class Problem:
 
 def systems(T: Transport) -> tuple[System, ...]:
     """The systems of T, uploaded here if they were not yet."""
-    if T.is_square:
+    if T.is_square and not T.couples:
         F = np.atleast_2d(T.first_bounce)
         return tuple(System(S, f) for S, f in zip(T.systems, F, strict=True))
-    return tuple(_scaled(matrix, A) for matrix, A in zip(T.matrices, T.operators, strict=True))
+    if not T.couples:
+        pairs = zip(T.matrices, T.operators, strict=True)
+        return tuple(_scaled(A, _column_norms(matrix, A.device)) for matrix, A in pairs)
+    (A,) = T.operators
+    if T.blocks is not None:
+        squares = [[_column_norms(block, A.device) ** 2 for block in row] for row in T.blocks]
+        return (_scaled(A, np.sqrt(np.sum(squares, axis=0)).ravel()),)
+    squares = np.stack([_column_norms(matrix, A.device) ** 2 for matrix in T.matrices])
+    mixing = np.eye(3) if T.mixing is None else T.mixing
+    return (_scaled(A, np.sqrt(np.square(mixing).T @ squares).ravel()),)
 
 
-def _scaled(matrix: Any, A: Operator) -> System:
-    norms = _column_norms(matrix, A)
+def _scaled(A: Operator, norms: np.ndarray) -> System:
     return System(ScaledColumns(A, np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0)), norms)
 
 
-def _column_norms(matrix: Any, A: Operator) -> np.ndarray:
+def _column_norms(matrix: Any, device: Device) -> np.ndarray:
     """Euclidean norms of the columns, (N,) float64; of products alone, with random signs v, E (A^T v)^2."""
     if isinstance(matrix, np.ndarray):
         return np.sqrt(np.einsum("ij,ij->j", matrix, matrix, dtype=np.float64))
     if isinstance(matrix, scipy.sparse.csr_array):
-        squares = np.bincount(matrix.indices, matrix.data.astype(np.float64) ** 2, minlength=A.shape[1])
+        squares = np.bincount(
+            matrix.indices, matrix.data.astype(np.float64) ** 2, minlength=matrix.T.shape[0]
+        )
         return np.sqrt(squares)
+    A = as_operator(matrix, device)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (A.shape[0], _PROBES))
     return np.sqrt(np.mean(np.square(A.T @ signs, dtype=np.float64), axis=1))

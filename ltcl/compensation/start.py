@@ -44,21 +44,26 @@ class Inverse:
     method: str
     options: dict[str, Any] = field(default_factory=dict)
 
+    def light(self, parts: Columns) -> Columns:
+        """Projector light, one array a system, of one solution a channel."""
+        return self.T.join(self.T.to_light(parts))
+
     def __call__(self, parts: Columns) -> tuple[Solution, ...]:
-        """One solution a channel."""
-        pairs = zip(self.T.systems, parts, strict=True)
+        """One solution a channel, of one target a system."""
+        pairs = zip(self.T.systems, self.T.split(parts), strict=True)
         return tuple(solve(S, l_out, self.method, **self.options) for S, l_out in pairs)
 
 
 def at_gain(inverse: Inverse, problem: Problem, gain: float) -> Start:
     """Of a given gain."""
     if not inverse.T.is_square:
-        return Start(gain, [np.zeros((inverse.T.shape[1], part.shape[1])) for part in problem.desired])
+        k = problem.desired[0].shape[1]
+        return Start(gain, [np.zeros((len(system.scale), k)) for system in problem.systems])
     solutions = inverse(problem.target(gain))
     # S^-1 meets every pixel but those of masked ones, which count only where weights say so.
-    masked = inverse.T.masked
+    masked = problem.limits.masked
     counted = problem.weights is not None and any(part[masked].any() for part in problem.weights)
-    light = inverse.T.to_light([solution.x for solution in solutions])
+    light = inverse.light([solution.x for solution in solutions])
     return Start(gain, light, solutions, meets=not counted)
 
 
@@ -71,7 +76,7 @@ def at_largest_gain(inverse: Inverse, problem: Problem, loss: float | None, exac
         return Start(*_at_a_loss(problem, loss))
     solved = inverse([np.hstack(sides) for sides in zip(problem.desired, problem.dark, strict=True)])
     k = problem.desired[0].shape[1]
-    u, v = (inverse.T.to_light([s.x[:, part] for s in solved]) for part in (slice(k), slice(k, None)))
+    u, v = (inverse.light([s.x[:, part] for s in solved]) for part in (slice(k), slice(k, None)))
     gain = gains.exact(u, v, problem.limits) if exactly and loss is None else None
     light = None
     if gain is None:
@@ -79,7 +84,7 @@ def at_largest_gain(inverse: Inverse, problem: Problem, loss: float | None, exac
     solutions = tuple(dataclasses.replace(s, x=gain * s.x[:, :k] - s.x[:, k:]) for s in solved)
     if light is not None:
         return Start(gain, light, solutions)
-    return Start(gain, inverse.T.to_light([s.x for s in solutions]), solutions, meets=True)
+    return Start(gain, inverse.light([s.x for s in solutions]), solutions, meets=True)
 
 
 def _at_a_loss(problem: Problem, loss: float | None) -> tuple[float, Columns]:

@@ -91,13 +91,14 @@ def compensate(
     (0.6, [[1.0, 1.0]])
     """
     require(T, square=False)
-    limits = Limits(*inputs.bounds(bounds), T.masked)
+    limits = Limits(*inputs.bounds(bounds), T.join([T.masked] * T.channels)[0])
     sought = inputs.gain(gain, loss)
     wanted, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
     dark = inputs.background(background, T, shape, wanted)
     counts = inputs.weights(weights, T, shape, wanted)
     rules = inputs.rules(T, method, rtol, options)
-    problem = Problem(systems(T), wanted, dark, counts, limits, rules)
+    wanted, dark = T.join(wanted), T.join(dark)
+    problem = Problem(systems(T), wanted, dark, None if counts is None else T.join(counts), limits, rules)
     inverse = Inverse(T, method, {"rtol": rtol, **options})
     if sought is not None:
         start = at_gain(inverse, problem, sought)
@@ -135,21 +136,23 @@ def _result(
     missing = [wanted - found for wanted, found in zip(target, seen, strict=True)]
     solved = tuple(found for found in limited if found is not None)
     solutions = start.solutions or solved
-    gaps = [s.residual if found is None else found.gap for s, found in zip(solutions, limited, strict=True)]
+    gaps = [found.gap for found in solved] + [
+        s.residual for s in start.solutions if len(solved) < len(limited)
+    ]
 
     def picture(columns: Columns, grid: tuple[int, int]) -> np.ndarray:
-        return shape.pack(columns, grid).astype(np.float32)
+        return shape.pack(T.split(columns), grid).astype(np.float32)
 
     return Compensation(
         pattern=picture(light, T.grid),
         appearance=picture(seen, T.camera_grid),
         gain=start.gain,
-        clipped=_clipped(limited, T.masked),
+        clipped=_clipped(limited, problem.limits.masked),
         target=picture(target, T.camera_grid),
         out_of_reach=picture(_beyond(missing, target, problem.rules["rtol"]), T.camera_grid),
         error=problem.norm(missing) / (problem.norm(target) or 1.0),
         gap=max(gaps),
-        solution=solutions[0] if T.channels == 1 else solutions,
+        solution=solutions[0] if len(solutions) == 1 else solutions,
         limited=solved,
     )
 
