@@ -62,12 +62,12 @@ def rules(T: Transport, method: str, rtol: Any, options: dict[str, Any]) -> dict
     """Options of a solve within the bounds; of a T without S, those are all that there are."""
     if not T.is_square:
         if method != "auto":
-            raise InputError(
-                f"method is {method!r}, but a T of {T.shape} has no S for it to solve; it must be 'auto'"
-            )
+            raise InputError(f"method is {method!r}, but this T has no S for it to solve; it must be 'auto'")
         for name in options:
             if name not in _OPTIONS:
-                raise InputTypeError(f"unknown option {name!r}; a T of {T.shape} has {', '.join(_OPTIONS)}")
+                raise InputTypeError(
+                    f"unknown option {name!r}; for a T without S there are {', '.join(_OPTIONS)}"
+                )
     rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
     atol = checks.number("atol", options.get("atol", 0.0), least=0.0)
     if rtol == 0.0 and atol == 0.0:

@@ -16,7 +16,7 @@ import scipy.sparse
 
 from ltcl.device import Device
 from ltcl.operators import Operator, ScaledColumns, as_operator
-from ltcl.solvers.bounded import Bounded, minimise
+from ltcl.solvers import Bounded, minimise
 from ltcl.transport import Transport
 
 _PROBES = 16  # of the norms of columns that cannot be seen: within a factor of 2, which is enough

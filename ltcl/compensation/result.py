@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ltcl.solvers import Solution
-from ltcl.solvers.bounded import Bounded
+from ltcl.solvers import Bounded, Solution
 
 
 @dataclass(frozen=True, repr=False)

@@ -19,8 +19,7 @@ from ltcl.compensation.problem import Limits, Problem, systems
 from ltcl.compensation.result import Compensation
 from ltcl.compensation.start import Inverse, Start, at_gain, at_largest_gain
 from ltcl.errors import ConvergenceError
-from ltcl.solvers import Status
-from ltcl.solvers.bounded import Bounded
+from ltcl.solvers import Bounded, Status
 from ltcl.transport import Transport, require
 
 Columns = list[np.ndarray]  # one (N, k) a channel of the transport
@@ -44,7 +43,8 @@ def compensate(
     Parameters
     ----------
     T : Transport
-        With more or fewer camera than projector pixels it works, too, in the least-squares sense.
+        With more or fewer camera than projector pixels, or blocks between colours, it works too, in the
+        least-squares sense and without `method`.
     desired : (h, w), (h, w, 3), or frames of these
         Wanted radiance at each camera pixel, in the units of T.
     bounds : (low, high)
@@ -66,7 +66,8 @@ def compensate(
     Returns
     -------
     Compensation
-        Never worse than the light without bounds, clamped.
+        Never worse than the light without bounds, clamped; at a `loss` found for gain="auto", by no more than
+        0.5 % of that.
 
     Raises
     ------
@@ -74,7 +75,8 @@ def compensate(
         Shapes that do not fit, bounds in the wrong order, a gain that is not positive, weights below 0, or
         no gain that keeps the picture within `loss`.
     ConvergenceError
-        The solve did not reach `rtol`.
+        A solve did not reach `rtol` in `maxiter` steps, or not at all. Within the bounds, where float32 is
+        too coarse to prove it, the best that was found comes back, and `gap` tells what is proved.
 
     Notes
     -----
