@@ -280,3 +280,45 @@ def dot_error(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """
     roundings = np.ceil(len(x) / _LEAVES) + 2 * np.log2(_LEAVES) + 2
     return gamma(roundings) * vector_dot(np.abs(x), np.abs(y))
+
+
+def bounded_look(
+    lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray, d: np.ndarray, h: np.ndarray
+) -> np.ndarray:
+    """Gap, z.z, z.h and z.d of every column, (4, k); bounds are (N,), the rest (N, k)."""
+    lower, upper, x, g, d, h = (np.asarray(part, np.float64) for part in (lower, upper, x, g, d, h))
+    lower, upper = lower[:, None], upper[:, None]
+    z = _free(lower, upper, x, g)
+    gap = np.maximum(g * (x - lower), g * (x - upper))
+    return np.stack([part.sum(axis=0) for part in (gap, z * z, z * h, z * d)])
+
+
+def bounded_direction(
+    alpha: np.ndarray,
+    beta: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    x: np.ndarray,
+    g: np.ndarray,
+    d: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """d (N, k); then g.d, d.d and the largest share of the way to a bound of every column, (3, k)."""
+    lower, upper, x, g, d = (np.asarray(part, np.float64) for part in (lower, upper, x, g, d))
+    lower, upper = lower[:, None], upper[:, None]
+    z = _free(lower, upper, x, g)
+    step = np.clip(x + alpha * np.where(z == 0, 0, z + beta * d), lower, upper) - x
+    way = np.where(step > 0, upper, lower) - x
+    share = np.divide(step, way, out=np.zeros_like(step), where=step != 0)
+    return step, np.stack([(g * step).sum(axis=0), (step * step).sum(axis=0), share.max(axis=0)])
+
+
+def bounded_move(
+    step: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: np.ndarray, x: np.ndarray
+) -> np.ndarray:
+    """x + step d, clipped, with (k,) steps."""
+    return np.clip(np.asarray(x, np.float64) + step * d, lower[:, None], upper[:, None])
+
+
+def _free(lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """-g, 0 where x is at a bound and -g points out."""
+    return np.where(((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0)), 0.0, -g)

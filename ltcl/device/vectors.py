@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a solver does between two products: fill, axpby, axpby column by column, diagonal scaling, dot, norm.
+"""What a solver does between two products: fill, axpby, axpby column by column, scaling, dot, norm.
 
 Everything is queued and returns at once; only `dot`, `dots` and `norm` give numbers to the host and so wait.
 Sums are trees over a fixed number of slices: the same bits at every call on a given device.
@@ -64,6 +64,13 @@ def scale_rows(d: Array, x: Array, out: Array) -> Array:
     if d.shape != x.shape[:1]:
         raise InputError(f"the diagonal has shape {d.shape}; it must be {x.shape[:1]}")
     _elementwise(out, "vector_scale_rows", x.columns, d, x, out)
+    return out
+
+
+def multiply(x: Array, y: Array, out: Array) -> Array:
+    """out = x y, entry by entry; `out` may be `x` or `y`."""
+    _same_shape(x, y, out)
+    _elementwise(out, "vector_scale_rows", 1, x, y, out)  # of one column as long as all
     return out
 
 

@@ -37,6 +37,7 @@ def test_elementwise_kernels_meet_their_twins(device, shape):
     close(vectors.axpy(a, X, Y.copy()).get(), reference.vector_axpby(a, x, 1, y), error)
     d = gallery.vectors(shape[0], None, 3)
     close(vectors.scale_rows(device.upload(d), X, out).get(), reference.vector_scale_rows(d, x), error)
+    close(vectors.multiply(X, Y, out).get(), np.float64(x) * y, reference.gamma(1) * np.abs(x * y))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
