@@ -16,7 +16,7 @@ from ltcl.device.array import Array
 from ltcl.errors import InputError
 
 _SLICES = 64  # partial sums of a dot product: enough groups for a large GPU, few enough for one last group
-_COPIERS = {True: 1 << 12, False: 1 << 16}  # items of `keep` on a CPU or not: each first finds whether to copy
+_COPIERS = {True: 1 << 12, False: 1 << 16}  # items of `keep` on a CPU or not: each has a rule to work out
 
 
 def fill(x: Array, value: float) -> Array:
