@@ -93,14 +93,17 @@ def scipy_gmres(problem: Problem, full: Any) -> tuple[np.ndarray, int]:
     return np.stack(found, axis=-1).reshape(problem.b.shape), len(calls)
 
 
+def _with_identity(R: Any) -> Any:
+    """S = I + R in float32, sparse or dense as R is."""
+    if scipy.sparse.issparse(R):
+        return scipy.sparse.csr_array(scipy.sparse.eye_array(R.shape[0]) + R).astype(np.float32)
+    return R + np.eye(len(R), dtype=np.float32)
+
+
 def compare(given: Options, problem: Problem, facts: dict[str, Any]) -> list[Row]:
     """Products and times of one problem."""
     R = problem.R
-    full = (
-        (scipy.sparse.eye_array(R.shape[0], format="csr", dtype=np.float32) + R)
-        if scipy.sparse.issparse(R)
-        else R + np.eye(len(R), dtype=np.float32)
-    )
+    full = _with_identity(R)
     first, ours = (ltcl.solve(problem.S, problem.b, rtol=RTOL) for _ in range(2))
     series, products = neumann(problem)
     krylov, steps = scipy_gmres(problem, full)

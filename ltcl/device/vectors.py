@@ -16,7 +16,7 @@ from ltcl.device.array import Array
 from ltcl.errors import InputError
 
 _SLICES = 64  # partial sums of a dot product: enough groups for a large GPU, few enough for one last group
-_COPIERS = 4096  # work-items of `keep`: each first works out whether to copy, so not one a value
+_COPIERS = {True: 1 << 12, False: 1 << 16}  # items of `keep` on a CPU or not: each has a rule to work out
 
 
 def fill(x: Array, value: float) -> Array:
@@ -108,7 +108,7 @@ def keep(weights: Array, squares: Array, slot: int, lowest: float, x: Array, bes
     row that is not finite is no best.
     """
     _same_shape(x, best)
-    items = min(_COPIERS, x.size)
+    items = min(_COPIERS[x.device.is_cpu], x.size)
     kernel = x.device.kernel("vector", "vector_keep")
     group = min(64, kernel.largest_group())
     with np.errstate(over="ignore"):
