@@ -87,7 +87,7 @@ class Array:
     def _row_bytes(self) -> int:
         return self.columns * self.dtype.itemsize
 
-    def _copy(self, to: Array, of: Array, nbytes: int, **offsets: int) -> None:
+    def _copy(self, to: Array, of: Array, nbytes: int, **offsets: Any) -> None:
         import pyopencl as cl
 
         if nbytes:

@@ -202,14 +202,14 @@ def _name_curves(axes: Axes, ends: Sequence[_End], limits: tuple[float, float]) 
     size, products = axes.get_window_extent(), axes.get_xlim()[1]
     height = _LINE / size.height * float(np.log(limits[1] / limits[0]))
     gap, letter = 0.025 * products, _LETTER / size.width * products
-    edge = [withStroke(linewidth=3, foreground=PAPER)]  # where a name crosses other curves
+    edge = withStroke(linewidth=3, foreground=PAPER)  # where a name crosses other curves
     for end, y in zip(ends, _apart(ends, limits, letter, height), strict=True):
         if y != end.y:
             axes.plot([end.x, end.x + gap], [end.y, y], color=end.colour, lw=0.8, alpha=0.6, clip_on=False)
         text = axes.text(
             end.x + gap, y, end.name, color=end.colour, fontsize=12, va="center", fontweight="bold"
         )
-        text.set_path_effects(edge)
+        text.set_path_effects([edge])
 
 
 def _dress(axes: Axes) -> None:

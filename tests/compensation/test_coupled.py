@@ -84,7 +84,9 @@ def test_within_bounds_the_colours_share_what_is_missing(device, kind, weighted)
         target = (1.1 * frame - background).reshape(N, 3).T.ravel()
         cost = lsq_linear(w[:, None] * WHOLE[kind], w * target, (0, 1), tol=1e-14).cost
         left = w * ((found - background).reshape(N, 3).T.ravel() - target)
-        assert np.linalg.norm(left) == pytest.approx(np.sqrt(2 * cost), abs=2e-4 * np.linalg.norm(w * target))
+        assert np.linalg.norm(left) == pytest.approx(
+            np.sqrt(2 * cost), abs=float(2e-4 * np.linalg.norm(w * target))
+        )
     assert 0.0 < c.clipped < 1.0
     assert len(c.limited) == 1
 
@@ -125,7 +127,7 @@ def test_rectangular_channels_mix_too(device):
     c = ltcl.compensate(T, target.reshape(3, 20).T.reshape(4, 5, 3), rtol=1e-4)
     cost = lsq_linear(whole, target, (0, 1), tol=1e-14).cost
     left = whole @ c.pattern.reshape(N, 3).T.ravel() - target
-    assert np.linalg.norm(left) == pytest.approx(np.sqrt(2 * cost), abs=2e-4 * np.linalg.norm(target))
+    assert np.linalg.norm(left) == pytest.approx(np.sqrt(2 * cost), abs=float(2e-4 * np.linalg.norm(target)))
 
 
 def test_separation_does_not_see_the_projectors_colours(device):

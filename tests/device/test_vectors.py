@@ -136,7 +136,8 @@ def test_the_best_iterate_is_kept_without_the_host(device, shape, last):
     for slot in range(len(rows)):
         for lowest in (np.inf, 3.0 * np.max(weights), 0.0):
             best = vectors.keep(device.upload(weights), squares, slot, lowest, X, Y.copy())
-            same_bits(best.get(), np.float32(reference.vector_keep(weights, rows, slot, lowest, x, y)))
+            kept = reference.vector_keep(weights, rows, slot, lowest, x, y)
+            same_bits(best.get(), np.asarray(kept, np.float32))
 
 
 def test_nan_and_infinity_come_through(device):
