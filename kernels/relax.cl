@@ -12,13 +12,11 @@
 //   relax_csr, relax_dense  one work-item a row, and as in csr.cl and dense.cl
 //   _stream                 the same in wide loads; for CPUs, where a row is a stream
 //   _group                  one work-group a row, its items side by side along the row; for GPUs
-// The first `lead` work-groups finish A, in one of two ways:
-//   in sequence  where chained >= 0: a single work-item goes through the rows of A that have entries left of the
-//                diagonal within A, while others correct the rest. `places` are first the rows of A, those
-//                `chained` ones before the others, and `weights` 1 / D_ii there. From starts[p] on follow the
-//                columns of row p of these, and its entries over the D of their columns.
-//   by inverse   as rows of a dense product: `weights` is [-P_AA^-1 S_AO, P_AA^-1] in rows; starts and places are
-//                any valid buffers and are not read.
+// The first `lead` work-groups finish A by inverse, as rows of a dense product with [-P_AA^-1 S_AO, P_AA^-1], which
+// `weights` is.
+//
+//   relax_substitute        finishes A in a launch of its own, in place: a single work-item goes through the rows
+//                           that have entries left of the diagonal within A, while others correct the rest.
 //
 // The sums of a row are kept apart where y ends and x begins, so that a sweep also tells the residual of x: what
 // this sweep takes from x, the one before took from y, and left the rest in carry = b - (S y)_lower.
@@ -50,42 +48,12 @@
         y[i] = x[i] + correction; \
     } while (0)
 
-// In s, rows become D / omega times their correction, which rows without entries are from the start.
-inline void relax_in_sequence(
-    int count, int chained, int stride, real omega, global const int *starts, global const int *places,
-    global const real *weights, global const real *x, global real *y, global real *s)
-{
-    const int other = chained + (int)get_global_id(0) - (int)get_local_size(0);  // not for the first group
-    if (get_group_id(0) > 0 && other < count)
-        for (int c = 0, i = places[other] * stride; c < K; ++c)
-            y[i + c] = x[i + c] + omega * weights[other] * s[i + c];
-    if (get_global_id(0) > 0)
-        return;
-    for (int row = 0; row < chained; ++row) {
-        const int i = places[row] * stride, end = starts[row + 1];
-        real sum[K];
-        for (int c = 0; c < K; ++c)
-            sum[c] = 0;
-        for (int j = starts[row]; j < end; ++j)
-            for (int c = 0; c < K; ++c)
-                sum[c] = weights[j] * s[places[j] * stride + c] + sum[c];
-        for (int c = 0; c < K; ++c) {
-            s[i + c] -= omega * sum[c];
-            y[i + c] = x[i + c] + omega * weights[row] * s[i + c];
-        }
-    }
-}
-
 // Work-items that each have a row of their own.
 inline void relax_finish(
-    int item, int start, int count, int before, int chained, int stride, real omega,
-    global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global real *s, global real *delta)
+    int item, int start, int count, int before, int stride,
+    global const real *weights, global const real *x,
+    global real *y, global const real *s, global real *delta)
 {
-    if (chained >= 0) {
-        relax_in_sequence(count, chained, stride, omega, starts, places, weights, x, y, s);
-        return;
-    }
     if (item >= count)
         return;
     const int known = start - before;
@@ -99,15 +67,11 @@ inline void relax_finish(
 
 // A work-group with a row of its own.
 inline void relax_finish_group(
-    int item, int start, int count, int before, int chained, int stride, real omega,
-    global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global real *s, global real *delta, local real *scratch)
+    int item, int start, int count, int before, int stride,
+    global const real *weights, global const real *x,
+    global real *y, global const real *s, global real *delta, local real *scratch)
 {
     const int me = get_local_id(0), step = get_local_size(0), known = start - before;
-    if (chained >= 0) {
-        relax_in_sequence(count, chained, stride, omega, starts, places, weights, x, y, s);
-        return;
-    }
     global const real *a = weights + (size_t)item * (known + count);
     real sum[K];
     for (int c = 0; c < K; ++c)
@@ -123,18 +87,17 @@ inline void relax_finish_group(
 }
 
 kernel void relax_csr(
-    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
-    int offset, real shift, real scale, real omega, global const int *pointers, global const int *columns,
+    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
+    int offset, real shift, real scale, global const int *pointers, global const int *columns,
     global const real *values, global const int *middle,
-    global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global const real *b, global real *s, global real *delta, global real *r,
+    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
     global real *carry)
 {
     stride = STRIDE(stride);
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish(
-            get_global_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
+            get_global_id(0), start, count, before, stride, weights, x, y, s,
             delta);
         return;
     }
@@ -152,17 +115,16 @@ kernel void relax_csr(
 }
 
 kernel void relax_dense(
-    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
-    int offset, real shift, real scale, real omega, int width, global const real *matrix,
-    global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global const real *b, global real *s, global real *delta, global real *r,
+    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
+    int offset, real shift, real scale, int width, global const real *matrix,
+    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
     global real *carry)
 {
     stride = STRIDE(stride);
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish(
-            get_global_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
+            get_global_id(0), start, count, before, stride, weights, x, y, s,
             delta);
         return;
     }
@@ -181,18 +143,17 @@ kernel void relax_dense(
 }
 
 kernel void relax_csr_stream(
-    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
-    int offset, real shift, real scale, real omega, global const int *pointers, global const int *columns,
+    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
+    int offset, real shift, real scale, global const int *pointers, global const int *columns,
     global const real *values, global const int *middle,
-    global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global const real *b, global real *s, global real *delta, global real *r,
+    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
     global real *carry)
 {
     stride = STRIDE(stride);
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish(
-            get_global_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
+            get_global_id(0), start, count, before, stride, weights, x, y, s,
             delta);
         return;
     }
@@ -207,17 +168,16 @@ kernel void relax_csr_stream(
 }
 
 kernel void relax_dense_stream(
-    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
-    int offset, real shift, real scale, real omega, int width, global const real *matrix,
-    global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global const real *b, global real *s, global real *delta, global real *r,
+    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
+    int offset, real shift, real scale, int width, global const real *matrix,
+    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
     global real *carry)
 {
     stride = STRIDE(stride);
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish(
-            get_global_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
+            get_global_id(0), start, count, before, stride, weights, x, y, s,
             delta);
         return;
     }
@@ -234,18 +194,17 @@ kernel void relax_dense_stream(
 }
 
 kernel void relax_csr_group(
-    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
-    int offset, real shift, real scale, real omega, global const int *pointers, global const int *columns,
+    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
+    int offset, real shift, real scale, global const int *pointers, global const int *columns,
     global const real *values, global const int *middle,
-    global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global const real *b, global real *s, global real *delta, global real *r,
+    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
     global real *carry, local real *scratch)
 {
     stride = STRIDE(stride);
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish_group(
-            get_group_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
+            get_group_id(0), start, count, before, stride, weights, x, y, s,
             delta, scratch);
         return;
     }
@@ -265,17 +224,16 @@ kernel void relax_csr_group(
 }
 
 kernel void relax_dense_group(
-    int rows, int begin, int first, int lead, int start, int count, int before, int chained, int stride,
-    int offset, real shift, real scale, real omega, int width, global const real *matrix,
-    global const int *starts, global const int *places, global const real *weights, global const real *x,
-    global real *y, global const real *b, global real *s, global real *delta, global real *r,
+    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
+    int offset, real shift, real scale, int width, global const real *matrix,
+    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
     global real *carry, local real *scratch)
 {
     stride = STRIDE(stride);
     x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
     if (get_group_id(0) < lead) {
         relax_finish_group(
-            get_group_id(0), start, count, before, chained, stride, omega, starts, places, weights, x, y, s,
+            get_group_id(0), start, count, before, stride, weights, x, y, s,
             delta, scratch);
         return;
     }
@@ -292,5 +250,35 @@ kernel void relax_dense_group(
         const real below = group_sum(lower[c], scratch), beyond = group_sum(upper[c], scratch);
         if (me == 0)
             RELAX_STORE(i + c, below, beyond);
+    }
+}
+
+// `places` are first the rows of A, those `chained` ones with entries before the others, and `weights` 1 / D_ii there.
+// From starts[p] on follow the columns of row p of these, and its entries over the D of their columns. In s, rows
+// become D / omega times their correction, which those without entries are from the start.
+kernel void relax_substitute(
+    int count, int chained, int stride, int offset, real omega, global const int *starts,
+    global const int *places, global const real *weights, global real *x, global real *s)
+{
+    stride = STRIDE(stride);
+    x += offset, s += offset;
+    const int other = chained + (int)get_global_id(0) - (int)get_local_size(0);  // not for the first group
+    if (get_group_id(0) > 0 && other < count)
+        for (int c = 0, i = places[other] * stride; c < K; ++c)
+            x[i + c] += omega * weights[other] * s[i + c];
+    if (get_global_id(0) > 0)
+        return;
+    for (int row = 0; row < chained; ++row) {
+        const int i = places[row] * stride, end = starts[row + 1];
+        real sum[K];
+        for (int c = 0; c < K; ++c)
+            sum[c] = 0;
+        for (int j = starts[row]; j < end; ++j)
+            for (int c = 0; c < K; ++c)
+                sum[c] = weights[j] * s[places[j] * stride + c] + sum[c];
+        for (int c = 0; c < K; ++c) {
+            s[i + c] -= omega * sum[c];
+            x[i + c] += omega * weights[row] * s[i + c];
+        }
     }
 }

@@ -111,7 +111,10 @@ def relax_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *ar
 def relax_finish(
     S: np.ndarray, omega: float | None, before: int, start: int, stop: int, s: np.ndarray, delta: np.ndarray
 ) -> np.ndarray:
-    """delta of P_AA delta_A = s_A - S_AO delta_O; P is the triangle with D / omega, or S (omega None)."""
+    """The delta of P_AA delta_A = s_A - S_AO delta_O: of relax_substitute, where O is empty, and the others.
+
+    P is the triangle with D / omega, or S where omega is None.
+    """
     own = np.asarray(S, np.float64)[start:stop, start:stop]
     P = own if omega is None else np.tril(own, -1) + np.diag(own.diagonal() / omega)
     return np.linalg.solve(P, s[start:stop] - S[start:stop, before:start] @ delta[before:start])

@@ -58,7 +58,7 @@ class Finish:
 
     block: Block
     chained: int
-    arguments: tuple[Array, Array, Array]
+    arguments: tuple[Array, ...]
 
 
 def cut(n: int, size: int, *, overlap: bool) -> list[Block]:
@@ -130,7 +130,6 @@ def by_inverse(rows: Rows, blocks: list[Block], omega: float | None, method: str
     M = rows.M
     size = sum((block.stop - block.start) * (block.stop - block.before) for block in blocks)
     M.device.require(4 * size, f"method={method!r} with inverses of {len(blocks)} blocks")
-    unused = M.device.upload([0], np.int32)
     places = ((slice(block.start, block.stop), slice(block.before, block.stop)) for block in blocks)
     for number, (block, part) in enumerate(zip(blocks, M.parts(places), strict=True)):
         part = rows.scale * part
@@ -144,7 +143,7 @@ def by_inverse(rows: Rows, blocks: list[Block], omega: float | None, method: str
                 f"{block.stop - 1}, is singular; choose another block= or use method='direct'"
             )
         weights = np.hstack([-inverse @ part[:, :known], inverse])
-        yield Finish(block, -1, (unused, unused, M.device.upload(weights)))
+        yield Finish(block, -1, (M.device.upload(weights),))
 
 
 def _inverse(own: np.ndarray, omega: float | None) -> np.ndarray | None:

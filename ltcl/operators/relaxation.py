@@ -98,22 +98,33 @@ class Relaxation:
         kernel = self.device.kernel("relax", f"relax_{rows.M.file}{variant}", K=width, **packed)
         group = fastest.group or (_ITEMS if self.device.is_cpu else 64)
         taken = 1 if fastest.group else group  # rows of a work-group
-        numbers = (columns, offset, rows.shift, rows.scale, self.omega)
+        numbers = (columns, offset, rows.shift, rows.scale)
         old = state.x if self.in_place else state.before
         vectors = (old, state.x, state.b, state.s, state.delta, state.r, state.carry)
         local = (self.device.local(group),) if fastest.group else ()
+        alone = self.device.kernel("relax", "relax_substitute", K=width, **packed)
 
         def launch(step: Step) -> None:
             block, finish = step.finish.block, step.finish
-            count, size = block.stop - block.start, group
-            lead, work = -(-count // taken), -(-step.rows // taken)
-            if self.in_place and count:  # a launch of its own: one group in sequence, the others beside it
+            count = block.stop - block.start
+            if finish.chained >= 0:
                 size = min(_CORRECTED, self.device.max_group)
-                lead = 1 - (finish.chained - count) // size
-            place = (step.rows, step.begin, rows.M.slabs[step.slab].first, lead)
-            finished = (step.start, count, block.before, finish.chained)
-            arguments = (*place, *finished, *numbers, *self._slabs[step.slab], *finish.arguments, *vectors)
-            kernel(size * (lead + work), size, *arguments, *local)
+                items = size * (1 - (finish.chained - count) // size)
+                numbered = (count, finish.chained, columns, offset, self.omega)
+                alone(items, size, *numbered, *finish.arguments, state.x, state.s)
+                return
+            lead, work = -(-count // taken), -(-step.rows // taken)
+            place = (
+                step.rows,
+                step.begin,
+                rows.M.slabs[step.slab].first,
+                lead,
+                step.start,
+                count,
+                block.before,
+            )
+            arguments = (*place, *numbers, *self._slabs[step.slab], *finish.arguments, *vectors)
+            kernel(group * (lead + work), group, *arguments, *local)
 
         return launch
 
@@ -132,8 +143,7 @@ class Relaxation:
 
     def _plan(self, finishes: list[Finish]) -> Iterator[Step]:
         """Blocks are those of the matrix: one that crosses slabs has its product in several launches."""
-        unused = self.device.upload([0], np.int32)
-        waiting = nothing = Finish(Block(0, 0, 0), -1, (unused, unused, unused))
+        waiting = nothing = Finish(Block(0, 0, 0), -1, (self.device.upload([0.0]),))
         for finish in finishes:
             for number, slab in enumerate(self.rows.M.slabs):
                 begin = max(finish.block.start, slab.first)
