@@ -84,8 +84,8 @@ class Problem:
     def nearest(self, which: int, gain: float, start: np.ndarray, **rules: Any) -> tuple[np.ndarray, Bounded]:
         """The light (N, k) of one system within the limits that comes nearest to the target."""
         system, limits = self.systems[which], self.limits
-        scale = np.where(limits.masked, 0.0, system.scale).astype(np.float32)
-        lower, upper = scale * np.float32(limits.low), scale * np.float32(limits.high)
+        scale = np.where(limits.masked, 0.0, system.scale)
+        lower, upper = ((scale * bound).astype(np.float32) for bound in (limits.low, limits.high))
         found = minimise(
             system.A,
             self.target(gain)[which],

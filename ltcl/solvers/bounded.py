@@ -38,6 +38,8 @@ from ltcl.solvers.result import Solution, Status
 
 _DESCENT = 0.1  # of z.z: below, p.z is too little to follow p
 _STRAIGHT = 0.5  # of d': a shorter step tells that clipping has bent d' far from p, and conjugacy is lost
+_ROUNDING = 2.0**-22  # of ||w b||: an error is not told from the least one by less
+_FAR = 1e30  # in units of b: a bound where none was meant, inside float32
 _PATIENCE = 50  # steps without a better certificate: rounding has the say
 
 
@@ -101,10 +103,11 @@ def minimise(
         Of status CONVERGED, MAXITER, or STAGNATED where rounding hides any further gain.
     """
     start = time.perf_counter()
-    unit = _power(max(float(np.max(np.abs(part))) for part in (b, lower, upper)))
+    largest = float(np.max(np.abs(b)))
+    unit = _power(largest or max(float(np.max(np.abs(part))) for part in (lower, upper)))
     unit_w = 1.0 if weights is None else _power(float(np.max(weights)))
     upload = A.device.upload
-    box = Box(upload(lower / unit), upload(upper / unit))
+    box = Box(*(upload(np.clip(part / unit, -_FAR, _FAR)) for part in (lower, upper)))
     w = None if weights is None else upload(weights / unit_w)
     descent = _Descent(
         A, upload(b / unit), w, box, upload(np.clip(x0, lower[:, None], upper[:, None]) / unit)
@@ -129,7 +132,7 @@ def minimise(
         errors=errors * unit * unit_w,
         least=judge.least * unit * unit_w,
         held=held,
-        gap=float(np.max((errors - judge.least) / judge.scale)),
+        gap=float(np.max(judge.excess(errors) / judge.scale)),
     )
 
 
@@ -230,8 +233,12 @@ class _Judge:
         self.errors = errors
         bound = errors - ratio(look.gap, errors, errors > 0.0)
         self.least = np.fmax(self.least, np.minimum(bound, errors))
-        self._above = np.where(np.isfinite(errors), np.minimum(errors, errors - self.least), np.inf)
-        self.unsolved = self._above > self._tolerance
+        self.unsolved = self.excess(errors) > self._tolerance
+
+    def excess(self, errors: np.ndarray) -> np.ndarray:
+        """What errors are above the least, at most, (k,)."""
+        above = np.maximum(errors - self.least, _ROUNDING * self.scale)
+        return np.where(np.isfinite(errors), above, np.inf)
 
     def _verdict(self) -> Status | None:
         if not self.unsolved.any():
@@ -242,7 +249,7 @@ class _Judge:
         return Status.STAGNATED if waited > _PATIENCE else None
 
     def _record(self) -> None:
-        above = float(np.max(self._above / self.scale))
+        above = float(np.max(self.excess(self.errors) / self.scale))
         if above < self._lowest:
             self._lowest, self._lowest_at = above, len(self.residuals)
         if self._callback is not None:
