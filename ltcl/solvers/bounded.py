@@ -38,6 +38,8 @@ from ltcl.solvers.result import Solution, Status
 
 _DESCENT = 0.1  # of z.z: below, p.z is too little to follow p
 _STRAIGHT = 0.5  # of d': a shorter step tells that clipping has bent d' far from p, and conjugacy is lost
+_ROUNDING = 2.0**-22  # of ||w b||: an error is not told from the least one by less
+_FAR = 1e30  # in units of b: a bound where none was meant, inside float32
 _PATIENCE = 50  # steps without a better certificate: rounding has the say
 
 
@@ -52,7 +54,7 @@ class Bounded(Solution):
     least : (k,) float64
         What no x within the bounds is below, by the gap and as exact as float32 products.
     held : (N, k) bool
-        Where x is at a bound, and a step beyond would lower the error.
+        Where x is at a bound or all but there, and a step beyond would lower the error.
     gap : float
         Largest ``(errors - least) / ||w b||``; `residuals` holds the largest ``errors / ||w b||``.
     """
@@ -61,6 +63,13 @@ class Bounded(Solution):
     least: np.ndarray
     held: np.ndarray
     gap: float
+
+    def __str__(self) -> str:
+        advice = "" if self.converged else f": {self.status.value}"
+        return (
+            f"bounded: {self.status.name.lower()} after {self.iterations} iterations, "
+            f"{self.products} products, relative error {self.residuals[-1]:.2g}, at most {self.gap:.2g} above the least{advice}"
+        )
 
 
 def minimise(
@@ -99,12 +108,22 @@ def minimise(
     -------
     Bounded
         Of status CONVERGED, MAXITER, or STAGNATED where rounding hides any further gain.
+
+    Examples
+    --------
+    >>> import ltcl
+    >>> from ltcl.operators import Dense
+    >>> A = Dense(ltcl.open_device(), [[1.0, 0.5], [0.5, 1.0]])
+    >>> s = minimise(A, np.array([[1.0], [0.0]]), np.zeros(2), np.ones(2), np.zeros((2, 1)), rtol=1e-4)
+    >>> print(s.x.ravel().round(2), s.held.ravel())  # without bounds 4/3 and -2/3
+    [0.8 0. ] [False  True]
     """
     start = time.perf_counter()
-    unit = _power(max(float(np.max(np.abs(part))) for part in (b, lower, upper)))
+    largest = float(np.max(np.abs(b)))
+    unit = _power(largest or max(float(np.max(np.abs(part))) for part in (lower, upper)))
     unit_w = 1.0 if weights is None else _power(float(np.max(weights)))
     upload = A.device.upload
-    box = Box(upload(lower / unit), upload(upper / unit))
+    box = Box(*(upload(np.clip(part / unit, -_FAR, _FAR)) for part in (lower, upper)))
     w = None if weights is None else upload(weights / unit_w)
     descent = _Descent(
         A, upload(b / unit), w, box, upload(np.clip(x0, lower[:, None], upper[:, None]) / unit)
@@ -129,7 +148,7 @@ def minimise(
         errors=errors * unit * unit_w,
         least=judge.least * unit * unit_w,
         held=held,
-        gap=float(np.max((errors - judge.least) / judge.scale)),
+        gap=float(np.max(judge.excess(errors) / judge.scale)),
     )
 
 
@@ -181,10 +200,10 @@ class _Descent:
         self.g, self.true = g, False
 
     def held(self, x: np.ndarray) -> np.ndarray:
-        """Entries at a bound that want to go beyond, and could if there were none."""
+        """Entries that a step along -g takes beyond a bound; some come close to it without touching."""
         lower, upper = (part.get()[:, None] for part in (self.box.lower, self.box.upper))
-        g = self.g.get()
-        return (lower < upper) & (((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0)))
+        beyond = x - self._alpha * self.g.get()
+        return (lower < upper) & ((beyond < lower) | (beyond > upper))
 
     def _gradient(self, out: Array) -> Array:
         wr = self.r if self.w is None else vectors.multiply(self.w, self.r, self.r.like())
@@ -230,8 +249,12 @@ class _Judge:
         self.errors = errors
         bound = errors - ratio(look.gap, errors, errors > 0.0)
         self.least = np.fmax(self.least, np.minimum(bound, errors))
-        self._above = np.where(np.isfinite(errors), np.minimum(errors, errors - self.least), np.inf)
-        self.unsolved = self._above > self._tolerance
+        self.unsolved = self.excess(errors) > self._tolerance
+
+    def excess(self, errors: np.ndarray) -> np.ndarray:
+        """What errors are above the least, at most, (k,)."""
+        above = np.maximum(errors - self.least, _ROUNDING * self.scale)
+        return np.where(np.isfinite(errors), above, np.inf)
 
     def _verdict(self) -> Status | None:
         if not self.unsolved.any():
@@ -242,7 +265,7 @@ class _Judge:
         return Status.STAGNATED if waited > _PATIENCE else None
 
     def _record(self) -> None:
-        above = float(np.max(self._above / self.scale))
+        above = float(np.max(self.excess(self.errors) / self.scale))
         if above < self._lowest:
             self._lowest, self._lowest_at = above, len(self.residuals)
         if self._callback is not None:

@@ -135,6 +135,17 @@ def test_a_target_within_reach_costs_no_step(device):
     assert not s.held.any()
 
 
+@pytest.mark.parametrize("far", [1e3, 1e9, 1e30])
+def test_a_bound_that_means_none_hides_nothing(device, far):
+    """The certificate is worth little then, the answer is not."""
+    S = lambertian(30, 2.0).S.astype(np.float32)
+    b = S @ random.uniform(-0.5, 1.0, (30, 1))
+    s = minimise(Dense(device, S), b, np.zeros(30), np.full(30, far), np.zeros((30, 1)), rtol=1e-4)
+    best = errors(S, exact(S, b, np.zeros(30), np.full(30, 10.0)), b)
+    assert (errors(S, s.x, b) <= best * (1 + 1e-4)).all()
+    assert (s.least <= best * (1 + 1e-6)).all()
+
+
 def test_black_is_reached_by_the_darkest_light(device):
     """b = 0 has no norm to be relative to."""
     S = lambertian(30, 0.8).S.astype(np.float32)
