@@ -72,11 +72,6 @@ kernel void dense_matvec_group(
     }
 }
 
-typedef union {
-    stretch vector;
-    real item[LANES];
-} stretch_items;
-
 // out = scale * (slab^T x) + add, where x is read from row `first` on. The host adds the slabs up, one
 // launch after the other, so the sum has one order.
 kernel void dense_rmatvec(

@@ -58,12 +58,13 @@ INLINE stretch exchange(spots p, spots p_normal, spots q, spots q_normal, global
     const stretch here = dot3(d, p_normal), there = -dot3(d, q_normal), r2 = dot3(d, d);
     // What is added to the denominator serves a patch and itself: 0 / 0 otherwise.
     const stretch value = here * there / (PI * r2 * r2 + 1e-30f);
-    flags open = (here > GRAZING) & (there > GRAZING);
+    const flags facing = (here > GRAZING) & (there > GRAZING);
+    const stretch open = facing ? value : (stretch)(0);
 #if BLOCKS
-    if (ANY(open))
-        open &= !ltcl_blocked(p, q, blocks);
+    if (ANY(facing))
+        return ltcl_blocked(p, q, blocks) ? (stretch)(0) : open;
 #endif
-    return open ? value : (stretch)(0);
+    return open;
 }
 
 // Point k of the rule is at angle k pi / 4 on an ellipse in each patch; it meets point 3 k of the other.
@@ -148,10 +149,7 @@ kernel void form_factor_pairs(
     const int i = from[n], start = to[n] / LANES * LANES;
     const spots p = spread_spots(geometry, pitch, CENTRE, i), normal = spread_spots(geometry, pitch, NORMAL, i);
     const stretch reach = (stretch)(geometry[3 * REACH * pitch + i]);
-    union {
-        stretch vector;
-        real item[LANES];
-    } g;
+    stretch_items g;
     g.vector = entries(i, p, normal, reach, start, geometry, pitch, blocks);
     out[n] = g.item[to[n] - start];
 }

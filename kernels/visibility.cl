@@ -15,21 +15,16 @@
 #include "common/spots.h"
 
 // The rays of patch i to patches j .. j + LANES - 1 that get through, counted.
-INLINE flags seen(
+INLINE stretch seen(
     int rays, int pitch, int i, int j, global const real *starts, global const real *ends,
     global const real *blocks)
 {
-    const flags none = 0, one = 1;
-    flags open = 0;
+    const stretch one = 1, none = 0;
+    stretch open = 0;
     for (int k = 0; k < rays; ++k)
         open += ltcl_blocked(spread_spots(starts, pitch, k, i), load_spots(ends, pitch, k, j), blocks) ? none : one;
     return open;
 }
-
-typedef union {
-    flags vector;
-    int item[LANES];
-} counts;
 
 kernel void visibility_rows(
     int rows, int first, int count, int pitch, int rays, global const real *starts, global const real *ends,
@@ -39,10 +34,10 @@ kernel void visibility_rows(
     const int row = get_global_id(1);
     if (j >= count || row >= rows)
         return;
-    counts open;
+    stretch_items open;
     open.vector = seen(rays, pitch, first + row, j, starts, ends, blocks);
     for (int lane = 0; lane < min(LANES, count - j); ++lane)
-        out[(size_t)row * count + j + lane] = (real)open.item[lane] / rays;
+        out[(size_t)row * count + j + lane] = open.item[lane] / rays;
 }
 
 kernel void visibility_pairs(
@@ -53,7 +48,7 @@ kernel void visibility_pairs(
     if (n >= count)
         return;
     const int start = to[n] / LANES * LANES;
-    counts open;
+    stretch_items open;
     open.vector = seen(rays, pitch, from[n], start, starts, ends, blocks);
-    out[n] = (real)open.item[to[n] - start] / rays;
+    out[n] = open.item[to[n] - start] / rays;
 }

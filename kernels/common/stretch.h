@@ -28,6 +28,11 @@ typedef int flags;
 #define TOTAL(v) (v)
 #endif
 
+typedef union {
+    stretch vector;
+    real item[LANES];
+} stretch_items;
+
 // What works on stretches must be inlined: a call passes each of them through memory.
 #ifdef __clang__
 #define INLINE inline __attribute__((always_inline))

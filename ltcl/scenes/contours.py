@@ -20,7 +20,9 @@ from __future__ import annotations
 import numpy as np
 import scipy.special
 
-_POINTS = 40
+TOUCHING, APART = 40, 16
+"""Points on each piece of an edge: for patches that touch or nearly, and for others."""
+
 _SLAB = 2048  # pairs of patches at a time, so that temporary arrays stay in the cache
 
 
@@ -83,13 +85,15 @@ def clip(outlines: np.ndarray, height: np.ndarray) -> np.ndarray:
     return np.stack([starts, edges], axis=2)
 
 
-def exchange(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def exchange(first: np.ndarray, second: np.ndarray, points: int = TOUCHING) -> np.ndarray:
     """a_i F_ij of pairs of patches, (P,), in the unit of the outlines squared.
 
     Parameters
     ----------
     first, second : ndarray, (P, E, 2, 3)
         Outlines, each wholly in front of the other's plane.
+    points : int
+        `TOUCHING` or `APART`.
 
     Examples
     --------
@@ -101,30 +105,30 @@ def exchange(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     total = np.zeros(len(first))
     for start in range(0, len(first), _SLAB):
         slab = slice(start, start + _SLAB)
-        total[slab] = _slab(first[slab], second[slab])
+        total[slab] = _slab(first[slab], second[slab], points)
     # Patches that hardly see each other may come out a rounding error below zero.
     return np.maximum(total, 0) / (2 * np.pi)
 
 
-def _slab(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _slab(first: np.ndarray, second: np.ndarray, points: int) -> np.ndarray:
     total = np.zeros(len(first))
     for p in range(first.shape[1]):
         for q in range(second.shape[1]):
             product = np.einsum("pi,pi->p", first[:, p, 1], second[:, q, 1])
             some = np.flatnonzero(product)
             if len(some):
-                total[some] += product[some] * _mean_log(first[some, p], second[some, q])
+                total[some] += product[some] * _mean_log(first[some, p], second[some, q], points)
     return total
 
 
-def _mean_log(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+def _mean_log(p: np.ndarray, q: np.ndarray, points: int) -> np.ndarray:
     """Mean of ln r between points of two segments (P, 2, 3), (P,)."""
     (start, edge), (other, along) = np.moveaxis(p, 1, 0), np.moveaxis(q, 1, 0)
     length = np.linalg.norm(along, axis=1)
     unit = along / length[:, None]
     offset = start - other
     cuts = _cuts(edge, along, offset)
-    node, weight = _crowded()
+    node, weight = _crowded(points)
     s = cuts[:, :-1, None] + np.diff(cuts, axis=1)[..., None] * node  # (P, pieces, points)
     # Of a point of p: how far along q, and at which distance from its line.
     t0, t1 = np.einsum("pi,pi->p", offset, unit), np.einsum("pi,pi->p", edge, unit)
@@ -155,8 +159,8 @@ def _log_integral(t: np.ndarray, distance: np.ndarray) -> np.ndarray:
     return scipy.special.xlogy(t, t**2 + distance**2) / 2 - t + distance * np.arctan2(t, distance)
 
 
-def _crowded() -> tuple[np.ndarray, np.ndarray]:
+def _crowded(points: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Legendre on [0, 1] under s = u^3 (10 - 15 u + 6 u^2), which flattens logarithms at both ends."""
-    node, weight = np.polynomial.legendre.leggauss(_POINTS)
+    node, weight = np.polynomial.legendre.leggauss(points)
     u = (node + 1) / 2
     return u**3 * (10 - 15 * u + 6 * u**2), weight / 2 * 30 * u**2 * (1 - u) ** 2

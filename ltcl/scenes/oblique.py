@@ -31,7 +31,7 @@ _TIERS = ((12.0, 3), (4.0, 4), (2.5, 5), (2.0, 6), (1.5, 8))
 """Distance of the centres in radii of both patches from which on so many points a side are enough."""
 
 _TOUCH = 1e-12  # of the patches' size: heights above a plane that are rounding errors
-_SLAB = 1 << 18  # pairs of quadrature points at a time, so that they stay in the cache
+_SLAB = 1 << 16  # pairs of quadrature points at a time, so that they stay in the cache
 
 
 def exchange(first: Wall, second: Wall, n: int) -> np.ndarray:
@@ -129,8 +129,9 @@ def _of_offsets(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np
         some = np.flatnonzero(left & (distance >= least))
         result[some] = _quadrature(first, second, offset[some], points)
         left[some] = False
-    near = np.flatnonzero(left | (facing & cut))
-    result[near] = _outlines(first, second, offset[near], cut[near])
+    apart = facing & cut & (distance >= _TIERS[-1][0])
+    for some, points in ((apart, contours.APART), (left | (facing & cut & ~apart), contours.TOUCHING)):
+        result[some] = _outlines(first, second, offset[some], cut[some], points)
     return result
 
 
@@ -150,7 +151,9 @@ def _heights(plane: np.ndarray, patch: np.ndarray, offset: np.ndarray) -> np.nda
     return (offset @ normal)[:, None] + signs @ patch @ normal
 
 
-def _outlines(first: np.ndarray, second: np.ndarray, offset: np.ndarray, cut: np.ndarray) -> np.ndarray:
+def _outlines(
+    first: np.ndarray, second: np.ndarray, offset: np.ndarray, cut: np.ndarray, points: int
+) -> np.ndarray:
     """By the integral over both outlines, each clipped by the other's plane where that cuts it."""
     # Counted in patch sides, as the logarithms of a closed outline cancel best near 1.
     unit = _size(first[0])
@@ -159,10 +162,11 @@ def _outlines(first: np.ndarray, second: np.ndarray, offset: np.ndarray, cut: np
     one = contours.outline(centre - first.sum(axis=0) / 2, first[1], first[0])
     other = contours.outline(offset - second.sum(axis=0) / 2, second[1], second[0])
     result = np.empty(len(offset))
-    result[~cut] = contours.exchange(one[~cut], other[~cut])
+    result[~cut] = contours.exchange(one[~cut], other[~cut], points)
     if cut.any():
         over, under = _heights(second, first, -offset[cut]), _heights(first, second, offset[cut])
-        result[cut] = contours.exchange(contours.clip(one[cut], over), contours.clip(other[cut], under))
+        clipped = contours.clip(one[cut], over), contours.clip(other[cut], under)
+        result[cut] = contours.exchange(*clipped, points)
     return result * unit**2
 
 
@@ -174,6 +178,9 @@ def _quadrature(first: np.ndarray, second: np.ndarray, offset: np.ndarray, point
     here, there = place @ first, place @ second  # (Q, 3)
     between = (there[None, :] - here[:, None]).reshape(-1, 3)
     square = np.einsum("ki,ki->k", between, between)
+    normal, other = _normal(first), _normal(second)
+    # The height of a point over the first plane is that of its patch's centre and its own from there.
+    moments = np.stack([weights, weights * (there @ normal)], axis=1)
     result = np.empty(len(offset))
     step = max(1, _SLAB // len(square))
     for start in range(0, len(offset), step):
@@ -183,10 +190,10 @@ def _quadrature(first: np.ndarray, second: np.ndarray, offset: np.ndarray, point
         r2 += np.einsum("pi,pi->p", apart, apart)[:, None]
         np.square(r2, out=r2)
         np.reciprocal(r2, out=r2)
-        leave = weights * ((apart @ _normal(second))[:, None] - here @ _normal(second))
-        meet = weights * ((apart @ _normal(first))[:, None] + there @ _normal(first))
-        kernel = r2.reshape(-1, len(weights), len(weights))
-        result[start : start + step] = -np.einsum("pk,pkl,pl->p", leave, kernel, meet, optimize=True)
+        inner = (r2.reshape(-1, len(weights)) @ moments).reshape(len(apart), -1, 2)
+        meet = (apart @ normal)[:, None] * inner[..., 0] + inner[..., 1]
+        leave = weights * ((apart @ other)[:, None] - here @ other)
+        result[start : start + step] = -np.einsum("pk,pk->p", leave, meet)
     return result * _area(first) * _area(second) / np.pi
 
 

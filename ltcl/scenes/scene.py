@@ -80,7 +80,9 @@ class Scene:
     def __post_init__(self) -> None:
         h, w = checks.grid("grid", self.grid)
         object.__setattr__(self, "grid", (h, w))
-        if not self.walls or w % len(self.walls):
+        if not self.walls:
+            raise InputError("walls are 0; a scene needs at least one")
+        if w % len(self.walls):
             raise InputError(f"walls are {len(self.walls)}; they must divide the {w} columns of the grid")
         for name, shapes in {
             "form_factors": [(h * w, h * w)],

@@ -10,7 +10,7 @@ import pytest
 
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.scenes import Block, Scene, box
+from ltcl.scenes import Block, FormFactor, Scene, box, cut
 from ltcl.scenes.box import WALLS
 from ltcl.scenes.occlusion import form_factors, lit_faces
 from ltcl.scenes.viewer import frame
@@ -56,6 +56,15 @@ def test_exchange_of_walls_past_a_block_agrees_with_sampling(device: Device, blo
         mean, error = sampled_exchange(every[i], every[j], 100_000, block)
         found = F[:, i, :, :, j].sum() * every[i].area / N**2
         assert found == pytest.approx(mean, abs=5 * error + 5e-3 * mean), (every[i].name, every[j].name)
+
+
+def test_the_operator_that_stores_no_matrix_gives_the_same_bounce(device: Device) -> None:
+    """Another code, with other formulas and other rays."""
+    scene = box(8, occluder=LAMP, device=device)
+    bounce = FormFactor(cut(scene.walls, 8), blocks=[(LAMP.low, LAMP.high)], device=device)
+    light = np.random.default_rng(0).random(len(scene.area))
+    found, expected = bounce @ light, scene.form_factors @ light
+    assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)
 
 
 def test_reciprocity_is_exact(device: Device) -> None:
