@@ -148,17 +148,19 @@ def southwell_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray,
     )
 
 
-def form_factor_pair(p: np.ndarray, q: np.ndarray, n: np.ndarray, m: np.ndarray) -> np.ndarray:
+def form_factor_pair(
+    p: np.ndarray, q: np.ndarray, n: np.ndarray, m: np.ndarray, clip: bool = True
+) -> np.ndarray:
     """cos cos / (pi r^2) of all points p (M, 3) with normals n and points q (N, 3) with normals m: (M, N)."""
     d = q[None] - p[:, None]
     r2 = (d**2).sum(axis=2)
     here, there = np.einsum("mnc,mc->mn", d, n), -np.einsum("mnc,nc->mn", d, m)
-    faces = (here > 1e-6) & (there > 1e-6)
+    faces = (here > 1e-6) & (there > 1e-6) if clip else r2 > 0
     return np.divide(here * there, np.pi * r2**2, out=np.zeros_like(r2), where=faces)
 
 
-def form_factor_entries(geometry: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6)."""
+def form_factor_entries(geometry: np.ndarray, blocks: np.ndarray, outer: float, inner: float) -> np.ndarray:
+    """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6); see `kernels/form_factor.cl`."""
     centre, right, down, normal = (geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4))
     angle = np.arange(8) * np.pi / 4
     place = np.sqrt(2 / 3) / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # on a circle, in edges
@@ -167,9 +169,28 @@ def form_factor_entries(geometry: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     def between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         return form_factor_pair(p, q, normal, normal) * ~blocked(p[:, None], q[None], blocks)
 
-    close = sum(between(points[k], points[3 * k % 8]) for k in range(8)) / 8
-    r2 = ((centre[None] - centre[:, None]) ** 2).sum(axis=2)
-    return np.where(r2 < geometry[12] + geometry[12][:, None], close, between(centre, centre))
+    eight = sum(between(points[k], points[3 * k % 8]) for k in range(8)) / 8
+    one = between(centre, centre)
+    # Half the second derivative along each edge times its variance, 1 / 12, by differences.
+    curved, step = form_factor_pair(centre, centre, normal, normal, clip=False), 1e-2
+    middle = curved.copy()
+    for edge in (right, down):
+        for end in (-step * edge, step * edge):
+            curved += (form_factor_pair(centre + end, centre, normal, normal, clip=False) - middle) / (
+                24 * step**2
+            )
+            curved += (form_factor_pair(centre, centre + end, normal, normal, clip=False) - middle) / (
+                24 * step**2
+            )
+    curved *= ~blocked(centre[:, None], centre[None], blocks)
+    d = centre[None] - centre[:, None]
+    height = np.einsum("mnc,mc->mn", d, normal)
+    rise = sum(np.abs(normal @ edge.T) for edge in (right, down)) / 2
+    above, below = height + rise > 1e-6, height - rise < -1e-6
+    r2, sizes = (d**2).sum(axis=2), geometry[12] + geometry[12][:, None]
+    hard = (r2 < inner**2 * sizes) | below | below.T
+    close = np.where(above & above.T, np.where(hard, eight, curved), 0.0)
+    return np.where(r2 < outer**2 * sizes, close, one)
 
 
 def form_factor_weigh(right: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -28,7 +28,8 @@ def kernel_matrix(A: FormFactor) -> tuple[np.ndarray, np.ndarray]:
     """What the kernel and the stored corrections stand for, (N, N) float64 each, by the twin."""
     count = A.shape[0]
     geometry, blocks = A._geometry.get()[:, :count], A._blocks.get()
-    G = reference.form_factor_entries(geometry, blocks[: A._defines["BLOCKS"]])
+    boxes, outer, inner = (A._defines[name] for name in ("BLOCKS", "OUTER", "INNER"))
+    G = reference.form_factor_entries(geometry, blocks[:boxes], outer, inner)
     albedo, area = A._albedo.get().astype(np.float64), A._area.get().astype(np.float64)
     return albedo[:, None] * G * area, A._near.to_dense()
 
@@ -49,6 +50,7 @@ SCENES = {
     "2 patches": (lambda: cut(WALLS[:2], 1), None),
     "7 tiles": (lambda: tiles(7, 1), None),
     "53 tiles": (lambda: tiles(53, 2), None),
+    "tiles around a block": (lambda: tiles(23, 3), [[(-1, -1, -1), (1, 1, 1)]]),
     "room": (lambda: cut(WALLS, 3), None),
     "room with a block": (lambda: cut([*WALLS, *box_faces(*BLOCK[0])], 2), BLOCK),
     "two blocks": (lambda: cut(WALLS, 3), [*BLOCK, [(0.4, 0.6, 0.2), (0.6, 0.7, 0.9)]]),
