@@ -160,7 +160,7 @@ def claims(shade: Recovery, gloss: Recovery, camera: float) -> list[Claim]:
         Claim("gloss: direct light in 20 iterations", f"1 % after {gloss.steps}", "20", gloss.steps <= 20),
         *(
             Claim(
-                f"{name}: an iteration shrinks the error by rho(R), and no less",
+                f"{name}: each iteration leaves rho(R) of the error",
                 f"{found.rate:.3f}, rho(R) = {found.rho:.3f}",
                 "within 2%",
                 abs(found.rate / found.rho - 1) < 0.02,
