@@ -8,6 +8,8 @@ where T couples them: then (3 N, k) arrays hold channel below channel, as `Trans
 
 from __future__ import annotations
 
+import dataclasses
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +18,7 @@ import scipy.sparse
 
 from ltcl.device import Device
 from ltcl.operators import Operator, ScaledColumns, as_operator
-from ltcl.solvers import Bounded, minimise
+from ltcl.solvers.bounded import Bounded, minimise
 from ltcl.transport import Transport
 
 _PROBES = 16  # of the norms of columns that cannot be seen: within a factor of 2, which is enough
@@ -68,6 +70,7 @@ class Problem:
     weights: list[np.ndarray] | None
     limits: Limits
     rules: dict[str, Any] = field(default_factory=dict)  # of `minimise`
+    products: Counter[int] = field(default_factory=Counter)  # so far, of each system
 
     def weighted(self, parts: list[np.ndarray]) -> list[np.ndarray]:
         """w times each part."""
@@ -82,7 +85,10 @@ class Problem:
         return [gain * wanted - dark for wanted, dark in zip(self.desired, self.dark, strict=True)]
 
     def nearest(self, which: int, gain: float, start: np.ndarray, **rules: Any) -> tuple[np.ndarray, Bounded]:
-        """The light (N, k) of one system within the limits that comes nearest to the target."""
+        """The light (N, k) of one system within the limits that comes nearest to the target.
+
+        Where a gain is searched for, the solve counts the products of all before it.
+        """
         system, limits = self.systems[which], self.limits
         scale = np.where(limits.masked, 0.0, system.scale)
         lower, upper = ((scale * bound).astype(np.float32) for bound in (limits.low, limits.high))
@@ -95,6 +101,8 @@ class Problem:
             weights=None if self.weights is None else self.weights[which],
             **{**self.rules, **rules},
         )
+        self.products[which] += found.products
+        found = dataclasses.replace(found, products=self.products[which])
         light = system.to_light(found.x)  # rounded; what is at a bound is to stay there
         light = np.where(found.x <= lower[:, None], limits.low, light)
         light = np.where(found.x >= upper[:, None], np.where(scale > 0, limits.high, 0.0)[:, None], light)

@@ -23,7 +23,7 @@ class Compensation:
     gain : float
         The target was gain * desired.
     clipped : float
-        Fraction of pattern values that are at a bound and would go beyond.
+        Fraction of pattern values that a bound keeps from going beyond it.
     target : array
         gain * desired.
     out_of_reach : array
@@ -37,7 +37,8 @@ class Compensation:
     solution : Solution or tuple of 3
         What the light would be without bounds, one per channel of the transport; of a T without S, `limited`.
     limited : tuple of Bounded
-        The solves within the bounds; empty where the bounds cost nothing.
+        The solves within the bounds; empty where the bounds cost nothing. Their products are those of the
+        search for a gain, too.
     """
 
     pattern: np.ndarray

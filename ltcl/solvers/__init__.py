@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from ltcl.solvers.bounded import Bounded, minimise
+from ltcl.solvers.bounded import Bounded
 from ltcl.solvers.matrices import matrix_iteration, matrix_series
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.solve import METHODS, solve
@@ -15,6 +15,5 @@ __all__ = [
     "Status",
     "matrix_iteration",
     "matrix_series",
-    "minimise",
     "solve",
 ]

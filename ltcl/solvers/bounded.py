@@ -54,7 +54,7 @@ class Bounded(Solution):
     least : (k,) float64
         What no x within the bounds is below, by the gap and as exact as float32 products.
     held : (N, k) bool
-        Where x is at a bound, and a step beyond would lower the error.
+        Where x is at a bound or all but there, and a step beyond would lower the error.
     gap : float
         Largest ``(errors - least) / ||w b||``; `residuals` holds the largest ``errors / ||w b||``.
     """
@@ -63,6 +63,14 @@ class Bounded(Solution):
     least: np.ndarray
     held: np.ndarray
     gap: float
+
+    def __str__(self) -> str:
+        advice = "" if self.converged else f": {self.status.value}"
+        return (
+            f"bounded: {self.status.name.lower()} after {self.iterations} iterations, "
+            f"{self.products} products, relative error {self.residuals[-1]:.2g}, "
+            f"at most {self.gap:.2g} above the least{advice}"
+        )
 
 
 def minimise(
@@ -101,6 +109,15 @@ def minimise(
     -------
     Bounded
         Of status CONVERGED, MAXITER, or STAGNATED where rounding hides any further gain.
+
+    Examples
+    --------
+    >>> import ltcl
+    >>> from ltcl.operators import Dense
+    >>> A = Dense(ltcl.open_device(), [[1.0, 0.5], [0.5, 1.0]])
+    >>> s = minimise(A, np.array([[1.0], [0.0]]), np.zeros(2), np.ones(2), np.zeros((2, 1)), rtol=1e-4)
+    >>> print(s.x.ravel().round(2), s.held.ravel())  # without bounds 4/3 and -2/3
+    [0.8 0. ] [False  True]
     """
     start = time.perf_counter()
     largest = float(np.max(np.abs(b)))
@@ -184,10 +201,10 @@ class _Descent:
         self.g, self.true = g, False
 
     def held(self, x: np.ndarray) -> np.ndarray:
-        """Entries at a bound that want to go beyond, and could if there were none."""
+        """Entries that a step along -g takes beyond a bound; some come close to it without touching."""
         lower, upper = (part.get()[:, None] for part in (self.box.lower, self.box.upper))
-        g = self.g.get()
-        return (lower < upper) & (((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0)))
+        beyond = x - self._alpha * self.g.get()
+        return (lower < upper) & ((beyond < lower) | (beyond > upper))
 
     def _gradient(self, out: Array) -> Array:
         wr = self.r if self.w is None else vectors.multiply(self.w, self.r, self.r.like())

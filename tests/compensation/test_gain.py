@@ -75,6 +75,7 @@ def test_the_largest_gain_at_a_loss(T, bounds, ambient, allowed):
     for more in (1.5, 3.0, 10.0):  # nor is there a larger one further up
         assert loss(more * c.gain, *arguments) > allowed
     assert c.clipped > 0.0
+    assert c.limited[0].products > 2 * c.limited[0].iterations + 4  # the search is counted
 
 
 def test_a_picture_out_of_reach_at_any_gain(T):
