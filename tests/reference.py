@@ -182,7 +182,14 @@ def form_factor_pair(
     return np.divide(here * there, np.pi * r2**2, out=np.zeros_like(r2), where=faces)
 
 
-def form_factor_entries(geometry: np.ndarray, blocks: np.ndarray, outer: float, inner: float) -> np.ndarray:
+def form_factor_pairs(G: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """G_ij of listed pairs, (P,)."""
+    return G[i, j]
+
+
+def form_factor_entries(
+    geometry: np.ndarray, blocks: np.ndarray, outer: float = 64, inner: float = 12
+) -> np.ndarray:
     """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6); see `kernels/form_factor.cl`."""
     centre, right, down, normal = (geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4))
     angle = np.arange(8) * np.pi / 4
@@ -251,6 +258,13 @@ def visibility_rows(starts: np.ndarray, ends: np.ndarray, blocks: np.ndarray) ->
     """Share of the rays from starts (rays, 3, M) to ends (rays, 3, N) that meet no box, (M, N)."""
     rays = zip(starts, ends, strict=True)
     return np.mean([~blocked(a.T[:, None], b.T[None], blocks) for a, b in rays], axis=0)
+
+
+def visibility_pairs(
+    starts: np.ndarray, ends: np.ndarray, blocks: np.ndarray, i: np.ndarray, j: np.ndarray
+) -> np.ndarray:
+    """The same of listed pairs, (P,)."""
+    return visibility_rows(starts, ends, blocks)[i, j]
 
 
 def gamma(roundings: float) -> float:

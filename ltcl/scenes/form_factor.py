@@ -31,8 +31,7 @@ from ltcl.scenes.patches import Patches
 from ltcl.scenes.visibility import Rays
 from ltcl.scenes.walls import check_albedo
 
-_SIZES = {"OUTER": 64, "INNER": 12}  # of a pair, see `near.squared_size`: where the kernel's rules change
-_NEAR = 5.0
+_NEAR = 5.0  # sizes of a pair, see `near.squared_size`
 _ERROR = 1e-4
 _LAUNCH = 1 << 28  # pairs in one launch: a fraction of a second, so that no display driver gives up
 _NEAR_SAMPLES = 6  # squared, the rays between near patches
@@ -100,7 +99,7 @@ class FormFactor(Operator):
         placed = frame.patches(patches)
         self._geometry = geometry.padded(self.device, _rows(placed))
         self._blocks = geometry.upload_blocks(self.device, frame, blocks)
-        self._defines = {"LANES": geometry.lanes(self.device), "BLOCKS": len(blocks), **_SIZES}
+        self._defines = {"LANES": geometry.lanes(self.device), "BLOCKS": len(blocks)}
         self._albedo, self._area = self.device.upload(given), self.device.upload(placed.area)
         self._near = CSR(self.device, self._correction(patches, blocks, near, given, placed.area))
 

@@ -57,7 +57,8 @@ def read_by_kernel(
 def test_rows_and_pairs_meet_their_twin(device, count, boxes, samples):
     patches, blocks = random_scene(count, boxes, seed=count)
     found = visibility(patches, blocks, device, samples=samples)
-    expected = reference.visibility_rows(*read_by_kernel(device, patches, blocks, samples))
+    read = read_by_kernel(device, patches, blocks, samples)
+    expected = reference.visibility_rows(*read)
     # A ray that grazes a box to rounding may count either way: one in a hundred entries, by one ray, at most.
     off = np.abs(found - expected)
     assert off.max() < 1.001 / samples**2
@@ -66,6 +67,8 @@ def test_rows_and_pairs_meet_their_twin(device, count, boxes, samples):
     i, j = np.divmod(np.arange(count**2), count)
     pairs = Rays(patches, blocks, device, samples).pairs(i, j)
     np.testing.assert_array_equal(pairs.reshape(count, count), found)
+    off = np.abs(pairs - reference.visibility_pairs(*read, i, j))
+    assert off.max() < 1.001 / samples**2
 
 
 def test_rows_in_parts_are_those_of_the_whole(device, monkeypatch):
