@@ -254,17 +254,29 @@ def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     return result
 
 
-def visibility_rows(starts: np.ndarray, ends: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Share of the rays from starts (rays, 3, M) to ends (rays, 3, N) that meet no box, (M, N)."""
-    rays = zip(starts, ends, strict=True)
-    return np.mean([~blocked(a.T[:, None], b.T[None], blocks) for a, b in rays], axis=0)
+def visibility_rows(
+    starts: np.ndarray, ends: np.ndarray, normals: np.ndarray, blocks: np.ndarray
+) -> np.ndarray:
+    """Of the rays from starts to ends (rays, 3, N) before both normals (3, N), the share that meet no box."""
+    faced, count = np.zeros((2, starts.shape[2], ends.shape[2]))
+    for a, b in zip(np.float64(starts), np.float64(ends), strict=True):
+        d = b.T[None] - a.T[:, None]
+        facing = (np.einsum("mnc,cm->mn", d, normals) > 1e-6) & (np.einsum("mnc,cn->mn", d, normals) < -1e-6)
+        faced += facing
+        count += facing & ~blocked(a.T[:, None], b.T[None], blocks)
+    return np.divide(count, faced, out=np.ones_like(count), where=faced > 0)
 
 
 def visibility_pairs(
-    starts: np.ndarray, ends: np.ndarray, blocks: np.ndarray, i: np.ndarray, j: np.ndarray
+    starts: np.ndarray,
+    ends: np.ndarray,
+    normals: np.ndarray,
+    blocks: np.ndarray,
+    i: np.ndarray,
+    j: np.ndarray,
 ) -> np.ndarray:
     """The same of listed pairs, (P,)."""
-    return visibility_rows(starts, ends, blocks)[i, j]
+    return visibility_rows(starts, ends, normals, blocks)[i, j]
 
 
 def gamma(roundings: float) -> float:

@@ -9,8 +9,11 @@ as a sparse matrix.
 
 Measured on boxes of 6 to 131424 patches, and walls at 30, 70 and 130 degrees: for smooth x, F x is within
 1e-4 of its largest value (row sums of the largest box: 6e-5), and F within 1e-4 in the 2-norm; a single entry
-may be off by 2 %. With blocks, light is blocked or not at the same pairs of points, which adds the error of
-so few rays at the borders of shadows; an entry with a shadow's border in it may be off by half of itself.
+may be off by 2 %. With blocks, light is blocked or not at the same pairs of points (36 between near patches,
+1 or 8 between others), which adds the error of so few rays at the borders of shadows: an entry with a border
+in it may be off by half of itself. Beside the host's matrices of rooms with a block, on the patch grid or off
+it, F was within 1.2 % in the Frobenius norm, and row sums at most 1.02 and within 0.05 of theirs, the most
+where a block covers half of a patch.
 """
 
 from __future__ import annotations

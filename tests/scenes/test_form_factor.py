@@ -12,7 +12,7 @@ import ltcl
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import IdentityPlus
-from ltcl.scenes import FormFactor, Patches, box, cut, dihedral, near, visibility
+from ltcl.scenes import Block, FormFactor, Patches, box, cut, dihedral, near, visibility
 from ltcl.scenes import geometry as scene_geometry
 from ltcl.scenes.box import WALLS
 from ltcl.scenes.walls import form_factors
@@ -171,6 +171,29 @@ def test_block_hides_what_rays_say(device):
     # A closed room with a solid block loses no light: what leaves a face arrives somewhere.
     inside = np.arange(len(patches)) // 4 % 12 != 10  # but for the face that lies on the floor
     assert np.abs(hidden.sum(axis=1)[inside] - 1).mean() < 0.1
+
+
+@pytest.mark.parametrize("n", [4, 8])
+@pytest.mark.parametrize(
+    "block",
+    [
+        Block((0.31, 0.23, 0), (0.37, 0.29, 0.43), albedo=0.5),  # on the floor, faces cut patches
+        Block((0.31, 0.23, 0.17), (0.37, 0.29, 0.43), albedo=0.5),  # in the air, faces cut patches
+        Block((0.25, 0.25, 0.25), (0.5, 0.5, 0.25), albedo=0.5),  # faces between patches
+        Block((0, 0.4, 0), (0.3, 0.6, 0.7), albedo=0.5),  # in a corner
+    ],
+)
+def test_rooms_with_a_block_are_those_of_the_host(device, n, block):
+    """Exact form factors times 256 rays a pair: 1.5 % of the norm, and no light made."""
+    room = box(n, albedo=0.5, occluder=block, device=device)
+    F = FormFactor(cut(room.walls, n), None, [(block.low, block.high)], device).to_dense()
+    assert np.linalg.norm(F - room.form_factors) < 0.015 * np.linalg.norm(room.form_factors)
+    sums, expected = F.sum(axis=1), room.form_factors.sum(axis=1)
+    np.testing.assert_allclose(sums, expected, atol=0.06)  # of a patch half under the block
+    assert sums.max() < 1.02
+    # Of a face and the room nothing is in between: only float32 and the kernel's quadrature are left.
+    face = np.arange(len(F)) // n % len(room.walls) >= 6
+    np.testing.assert_allclose(F[face], room.form_factors[face], atol=2e-3)
 
 
 def test_callers_own_near_values(device):
