@@ -164,7 +164,8 @@ def read(
 
 def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(..., 2) from homogeneous (..., 3)."""
-    mapped = points @ homography.T
+    # Not by matmul: where H holds zeros, as at eye level, some BLAS warn of a division by zero.
+    mapped = np.einsum("...j,ij->...i", points, homography)
     return mapped[..., :2] / mapped[..., 2:]
 
 
