@@ -259,7 +259,7 @@ def visibility_rows(
 ) -> np.ndarray:
     """Of the rays from starts to ends (rays, 3, N) before both normals (3, N), the share that meet no box."""
     faced, count = np.zeros((2, starts.shape[2], ends.shape[2]))
-    for a, b in zip(np.float64(starts), np.float64(ends), strict=True):
+    for a, b in zip(starts.astype(np.float64), ends.astype(np.float64), strict=True):
         d = b.T[None] - a.T[:, None]
         facing = (np.einsum("mnc,cm->mn", d, normals) > 1e-6) & (np.einsum("mnc,cn->mn", d, normals) < -1e-6)
         faced += facing
@@ -267,15 +267,9 @@ def visibility_rows(
     return np.divide(count, faced, out=np.ones_like(count), where=faced > 0)
 
 
-def visibility_pairs(
-    starts: np.ndarray,
-    ends: np.ndarray,
-    normals: np.ndarray,
-    blocks: np.ndarray,
-    i: np.ndarray,
-    j: np.ndarray,
-) -> np.ndarray:
+def visibility_pairs(i: np.ndarray, j: np.ndarray, *rays: np.ndarray) -> np.ndarray:
     """The same of listed pairs, (P,)."""
+    starts, ends, normals, blocks = rays
     return visibility_rows(starts, ends, normals, blocks)[i, j]
 
 

@@ -56,8 +56,8 @@ def cast(
     origins, directions : ndarray, (R, 3)
         Directions need not be unit vectors.
     blocks : ndarray, (B, 2, 3)
-        Opaque boxes along the axes, lowest and highest corner, as `ltcl.scenes.geometry.check_blocks` returns
-        them. Walls on their faces reflect.
+        Opaque boxes along the axes, lowest and highest corner, as
+        `ltcl.scenes.exchange.geometry.check_blocks` returns them. Walls on their faces reflect.
 
     Examples
     --------

@@ -16,10 +16,11 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes import crossing, exchange
 from ltcl.scenes import light as lighting
 from ltcl.scenes import viewer as viewing
 from ltcl.scenes.blocks import Block
+from ltcl.scenes.exchange import crossing
+from ltcl.scenes.exchange import transport as exchange
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall, check_albedo
 from ltcl.transport import Transport
@@ -134,7 +135,7 @@ class Scene:
 
         Notes
         -----
-        Eq. 4 of the paper, solved by Cholesky, see `ltcl.scenes.exchange`.
+        Eq. 4 of the paper, solved by Cholesky, see `ltcl.scenes.exchange.transport`.
 
         Examples
         --------

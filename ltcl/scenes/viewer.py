@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from ltcl.errors import InputError
-from ltcl.scenes import crossing
+from ltcl.scenes.exchange import crossing
 from ltcl.scenes.walls import Vector, Wall
 
 _MARGIN = 0.03  # of the larger side, left free around the walls

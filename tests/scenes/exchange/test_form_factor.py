@@ -12,14 +12,15 @@ import ltcl
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import IdentityPlus
-from ltcl.scenes import Block, FormFactor, Patches, box, cut, dihedral, near, visibility
-from ltcl.scenes import geometry as scene_geometry
+from ltcl.scenes import Block, FormFactor, Patches, box, cut, dihedral, visibility
 from ltcl.scenes.box import WALLS
+from ltcl.scenes.exchange import geometry as scene_geometry
+from ltcl.scenes.exchange import near
 from ltcl.scenes.walls import form_factors
 from tests import gallery, reference
 from tests.operators import helpers
-from tests.scenes.test_near import leaning, turned
-from tests.scenes.test_visibility import box_faces
+from tests.scenes.exchange.test_near import leaning, turned
+from tests.scenes.exchange.test_visibility import box_faces
 
 BLOCK = [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
 
@@ -217,7 +218,7 @@ def test_launches_in_slabs_give_the_same(device, monkeypatch):
     A = FormFactor(patches, 0.5, device=device)
     x = device.upload(gallery.vectors(len(patches), 5))
     whole = A.apply(x).get()
-    monkeypatch.setattr("ltcl.scenes.form_factor._LAUNCH", 7 * A._geometry.shape[1])
+    monkeypatch.setattr("ltcl.scenes.exchange.form_factor._LAUNCH", 7 * A._geometry.shape[1])
     with device.profile() as profile:
         cut_up = A.apply(x).get()
     assert profile.launches["form_factor_matvec"] == 2 * 8  # 4 + 1 right-hand sides, 54 rows by 7

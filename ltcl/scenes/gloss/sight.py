@@ -11,7 +11,7 @@ import numpy as np
 
 from ltcl.errors import InputError
 from ltcl.scenes.blocks import point
-from ltcl.scenes.geometry import check_blocks
+from ltcl.scenes.exchange.geometry import check_blocks
 from ltcl.scenes.patches import Patches
 from ltcl.scenes.rays import clear
 from ltcl.scenes.walls import Wall

@@ -22,8 +22,8 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, Device, open_device
 from ltcl.errors import InputError
-from ltcl.scenes import geometry
-from ltcl.scenes.geometry import Frame
+from ltcl.scenes.exchange import geometry
+from ltcl.scenes.exchange.geometry import Frame
 from ltcl.scenes.patches import Patches
 
 _LAUNCH = 1 << 30  # tests of a ray and a box in one launch: a fraction of a second, also for slow devices

@@ -28,10 +28,10 @@ from ltcl import checks
 from ltcl.device import Array, Device, open_device
 from ltcl.operators import CSR, Operator
 from ltcl.operators.base import widths
-from ltcl.scenes import geometry, near
-from ltcl.scenes.geometry import Frame
+from ltcl.scenes.exchange import geometry, near
+from ltcl.scenes.exchange.geometry import Frame
+from ltcl.scenes.exchange.visibility import Rays
 from ltcl.scenes.patches import Patches
-from ltcl.scenes.visibility import Rays
 from ltcl.scenes.walls import check_albedo
 
 _NEAR = 5.0  # sizes of a pair, see `near.squared_size`
@@ -52,12 +52,12 @@ class FormFactor(Operator):
     albedo : float or (N,) in [0, 1), optional
         Share of the light a patch gives back, in one colour. F itself when not given.
     blocks : (B, 2, 3), optional
-        Low and high corner of opaque boxes along the axes; see `ltcl.scenes.visibility`.
+        Low and high corner of opaque boxes along the axes; see `ltcl.scenes.exchange.visibility`.
     device : Device or str, optional
         The best one when not given.
     near : callable(i, j) -> (P,), optional
         Exact form factors, without blocks, of listed pairs i < j of patches that are close together.
-        `ltcl.scenes.near.form_factors` when not given.
+        `ltcl.scenes.exchange.near.form_factors` when not given.
 
     Attributes
     ----------

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ltcl.scenes import near
 from ltcl.scenes.box import WALLS
+from ltcl.scenes.exchange import near
 from ltcl.scenes.patches import Patches, cut
 from ltcl.scenes.walls import Vector, Wall, form_factors
 

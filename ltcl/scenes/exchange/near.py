@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 import scipy.spatial
 
-from ltcl.scenes import contours
+from ltcl.scenes.exchange import contours
 from ltcl.scenes.patches import Patches
 
 _TOUCHING = 2.2  # sizes of a pair within which two patches may touch, at any shape

@@ -3,22 +3,18 @@
 
 from __future__ import annotations
 
-import importlib
-
 import numpy as np
 import pytest
 
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.scenes import geometry
 from ltcl.scenes.box import WALLS
-from ltcl.scenes.geometry import Frame
+from ltcl.scenes.exchange import geometry
+from ltcl.scenes.exchange.geometry import Frame
+from ltcl.scenes.exchange.visibility import Rays, visibility
 from ltcl.scenes.patches import Patches, cut
-from ltcl.scenes.visibility import Rays, visibility
 from ltcl.scenes.walls import Wall
 from tests import reference
-
-MODULE = importlib.import_module("ltcl.scenes.visibility")  # its name in the package is the function's
 
 
 def random_scene(count: int, boxes: int, seed: int) -> tuple[Patches, np.ndarray]:
@@ -65,14 +61,14 @@ def test_rows_and_pairs_meet_their_twin(device, count, boxes, samples):
     i, j = np.divmod(np.arange(count**2), count)
     pairs = Rays(patches, blocks, device, samples).pairs(i, j)
     np.testing.assert_array_equal(pairs.reshape(count, count), found)
-    off = np.abs(pairs - reference.visibility_pairs(*read, i, j)) > 1e-6
+    off = np.abs(pairs - reference.visibility_pairs(i, j, *read)) > 1e-6
     assert np.count_nonzero(off) <= 0.01 * count**2
 
 
 def test_rows_in_parts_are_those_of_the_whole(device, monkeypatch):
     patches, blocks = random_scene(30, 3, seed=1)
     whole = visibility(patches, blocks, device)
-    monkeypatch.setattr(MODULE, "_LAUNCH", 30 * 16 * 3 * 7)  # 7 rows at a time
+    monkeypatch.setattr("ltcl.scenes.exchange.visibility._LAUNCH", 30 * 16 * 3 * 7)  # 7 rows at a time
     assert Rays(patches, blocks, device, 4).most_rows() == 7
     np.testing.assert_array_equal(visibility(patches, blocks, device), whole)
     i, j = np.triu_indices(30, 1)
@@ -121,7 +117,7 @@ def test_faces_and_edges_that_only_touch_do_not_block(device):
 
 
 def test_no_box_no_device(monkeypatch):
-    monkeypatch.setattr(MODULE, "open_device", lambda *_: pytest.fail("opened"))
+    monkeypatch.setattr("ltcl.scenes.exchange.visibility.open_device", lambda *_: pytest.fail("opened"))
     assert visibility(cut(WALLS, 1), []).min() == 1.0
 
 
