@@ -19,20 +19,24 @@ where a block covers half of a patch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Array, Device, open_device
+from ltcl.errors import InputError
 from ltcl.operators import CSR, Operator
 from ltcl.operators.base import widths
 from ltcl.scenes.exchange import geometry, near
 from ltcl.scenes.exchange.geometry import Frame
 from ltcl.scenes.exchange.visibility import Rays
-from ltcl.scenes.patches import Patches
+from ltcl.scenes.patches import Patches, cut
 from ltcl.scenes.walls import check_albedo
+
+if TYPE_CHECKING:
+    from ltcl.scenes.scene import Scene
 
 _NEAR = 5.0  # sizes of a pair, see `near.squared_size`
 _ERROR = 1e-4
@@ -105,6 +109,37 @@ class FormFactor(Operator):
         self._defines = {"LANES": geometry.lanes(self.device), "BLOCKS": len(blocks)}
         self._albedo, self._area = self.device.upload(given), self.device.upload(placed.area)
         self._near = CSR(self.device, self._correction(patches, blocks, near, given, placed.area))
+
+    @classmethod
+    def of(cls, scene: Scene, device: Device | str | None = None) -> tuple[FormFactor, ...]:
+        """One bounce in a scene of `box`, `dihedral` or `trihedral`, one operator per channel.
+
+        They are computed from the scene's walls and blocks, not from its matrix of form factors.
+
+        Raises
+        ------
+        InputError
+            If the walls have not as many columns of patches as rows.
+
+        Examples
+        --------
+        All bounces of direct light in a room with a block:
+
+        >>> import ltcl, numpy
+        >>> from ltcl.scenes import Block, box
+        >>> room = box(4, albedo=0.5, occluder=Block((0.3, 0.2, 0), (0.4, 0.3, 0.6), albedo=0.5))
+        >>> (A,) = FormFactor.of(room)
+        >>> l_d = numpy.ones(len(room.area))
+        >>> l = ltcl.solve(ltcl.operators.IdentityPlus(A, sign=-1), l_d).x
+        >>> l.shape, bool(1.9 < l.max() < 2.05)  # 1 + 1/2 + 1/4 + ..., less where the block stands
+        ((176,), True)
+        """
+        n, columns = scene.grid[0], scene.grid[1] // len(scene.walls)
+        if n != columns:
+            raise InputError(f"scene has walls of {n} x {columns} patches; they must be n x n")
+        patches, blocks = cut(scene.walls, n), [(block.low, block.high) for block in scene.blocks]
+        chosen = device if isinstance(device, Device) else open_device(device)
+        return tuple(cls(patches, albedo, blocks, chosen) for albedo in scene.albedo)
 
     @property
     def nbytes(self) -> int:

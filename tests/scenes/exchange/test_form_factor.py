@@ -241,6 +241,28 @@ def test_forward_light_without_storing_a_bounce(device):
         np.testing.assert_allclose(found.x, expected, rtol=1e-3)
 
 
+def test_a_scene_gives_its_operators(device):
+    """One per channel, as good as the scene's own matrix; light through them as through that."""
+    room = box(
+        6, albedo=(0.8, 0.5, 0.3), occluder=Block((0.31, 0.23, 0), (0.37, 0.29, 0.43), 0.6), device=device
+    )
+    l_d = np.random.default_rng(2).random(len(room.area))
+    operators, matrices = FormFactor.of(room, device), room.A
+    for A, dense in zip(operators, matrices, strict=True):
+        assert np.linalg.norm(A.to_dense() - dense) < 0.015 * np.linalg.norm(dense)
+        found = ltcl.solve(IdentityPlus(A, sign=-1), l_d, rtol=1e-4).x
+        expected = np.linalg.solve(np.eye(len(l_d)) - dense, l_d)
+        assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)
+    (A,) = FormFactor.of(dihedral(5, albedo=0.5), device)  # free of blocks: to the bound
+    np.testing.assert_allclose(A.to_dense(), dihedral(5, albedo=0.5).A, atol=A.error)
+
+
+def test_a_scene_of_oblong_walls_is_refused(device):
+    scene = dataclasses.replace(dihedral(2), grid=(1, 8))
+    with pytest.raises(InputError, match=r"scene has walls of 1 x 4 patches; they must be n x n"):
+        FormFactor.of(scene, device)
+
+
 @pytest.mark.parametrize("method", ["neumann", "richardson", "chebyshev", "gmres", "bicgstab", "cg"])
 def test_solvers_take_it(device, method):
     scene = dihedral(4, albedo=0.6)
