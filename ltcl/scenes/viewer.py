@@ -190,7 +190,7 @@ def read(
 
 def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(..., 2) from homogeneous (..., 3)."""
-    # Not by matmul: where H holds zeros, as at eye level, some BLAS warn of a division by zero.
+    # Not by matmul: of finite numbers some BLAS report a division by zero (numpy issue 29820).
     mapped = np.einsum("...j,ij->...i", points, homography)
     return mapped[..., :2] / mapped[..., 2:]
 
