@@ -14,6 +14,8 @@ from ltcl.transport import Transport
 Columns = list[np.ndarray]
 _OPTIONS = ("atol", "maxiter", "callback", "throw")  # of `ltcl.solve`, that a solve within bounds has, too
 
+_LEAST_LOSS = 1e-6
+
 
 def bounds(value: Any) -> tuple[float, float]:
     """(low, high), finite and in this order."""
@@ -30,8 +32,10 @@ def gain(value: Any, loss: Any) -> float | None:
     if isinstance(value, str):
         if value != "auto":
             raise InputError(f"gain is {value!r}; it must be 'auto' or a finite number above 0")
-        if loss is not None:
-            checks.number("loss", loss, above=0.0, below=1.0)
+        if loss is not None and checks.number("loss", loss, above=0.0, below=1.0) < _LEAST_LOSS:
+            raise InputError(
+                f"loss is {loss!r}, which float32 cannot tell from none; it must be at least {_LEAST_LOSS:g}"
+            )
         return None
     if loss is not None:
         raise InputError(f"loss is {loss!r}, but gain is {value!r}; a loss is of use with gain='auto' only")

@@ -52,11 +52,12 @@ def compensate(
     background : like `desired` or one frame of it, optional
         Light the projector cannot take away: ambient and its own black. T pattern + background is matched.
     gain : float or "auto"
-        Scale of the target; "auto" finds the largest one, for all frames and colours, that the bounds reach.
+        Scale of the target; "auto" finds the largest one, for all frames and colours, that the bounds reach;
+        at a loss at most 1 % below the largest there is.
     loss : float, optional
-        Of gain="auto": relative error, weights included, that the gain may cost. When not given, none where
-        some gain is within reach exactly and there are no `weights`; else `rtol`, or 0.001 if that is less,
-        above what a picture half as bright would cost.
+        Of gain="auto": relative error, weights included, that the gain may cost, from 1e-6 to 1. When not
+        given, none where some gain is within reach exactly and there are no `weights`; else `rtol` or 1.1
+        times the least error of all gains (found to 1 %), whichever is more.
     weights : like `desired` or one frame of it, optional
         How much the error at each camera pixel counts, at least 0. When not given 1, and 0 where T.masked.
     method, rtol, **options
@@ -66,8 +67,7 @@ def compensate(
     Returns
     -------
     Compensation
-        Never worse than the light without bounds, clamped; at a `loss` found for gain="auto", by no more than
-        0.5 % of that.
+        Never worse than the light without bounds, clamped, at a given gain; within the loss of gain="auto".
 
     Raises
     ------
