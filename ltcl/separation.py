@@ -34,7 +34,7 @@ LAMBERTIAN = (
 )
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Separation:
     """Result of `ltcl.separate`. Pictures have the shape of the image, linear, float32.
 

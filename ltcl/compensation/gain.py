@@ -32,7 +32,7 @@ _FLOOR = 1e-6  # relative error that float32 hardly tells from none
 _STEPS = 60
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trial:
     """The nearest light that was found at a gain; errors relative to ||gain W d||.
 
@@ -198,7 +198,7 @@ def _from_above(problem: Problem, loss: float) -> tuple[float, list[np.ndarray]]
     ``gain ||W d||^2 - max (W c).(W d) <= ||gain W d - W c|| ||W d||``; in p the maximum is of a linear
     function.
     """
-    reach, light = 0.0, []
+    size, reach, light = _size(problem), 0.0, []
     limits = problem.limits
     for system, wwd, dark in zip(
         problem.systems, problem.weighted(problem.weighted(problem.desired)), problem.dark, strict=True
@@ -209,10 +209,10 @@ def _from_above(problem: Problem, loss: float) -> tuple[float, list[np.ndarray]]
         reach += float(np.sum(use * best) + np.sum(dark * wwd))
     if reach <= 0.0:
         raise InputError(
-            "gain is 'auto', but no light within the bounds looks more like the picture than none; "
+            "gain is 'auto', but no light within the bounds looks more like desired than none does; "
             "is desired negative, or T?"
         )
-    return reach / ((1.0 - loss) * _size(problem) ** 2), light
+    return reach / ((1.0 - loss) * size**2), light
 
 
 def _residual(problem: Problem, gain: float, light: list[np.ndarray]) -> list[np.ndarray]:

@@ -22,7 +22,7 @@ Columns = list[np.ndarray]
 _MORE = 1.1  # times the least error of all gains, that the largest may have where none is in reach
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Start:
     """A gain, and the light (N, k) of each system to be brought within the limits.
 

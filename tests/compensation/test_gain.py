@@ -186,7 +186,6 @@ def test_masked_pixels_and_colours_of_their_own(device):
     for matrix in matrices:
         matrix[4, 4] = 0.0
     T = ltcl.Transport(matrices, GRID, device=device, on_dark="mask")
-    lit = np.delete(np.arange(N), 4)
     pattern = random.uniform(0.3, 0.8, (N, 3))
     pattern[4] = 0.0
     desired = np.stack([matrix @ pattern[:, c] for c, matrix in enumerate(matrices)], axis=-1)
@@ -194,6 +193,5 @@ def test_masked_pixels_and_colours_of_their_own(device):
     c = ltcl.compensate(T, desired.reshape(*GRID, 3), gain="auto", method="direct")
     assert c.gain == pytest.approx(1.0 / pattern.max(), rel=1e-3)
     np.testing.assert_allclose(c.pattern.reshape(N, 3), c.gain * pattern, atol=1e-3)
-    assert np.abs(c.out_of_reach.reshape(N, 3)[lit]).max() == 0.0
-    assert c.out_of_reach.reshape(N, 3)[4].min() > 0.0
+    assert not c.out_of_reach.any()
     assert c.error < 1e-3
