@@ -131,10 +131,11 @@ def closest(problem: Problem, enough: float = 0.0) -> Trial:
     first, light = _from_above(problem, 0.0)
     enough = max(enough, _FLOOR)
     lines: list[tuple[float, float]] = []
-    t, farthest, best = 1.0, 1.0, None
+    t, farthest, bound, best = 1.0, 1.0, 0.0, None
     for _ in range(_STEPS):
         sine = 1.0 if best is None else best.sine
-        trial = _nearest(problem, first / t, light, max(sine, enough) * TOLERANCE / 4)
+        accuracy = max(_COARSE * (sine - bound), TOLERANCE / 4 * max(sine, enough))
+        trial = _nearest(problem, first / t, light, accuracy)
         light = trial.light
         lines.append((trial.slope, (trial.least - trial.slope) / t))
         if best is None or trial.sine < best.sine:
