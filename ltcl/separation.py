@@ -35,7 +35,7 @@ LARGEST_DEFECT = 0.1
 LARGEST_NEGATIVE = 0.005
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Separation:
     """Result of `ltcl.separate`. Pictures have the shape of the image, linear, float32.
 

@@ -171,7 +171,7 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
         r"bounds is \(0, 1, 2\); it must be \(low, high\)",
     ),
     "bounds missing": ({"bounds": None}, InputError, r"bounds is None; it must be \(low, high\)"),
-    "gain zero": ({"gain": 0.0}, InputError, "gain is 0.0; it must be a finite number above 0"),
+    "gain zero": ({"gain": 0.0}, InputError, "gain is 0.0; it must be 'auto' or a finite number above 0"),
     "gain negative": ({"gain": -2}, InputError, "gain is -2; it must be"),
     "gain NaN": ({"gain": np.nan}, InputError, "gain is nan; it must be"),
     "gain text": ({"gain": "most"}, InputError, "gain is 'most'; it must be 'auto' or a finite number"),

@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from ltcl import report
+from ltcl import checks, report
 from ltcl.cli import console, options, pictures, results, transports
 from ltcl.compensation import Compensation
+from ltcl.errors import InputError
 from ltcl.transport import Transport
 
 
@@ -35,7 +38,7 @@ _LOSS = Annotated[
     float | None,
     typer.Option(
         metavar="FRACTION",
-        help="Error that --gain auto may cost. Default: none if possible, else a little above the least.",
+        help="Error that --gain auto may cost. Default: none if possible, else RTOL or 1.1 times the least.",
         show_default=False,
     ),
 ]
@@ -82,10 +85,12 @@ def run(
     """Find the projector patterns that make a scene look like PICTURE.
 
     Writes for each picture the pattern, how the scene will look under it and what is out of the projector's
-    reach, exactly as .exr and for the eye as .png, and compensate.json.
+    reach, exactly as .exr and for the eye as .png, and compensate.json. What is out of reach is grey where
+    nothing is, orange where the scene stays too dark and blue where it stays too bright.
     """
     from ltcl.compensation import compensate
 
+    _check(gain, loss)
     T = transports.load(
         transport,
         device,
@@ -124,7 +129,8 @@ def run(
         for (name, wanted), file in zip(desired.items(), picture, strict=True):
             steps.item(file.name)
             pictured = {"background": dark, "weights": counts}
-            done = compensate(T, wanted, callback=steps.solve(rtol), **pictured, **settings)
+            with _named({"desired": file, "gain": file, "background": background, "weights": weights}):
+                done = compensate(T, wanted, callback=steps.solve(rtol), **pictured, **settings)
             entries.append(
                 {"file": str(file), **_entry(T, done, low, high), **_under(done, dark)}
                 | _write(folder, name, done, high)
@@ -135,8 +141,29 @@ def run(
         _show(out, entries, advise=gain != "auto")
 
 
+def _check(gain: float | str, loss: float | None) -> None:
+    """What the library refuses of a gain and a loss, in the words of the command line."""
+    if gain != "auto":
+        checks.number("--gain", gain, above=0.0)
+        if loss is not None:
+            raise InputError(f"--loss is {loss:g}, but --gain is {gain:g}; --loss is for --gain auto only")
+    elif loss is not None:
+        checks.number("--loss", loss, least=1e-6, below=1.0)
+
+
+@contextmanager
+def _named(files: dict[str, Path | None]) -> Iterator[None]:
+    """Refusals that begin with the name of an argument begin with its file."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error).replace("gain is 'auto', but", "--gain is auto, but")
+        file = files.get(str(error).partition(" ")[0])
+        raise InputError(text if file is None else f"{file}: {text}") from None
+
+
 def _entry(T: Transport, done: Compensation, low: float, high: float) -> dict[str, Any]:
-    """What the report says of one picture; `too_dark` to `brightest` are of the light without bounds."""
+    """What the report says of one picture; `asks_below` to `brightest` are of the light without bounds."""
     solutions = done.solution if isinstance(done.solution, tuple) else (done.solution,)
     light = [done.pattern]  # of a T that has no S, so that there is no other
     if T.is_square:
@@ -144,8 +171,10 @@ def _entry(T: Transport, done: Compensation, low: float, high: float) -> dict[st
     return {
         "gain": done.gain,
         "clipped": done.clipped,
-        "too_dark": float(np.mean(np.less(light, low))),
-        "too_bright": float(np.mean(np.greater(light, high))),
+        "too_dark": float(np.mean(done.out_of_reach > 0)),
+        "too_bright": float(np.mean(done.out_of_reach < 0)),
+        "asks_below": float(np.mean(np.less(light, low))),
+        "asks_above": float(np.mean(np.greater(light, high))),
         "brightest": float(np.max(light)),
         "error": done.error,
         "gap": done.gap,
@@ -166,12 +195,23 @@ def _under(done: Compensation, dark: np.ndarray | None) -> dict[str, float]:
 
 def _write(folder: Path, name: str, done: Compensation, high: float) -> dict[str, Any]:
     # Appearance / gain compares with the picture that was asked for, whatever the units of T.
-    missing = done.out_of_reach
+    missing, shown = done.out_of_reach, _diverging(done.out_of_reach / done.gain) * done.gain
     return {
         "pattern": pictures.write(folder, f"{name}_pattern", done.pattern, high if high > 0 else 1.0),
         "appearance": pictures.write(folder, f"{name}_appearance", done.appearance, done.gain),
-        "out_of_reach": pictures.write(folder, f"{name}_out_of_reach", missing, done.gain, np.abs(missing)),
+        "out_of_reach": pictures.write(folder, f"{name}_out_of_reach", missing, done.gain, shown),
     }
+
+
+def _diverging(missing: np.ndarray) -> np.ndarray:
+    """Linear (h, w, 3): grey for 0, to orange for 1 and to blue for -1; of colours that most off."""
+    from ltcl import images
+
+    if missing.ndim == 3:
+        most = np.argmax(np.abs(missing), axis=-1)[..., None]
+        missing = np.take_along_axis(missing, most, axis=-1)[..., 0]
+    shade = np.clip(missing, -1.0, 1.0)[..., None] * [0.5, 0.0, -0.5]
+    return images.from_srgb(0.5 + shade)
 
 
 def _show(out: Path, entries: list[dict[str, Any]], advise: bool) -> None:
@@ -191,6 +231,8 @@ def _show(out: Path, entries: list[dict[str, Any]], advise: bool) -> None:
         ],
     )
     typer.echo(f"\npatterns, appearances and what is out of reach as .exr and .png in {out}")
+    if any(entry["too_dark"] or entry["too_bright"] for entry in entries):
+        typer.echo("out of reach: orange stays too dark, blue too bright")
     for entry in entries if advise else ():
         _advise(entry)
 
@@ -208,13 +250,13 @@ def _advise(entry: dict[str, Any]) -> None:
             f"{entry['file']}: {100 * under:.0f} % of it is no brighter than the background; "
             "darken the room, or brighten the picture"
         )
-    bounced = entry["too_dark"] - under
+    bounced = entry["asks_below"] - under
     if bounced > _MANY:
         console.note(
             f"{entry['file']}: {100 * bounced:.0f} % of it is darker than the light that bounces "
             "there from the rest of the picture; brighten its dark parts"
         )
-    if entry["too_bright"] > _MANY and entry["brightest"] > 0:
+    if entry["asks_above"] > _MANY and entry["brightest"] > 0:
         high = entry["pattern"]["png_scale"]
         gain = entry["gain"] * high / entry["brightest"]
         console.note(

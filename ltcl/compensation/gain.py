@@ -9,23 +9,58 @@ weighted desired picture,
 
     h(gain) = min over c in C of ||W (gain d - c)|| - loss ||gain W d||
 
-is convex in the gain. The largest gain with h <= 0 is found by Newton's method from above, where the tangent
-of a convex h cannot pass its last zero; h' costs nothing, since min ||r|| has the derivative r.W d / ||r||.
-Where h' <= 0 at h > 0, h has no zero. Some pictures have parts that no gain brings within reach, darker than
-the light that bounces there: `least_loss` tells what they cost.
+is convex in the gain, so that the gains with h <= 0 are an interval. Its upper end is held between two
+numbers. Every c comes within the loss at gains of its own, where a quadratic is at most 0: the largest of
+these is in reach. Every solve at a gain has a certificate, and with it a tangent below h: its zero cannot be
+passed, and is where Newton's method goes on. Where such a tangent has no zero, h has none.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from ltcl.compensation.problem import Limits, Problem
 from ltcl.errors import InputError
+from ltcl.solvers import Status
 
-_AIM = 0.99  # of the loss, so that Newton from above gets below the loss itself
-_ACCURACY = 0.005  # of the loss, to which the last picture is the nearest
-_COARSE = 0.02  # of what the error is above the loss, to which those on the way are
-_STEPS = 50
+TOLERANCE = 0.01  # of the gain; of the least error, where that is sought
+_COARSE = 0.1  # of what the error is above the loss: how exact solves on the way are
+_FINE = 0.2  # of what the tolerance of the gain is worth, to which the last ones are
+_FLOOR = 1e-6  # relative error that float32 hardly tells from none
+_STEPS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """The nearest light that was found at a gain; errors relative to ||gain W d||.
+
+    For every gain' min ||W (gain' d - c)|| / ||W d|| is at least gain * least + slope * (gain' - gain).
+    `own` are the parts of ||W c||: its cosine with W d, and its size over ||W d||.
+    """
+
+    gain: float
+    light: list[np.ndarray]
+    error: float
+    least: float
+    slope: float
+    own: tuple[float, float]
+    settled: bool  # no further step would tell more
+
+    @property
+    def sine(self) -> float:
+        """The error of this light at the gain that suits it best; 1 where none does."""
+        cosine = max(self.own[0], 0.0)
+        return float(np.sqrt(max(1.0 - cosine**2, 0.0)))
+
+    def largest(self, loss: float) -> float:
+        """The largest gain at which this light is within `loss`; 0 where it is at none."""
+        cosine, size = self.own
+        room = loss**2 - (1.0 - cosine**2)
+        if room < 0.0 or cosine <= 0.0:
+            return 0.0
+        return size * (cosine + float(np.sqrt(room))) / (1.0 - loss**2)
 
 
 def exact(u: list[np.ndarray], v: list[np.ndarray], limits: Limits) -> float | None:
@@ -47,62 +82,114 @@ def exact(u: list[np.ndarray], v: list[np.ndarray], limits: Limits) -> float | N
 
 
 def largest(problem: Problem, loss: float) -> tuple[float, list[np.ndarray]]:
-    """The largest gain at which some light within the limits comes within `loss` of the picture; that light.
+    """The largest gain, within `TOLERANCE`, at which some light comes within `loss`; that light.
 
     Raises
     ------
     InputError
         No gain does.
     """
-    gain, light = _from_above(problem, loss)
-    accuracy = _COARSE
+    high, light = _from_above(problem, loss)
+    low, best = 0.0, light
+    gain, accuracy = high, _COARSE * (1.0 - loss)
     for _ in range(_STEPS):
-        light, error, slope = _nearest(problem, gain, light, accuracy)
-        if error <= loss:
-            return gain, light
-        accuracy = max(_ACCURACY * loss, _COARSE * (error - loss))
-        rise = slope - _AIM * loss
-        gain -= gain * (error - _AIM * loss) / rise if rise > 0.0 else gain
-        if gain <= 0.0:
+        trial = _nearest(problem, gain, light, accuracy)
+        light, own = trial.light, trial.largest(loss)
+        if own > low:
+            low, best = own, light
+        rise = trial.slope - loss
+        if trial.least > loss:  # the tangent decides
+            if rise <= 0.0 or trial.least - loss >= rise:
+                break
+            high = gain * (1.0 - (trial.least - loss) / rise)
+            accuracy = max(_COARSE * (trial.error - loss), _FINE * TOLERANCE * rise)
+        elif trial.settled:
+            high = gain
+        else:
+            accuracy /= 4
+        if high <= (1.0 + TOLERANCE) * low:
             break
-    least = least_loss(problem, max(loss, _COARSE))
+        if trial.least > loss or trial.settled:
+            gain = high * (1.0 - TOLERANCE / 2)
+    if low > 0.0:
+        return low, best
+    nearest = closest(problem)
+    if nearest.sine <= loss:
+        return nearest.largest(loss), nearest.light
     raise InputError(
         f"gain is 'auto', but no gain brings the picture within a loss of {loss:g}; the least is "
-        f"about {least:.2g}; give a larger loss, or brighten the picture's dark parts"
+        f"about {nearest.sine:.3g}; give a larger loss, or brighten the picture's dark parts"
     )
 
 
-def least_loss(problem: Problem, tolerance: float) -> float:
-    """The relative error that no darker picture is below by much: halving the gain gains less than this."""
-    gain, light = _from_above(problem, 0.0)
-    least, error = np.inf, 1.0
-    while error < least - tolerance:
-        least = error
-        gain /= 2
-        light, error, _ = _nearest(problem, gain, light, tolerance / 4)
-    return min(least, error)
+def closest(problem: Problem, enough: float = 0.0) -> Trial:
+    """The light with the least `sine`, to `TOLERANCE` of it, or one within `enough`.
+
+    In t = 1 / gain the least error is convex: the tangents of all trials bound it from below, and where
+    that bound is lowest is the next one. Gains below half of the least tried are not looked at.
+    """
+    first, light = _from_above(problem, 0.0)
+    enough = max(enough, _FLOOR)
+    lines: list[tuple[float, float]] = []
+    t, farthest, bound, best = 1.0, 1.0, 0.0, None
+    for _ in range(_STEPS):
+        sine = 1.0 if best is None else best.sine
+        accuracy = max(_COARSE * (sine - bound), TOLERANCE / 4 * max(sine, enough))
+        trial = _nearest(problem, first / t, light, accuracy)
+        light = trial.light
+        lines.append((trial.slope, (trial.least - trial.slope) / t))
+        if best is None or trial.sine < best.sine:
+            best = trial
+        farthest = max(farthest, t)
+        t, bound = _lowest(lines, 2 * farthest)
+        if best.sine <= max(enough, (1.0 + TOLERANCE) * bound):
+            break
+    assert best is not None  # noqa: S101 - there are steps
+    return best
 
 
-def _nearest(
-    problem: Problem, gain: float, light: list[np.ndarray], accuracy: float
-) -> tuple[list[np.ndarray], float, float]:
-    """The light that comes nearest at this gain, its relative error, and d||r|| / d gain over ||W d||."""
+def _lowest(lines: list[tuple[float, float]], most: float) -> tuple[float, float]:
+    """Where in (0, most] the largest of the lines a + b t is lowest, and how low."""
+    a, b = np.array(lines).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossings = ((a[:, None] - a) / (b - b[:, None])).ravel()
+    t = np.append(crossings[(crossings > 0.0) & (crossings < most)], most)
+    heights = np.max(a + b * t[:, None], axis=1)
+    return float(t[np.argmin(heights)]), float(np.min(heights))
+
+
+def _nearest(problem: Problem, gain: float, light: list[np.ndarray], accuracy: float) -> Trial:
+    """The trial at this gain, whose error is above the least by `accuracy` at most."""
     size = _size(problem)
     columns = sum(part.shape[1] for part in problem.desired)
     rules = {"rtol": 0.0, "atol": accuracy * gain * size / np.sqrt(columns)}
-    light = [problem.nearest(which, gain, start, **rules)[0] for which, start in enumerate(light)]
+    pairs = [problem.nearest(which, gain, start, **rules) for which, start in enumerate(light)]
+    light, solves = [p for p, _ in pairs], [found for _, found in pairs]
+    wanted = problem.weighted(problem.desired)
     left = problem.weighted(_residual(problem, gain, light))
     error = float(np.sqrt(_inner(left, left)))
-    slope = _inner(left, problem.weighted(problem.desired)) / (error or 1.0)
-    return light, error / (gain * size), slope / size
+    # Each column has a bound and a slope of its own; of the norm, these add up with the weights error / norm.
+    above = sum(float(np.sum(found.errors * (found.errors - found.least))) for found in solves)
+    along = _inner(left, wanted)
+    seen = [gain * part - rest for part, rest in zip(wanted, left, strict=True)]
+    norm = float(np.sqrt(_inner(seen, seen)))
+    return Trial(
+        gain=gain,
+        light=light,
+        error=error / (gain * size),
+        least=(error - above / (error or 1.0)) / (gain * size),
+        slope=along / ((error or 1.0) * size),
+        own=(_inner(seen, wanted) / ((norm or 1.0) * size), norm / size),
+        settled=all(found.status is not Status.CONVERGED or not np.any(found.errors) for found in solves),
+    )
 
 
 def _size(problem: Problem) -> float:
     size = problem.norm(problem.desired)
     if size == 0.0:
-        raise InputError(
-            "gain is 'auto', but desired is black where it counts: no gain is too large for that"
-        )
+        everywhere = not any(part.any() for part in problem.desired)
+        where = "everywhere" if everywhere else "wherever weights are above 0"
+        raise InputError(f"gain is 'auto', but desired is 0 {where}: no gain is too large for that")
     return size
 
 
@@ -112,7 +199,7 @@ def _from_above(problem: Problem, loss: float) -> tuple[float, list[np.ndarray]]
     ``gain ||W d||^2 - max (W c).(W d) <= ||gain W d - W c|| ||W d||``; in p the maximum is of a linear
     function.
     """
-    reach, light = 0.0, []
+    size, reach, light = _size(problem), 0.0, []
     limits = problem.limits
     for system, wwd, dark in zip(
         problem.systems, problem.weighted(problem.weighted(problem.desired)), problem.dark, strict=True
@@ -123,10 +210,10 @@ def _from_above(problem: Problem, loss: float) -> tuple[float, list[np.ndarray]]
         reach += float(np.sum(use * best) + np.sum(dark * wwd))
     if reach <= 0.0:
         raise InputError(
-            "gain is 'auto', but no light within the bounds looks more like the picture than none; "
+            "gain is 'auto', but no light within the bounds looks more like desired than none does; "
             "is desired negative, or T?"
         )
-    return reach / ((1.0 - loss) * _size(problem) ** 2), light
+    return reach / ((1.0 - loss) * size**2), light
 
 
 def _residual(problem: Problem, gain: float, light: list[np.ndarray]) -> list[np.ndarray]:

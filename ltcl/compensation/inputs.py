@@ -3,16 +3,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+import logging
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks, layout
 from ltcl.errors import InputError, InputTypeError
+from ltcl.solvers.direct import Direct
+from ltcl.solvers.solve import ITERATIVE, METHODS
 from ltcl.transport import Transport
 
+logger = logging.getLogger(__name__)
+
 Columns = list[np.ndarray]
+_OWN = ("bounds", "background", "gain", "loss", "weights", "method", "rtol")
 _OPTIONS = ("atol", "maxiter", "callback", "throw")  # of `ltcl.solve`, that a solve within bounds has, too
+
+_LEAST_LOSS = 1e-6
 
 
 def bounds(value: Any) -> tuple[float, float]:
@@ -20,28 +29,55 @@ def bounds(value: Any) -> tuple[float, float]:
     try:
         low, high = value
     except (TypeError, ValueError):
-        raise InputError(f"bounds is {value!r}; it must be (low, high)") from None
+        raise InputError(f"bounds is {_shown(value)}; it must be (low, high)") from None
+    for place, bound in enumerate((low, high)):
+        if np.ndim(bound):
+            raise InputError(
+                f"bounds[{place}] is {_shown(bound)}; it must be one number, the same for all pixels"
+            )
     low = checks.number("bounds[0]", low)
     return low, checks.number("bounds[1]", high, above=low)
 
 
 def gain(value: Any, loss: Any) -> float | None:
     """The gain, None where it is to be found; a loss is checked, too."""
-    if isinstance(value, str):
-        if value != "auto":
-            raise InputError(f"gain is {value!r}; it must be 'auto' or a finite number above 0")
-        if loss is not None:
-            checks.number("loss", loss, above=0.0, below=1.0)
+    if isinstance(value, str) and value == "auto":
+        if loss is not None and checks.number("loss", loss, above=0.0, below=1.0) < _LEAST_LOSS:
+            raise InputError(
+                f"loss is {loss!r}, which float32 cannot tell from none; it must be at least {_LEAST_LOSS:g}"
+            )
         return None
+    try:
+        found = None if np.ndim(value) else checks.number("gain", value, above=0.0)
+    except InputError:
+        found = None
+    if found is None:
+        raise InputError(f"gain is {_shown(value)}; it must be 'auto' or a finite number above 0")
     if loss is not None:
         raise InputError(f"loss is {loss!r}, but gain is {value!r}; a loss is of use with gain='auto' only")
-    return checks.number("gain", value, above=0.0)
+    return found
+
+
+def desired(value: Any, T: Transport) -> tuple[Columns, layout.Layout]:
+    """Of every channel; a warning where it looks like a picture that was not decoded."""
+    array = checks.real("desired", value)
+    if array.dtype.kind in "iu" and array.size and array.max() > 1:
+        logger.warning(
+            "desired holds %s, up to %d; it is taken as linear radiance in the units of T: "
+            "use ltcl.images.read, or divide",
+            array.dtype,
+            array.max(),
+        )
+    return layout.unpack("desired", array, T.camera_grid, T.channels)
 
 
 def background(value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Columns:
-    """Of every channel: none, one for all frames, or one per frame."""
+    """Of every channel: none, one number, one for all frames, or one per frame."""
     if value is None:
         return [np.zeros_like(part) for part in like]
+    if np.ndim(value) == 0:
+        level = checks.number("background", value)
+        return [np.full(part.shape, level) for part in like]
     return _alike("background", value, T, shape, like)
 
 
@@ -60,14 +96,16 @@ def weights(value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Co
 
 def rules(T: Transport, method: str, rtol: Any, options: dict[str, Any]) -> dict[str, Any]:
     """Options of a solve within the bounds; of a T without S, those are all that there are."""
-    if not T.is_square:
-        if method != "auto":
-            raise InputError(f"method is {method!r}, but this T has no S for it to solve; it must be 'auto'")
-        for name in options:
-            if name not in _OPTIONS:
-                raise InputTypeError(
-                    f"unknown option {name!r}; for a T without S there are {', '.join(_OPTIONS)}"
-                )
+    if not T.is_square and method != "auto":
+        raise InputError(f"method is {method!r}, but this T has no S for it to solve; it must be 'auto'")
+    checks.one_of("method", method, METHODS)
+    known = list(_OPTIONS)
+    if T.is_square:
+        kind = {**ITERATIVE, Direct.name: Direct}.get(method)
+        known += ["x0", *(field.name for field in (dataclasses.fields(kind) if kind else ()))]
+    for name in options:
+        if name not in known:
+            raise InputTypeError(f"unknown option {name!r}; compensate has {', '.join([*_OWN, *known])}")
     rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
     atol = checks.number("atol", options.get("atol", 0.0), least=0.0)
     if rtol == 0.0 and atol == 0.0:
@@ -76,6 +114,13 @@ def rules(T: Transport, method: str, rtol: Any, options: dict[str, Any]) -> dict
     if options.get("maxiter") is not None:
         found["maxiter"] = checks.count("maxiter", options["maxiter"])
     return found
+
+
+def _shown(value: Any) -> str:
+    """What was given, in one line; of arrays the shape."""
+    if isinstance(value, (tuple, list)) and any(np.ndim(part) for part in value):
+        return f"a {type(value).__name__} of {len(value)} arrays"
+    return f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
 
 
 def _alike(name: str, value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Columns:

@@ -24,7 +24,7 @@ from ltcl.transport import Transport
 _PROBES = 16  # of the norms of columns that cannot be seen: within a factor of 2, which is enough
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class System:
     """A, (M, N), and the scale (N,) float64 of its unknowns; 0 where a projector pixel lights nothing."""
 
@@ -41,7 +41,7 @@ class System:
         return np.divide(x, scale, out=np.zeros(x.shape), where=scale > 0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Limits:
     """The projector's bounds; pixels that are `masked`, (N,), stay dark whatever these are."""
 
@@ -53,6 +53,10 @@ class Limits:
         """Light (N, k) moved within the bounds."""
         return np.where(self.masked[:, None], 0.0, np.clip(light, self.low, self.high))
 
+    def touched(self, light: np.ndarray) -> np.ndarray:
+        """Where light within the bounds is at one of them."""
+        return (light <= self.low) | (light >= self.high)
+
     def exceeded(self, light: np.ndarray) -> np.ndarray:
         """Where light is outside; the slack counts rounding at a bound as inside."""
         slack = 1e-6 * (self.high - self.low)
@@ -60,7 +64,7 @@ class Limits:
         return beyond & ~self.masked[:, None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """What is to be seen, T p + dark = gain * desired, weighted by w; each a list of (M, k), one a system."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from ltcl.solvers import Bounded, Solution
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Compensation:
     """Result of `ltcl.compensate`. Pictures are linear, float32, of the frames and colours of `desired`.
 
@@ -23,17 +23,20 @@ class Compensation:
     gain : float
         The target was gain * desired.
     clipped : float
-        Fraction of pattern values that a bound keeps from going beyond it.
+        Fraction of pattern values that are at a bound and would lower the error beyond it; masked pixels do
+        not count.
     target : array
         gain * desired.
     out_of_reach : array
-        target - appearance, 0 where that is within the solve's tolerance of the brightest target: where the
-        projector's limits keep the scene too dark (positive) or too bright (negative).
+        target - appearance where the projector's limits keep the scene too dark (positive) or too bright
+        (negative). 0 where nothing is clipped; else 0 where a solve's tolerance explains it: where weight *
+        abs(target - appearance) is at most 3 times what ``max(rtol ||W target||, atol)`` of this frame and
+        colour makes in the root mean square. So it is 0 where the weight is.
     error : float
         ``||W (appearance - target)|| / ||W target||`` of all frames and colours together.
     gap : float
-        What the error is above the least that the bounds allow, at most: a bound that was computed for this
-        result. Relative to gain * desired - background, of the worst frame and colour.
+        What the error is above the least that the bounds allow, at most: no pattern within them has an error
+        below error - gap. A bound that was computed for this result.
     solution : Solution or tuple of 3
         What the light would be without bounds, one per channel of the transport; of a T without S, `limited`.
     limited : tuple of Bounded

@@ -19,10 +19,10 @@ from ltcl.solvers import Solution, solve
 from ltcl.transport import Transport
 
 Columns = list[np.ndarray]
-_LOSS = 1e-3  # of the picture: what no eye sees
+_MORE = 1.1  # times the least error of all gains, that the largest may have where none is in reach
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Start:
     """A gain, and the light (N, k) of each system to be brought within the limits.
 
@@ -90,5 +90,6 @@ def at_largest_gain(inverse: Inverse, problem: Problem, loss: float | None, exac
 def _at_a_loss(problem: Problem, loss: float | None) -> tuple[float, Columns]:
     if loss is not None:
         return gains.largest(problem, loss)
-    small = max(problem.rules["rtol"], _LOSS)
-    return gains.largest(problem, gains.least_loss(problem, small) + small)
+    rtol = problem.rules["rtol"]
+    least = gains.closest(problem, enough=rtol / _MORE).sine
+    return gains.largest(problem, max(rtol, _MORE * least))

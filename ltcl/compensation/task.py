@@ -22,6 +22,7 @@ from ltcl.errors import ConvergenceError
 from ltcl.solvers import Bounded, Status
 from ltcl.transport import Transport, require
 
+_EXPLAINED = 3.0  # times the root mean square of an error: few of a solve's are larger
 Columns = list[np.ndarray]  # one (N, k) a channel of the transport
 
 
@@ -49,14 +50,15 @@ def compensate(
         Wanted radiance at each camera pixel, in the units of T.
     bounds : (low, high)
         What the projector can emit per pixel, in linear light.
-    background : like `desired` or one frame of it, optional
+    background : number, like `desired` or one frame of it, optional
         Light the projector cannot take away: ambient and its own black. T pattern + background is matched.
     gain : float or "auto"
-        Scale of the target; "auto" finds the largest one, for all frames and colours, that the bounds reach.
+        Scale of the target; "auto" finds the largest one, for all frames and colours, that the bounds reach;
+        at a loss at most 1 % below the largest there is.
     loss : float, optional
-        Of gain="auto": relative error, weights included, that the gain may cost. When not given, none where
-        some gain is within reach exactly and there are no `weights`; else `rtol`, or 0.001 if that is less,
-        above what a picture half as bright would cost.
+        Of gain="auto": relative error, weights included, that the gain may cost, from 1e-6 to 1. When not
+        given, none where some gain is within reach exactly and there are no `weights`; else `rtol` or 1.1
+        times the least error of all gains (found to 1 %), whichever is more.
     weights : like `desired` or one frame of it, optional
         How much the error at each camera pixel counts, at least 0. When not given 1, and 0 where T.masked.
     method, rtol, **options
@@ -66,8 +68,7 @@ def compensate(
     Returns
     -------
     Compensation
-        Never worse than the light without bounds, clamped; at a `loss` found for gain="auto", by no more than
-        0.5 % of that.
+        Never worse than the light without bounds, clamped, at a given gain; within the loss of gain="auto".
 
     Raises
     ------
@@ -95,7 +96,7 @@ def compensate(
     require(T, square=False)
     limits = Limits(*inputs.bounds(bounds), T.join([T.masked] * T.channels)[0])
     sought = inputs.gain(gain, loss)
-    wanted, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
+    wanted, shape = inputs.desired(desired, T)
     dark = inputs.background(background, T, shape, wanted)
     counts = inputs.weights(weights, T, shape, wanted)
     rules = inputs.rules(T, method, rtol, options)
@@ -138,9 +139,9 @@ def _result(
     missing = [wanted - found for wanted, found in zip(target, seen, strict=True)]
     solved = tuple(found for found in limited if found is not None)
     solutions = start.solutions or solved
-    gaps = [found.gap for found in solved] + [
-        s.residual for s in start.solutions if len(solved) < len(limited)
-    ]
+    size, clipped = problem.norm(target) or 1.0, _clipped(light, limited, problem.limits)
+    error = problem.norm(missing)
+    least = np.sqrt(sum(float(np.sum(np.square(found.least))) for found in solved))  # of others 0
 
     def picture(columns: Columns, grid: tuple[int, int]) -> np.ndarray:
         return shape.pack(T.split(columns), grid).astype(np.float32)
@@ -149,22 +150,33 @@ def _result(
         pattern=picture(light, T.grid),
         appearance=picture(seen, T.camera_grid),
         gain=start.gain,
-        clipped=_clipped(limited, problem.limits.masked),
+        clipped=clipped,
         target=picture(target, T.camera_grid),
-        out_of_reach=picture(_beyond(missing, target, problem.rules["rtol"]), T.camera_grid),
-        error=problem.norm(missing) / (problem.norm(target) or 1.0),
-        gap=max(gaps),
+        out_of_reach=picture(_beyond(problem, missing, target, clipped), T.camera_grid),
+        error=error / size,
+        gap=max(error - float(least), 0.0) / size,
         solution=solutions[0] if len(solutions) == 1 else solutions,
         limited=solved,
     )
 
 
-def _clipped(limited: list[Bounded | None], masked: np.ndarray) -> float:
-    """The share of values that the bounds hold, of pixels that are lit."""
-    return float(np.mean([0.0 if found is None else found.held[~masked].mean() for found in limited]))
+def _clipped(light: Columns, limited: list[Bounded | None], limits: Limits) -> float:
+    """The share of values at a bound that want to go beyond it, of pixels that are lit."""
+    shares = []
+    for p, found in zip(light, limited, strict=True):
+        held = np.zeros(p.shape, bool) if found is None else found.held & limits.touched(p)
+        shares.append(held[~limits.masked].mean())
+    return float(np.mean(shares))
 
 
-def _beyond(missing: Columns, target: Columns, rtol: float) -> Columns:
+def _beyond(problem: Problem, missing: Columns, target: Columns, clipped: float) -> Columns:
     """What is missing, without what the tolerance of a solve explains."""
-    small = rtol * max(float(np.max(np.abs(part))) for part in target)
-    return [np.where(np.abs(part) > small, part, 0.0) for part in missing]
+    if clipped == 0.0:
+        return [np.zeros_like(part) for part in missing]
+    counted = zip(missing, problem.weighted(missing), problem.weighted(target), strict=True)
+    rtol, atol = problem.rules["rtol"], problem.rules["atol"]
+    found = []
+    for part, wrong, wanted in counted:
+        allowed = np.maximum(rtol * np.linalg.norm(wanted, axis=0), atol) / np.sqrt(len(part))
+        found.append(np.where(np.abs(wrong) > _EXPLAINED * allowed, part, 0.0))
+    return found

@@ -43,7 +43,7 @@ _FAR = 1e30  # in units of b: a bound where none was meant, inside float32
 _PATIENCE = 50  # steps without a better certificate: rounding has the say
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Bounded(Solution):
     """Result of `minimise`: a `Solution` with its certificate; errors in the units of w b.
 

@@ -33,7 +33,7 @@ class Status(enum.Enum):
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """Result of `ltcl.solve`.
 

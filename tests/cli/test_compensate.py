@@ -108,7 +108,8 @@ def test_clipping_comes_with_advice(program: Program, transport: Path, tmp_path:
     advised = outcome.err.rpartition("--gain ")[2].strip()
     assert float(advised) < 1
     outcome = program("compensate", transport, bright, "--out", tmp_path / "out", "--gain", advised, "--json")
-    assert outcome.json["pictures"][0]["too_bright"] == 0
+    assert outcome.json["pictures"][0]["asks_above"] == 0
+    assert outcome.json["pictures"][0]["too_dark"] == 0
     assert outcome.json["pictures"][0]["brightest"] > 0.9
 
 
@@ -168,9 +169,14 @@ def test_earlier_results_give_way_to_new_ones(
         (["nowhere.npz", "{picture}"], ["nowhere.npz: no such file"]),
         (["{transport}", "{picture}", "--device", "nonsense"], ["device is 'nonsense'"]),
         (["{transport}", "{picture}", "--grid", "7x7"], ["h * w must be 50"]),
-        (["{transport}", "{picture}", "--gain", "0"], ["gain is 0.0", "above 0"]),
-        (["{transport}", "{picture}", "--loss", "0.1"], ["loss is 0.1, but gain is 1.0"]),
-        (["{transport}", "{picture}", "--gain", "auto", "--loss", "2"], ["loss is 2.0", "below 1"]),
+        (["{transport}", "{picture}", "--gain", "0"], ["--gain is 0.0", "above 0"]),
+        (
+            ["{transport}", "{picture}", "--loss", "0.1"],
+            ["--loss is 0.1, but --gain is 1; --loss is for --gain auto only"],
+        ),
+        (["{transport}", "{picture}", "--gain", "auto", "--loss", "2"], ["--loss is 2.0", "below 1"]),
+        (["{transport}", "{picture}", "--gain", "auto", "--loss", "0"], ["--loss is 0.0", "at least 1e-06"]),
+        (["{transport}", "{picture}", "--gain", "-1"], ["--gain is -1.0", "above 0"]),
         (["{transport}", "{picture}", "--weights", "{large}"], ["20 x 30", "--resize"]),
         (["{transport}", "{picture}", "--low", "1", "--high", "0"], ["--high is 0.0", "above 1"]),
         (["{transport}", "{picture}", "--rtol", "nan"], ["rtol is nan"]),
@@ -243,13 +249,53 @@ def test_what_is_out_of_reach_is_drawn(
     (entry,) = program(*arguments).json["pictures"]
     missing = images.read(tmp_path / "out" / "spot_out_of_reach.exr")
     assert missing[2, 3] > 1.0
-    assert images.read(tmp_path / "out" / entry["out_of_reach"]["png"])[2, 3].min() > 0.9
+    shown = images.to_srgb(images.read(tmp_path / "out" / entry["out_of_reach"]["png"]))
+    np.testing.assert_allclose(shown[2, 3], [1.0, 0.5, 0.0], atol=0.01)  # orange: too dark
+    np.testing.assert_allclose(shown[0, 0], 0.5, atol=0.01)
+    assert entry["too_dark"] == np.mean(missing > 0) > 0
+    assert entry["too_bright"] == np.mean(missing < 0)
     assert entry["clipped"] > 0
     assert 0 < entry["gap"] <= 0.01
     weights[2, 3] = 0.0
     images.write(tmp_path / "weights.exr", weights)
     (told,) = program(*arguments, "--weights", tmp_path / "weights.exr").json["pictures"]
     assert told["error"] < 0.5 * entry["error"]
+
+
+def test_too_bright_is_drawn_blue(program: Program, transport: Path, tmp_path: Path) -> None:
+    desired = np.full((5, 10), 1.0, np.float32)
+    desired[2, 3] = 0.0
+    images.write(tmp_path / "hole.exr", desired)
+    arguments = ["compensate", transport, tmp_path / "hole.exr", "--out", tmp_path / "out", "--high", "9"]
+    (entry,) = program(*arguments, "--low", "0.5", "--json").json["pictures"]
+    shown = images.to_srgb(images.read(tmp_path / "out" / entry["out_of_reach"]["png"]))[2, 3]
+    assert shown[2] > 0.6 > 0.4 > shown[0]
+    assert entry["too_bright"] > 0
+    assert "orange stays too dark, blue too bright" in program(*arguments, "--low", "0.5").out
+
+
+def test_nothing_out_of_reach_is_grey_all_over(
+    program: Program, transport: Path, picture: Path, tmp_path: Path
+) -> None:
+    arguments = ["compensate", transport, picture, "--gain", "auto", "--out", tmp_path / "out", "--json"]
+    (entry,) = program(*arguments).json["pictures"]
+    assert entry["clipped"] == entry["too_dark"] == entry["too_bright"] == 0
+    assert not images.read(tmp_path / "out" / entry["out_of_reach"]["exr"]).any()
+    assert np.ptp(images.read(tmp_path / "out" / entry["out_of_reach"]["png"])) == 0
+
+
+def test_refusals_name_the_file(program: Program, transport: Path, picture: Path, tmp_path: Path) -> None:
+    black, colour = tmp_path / "black.exr", tmp_path / "colour.exr"
+    images.write(black, np.zeros((5, 10), np.float32))
+    images.write(colour, np.ones((5, 10, 3), np.float32) * [1, 0.5, 0.2])
+    out = ["--out", tmp_path / "out"]
+    black_picture = program("compensate", transport, black, "--gain", "auto", *out)
+    black_picture.refused(f"{black}: --gain is auto, but desired is 0 everywhere")
+    none_counts = program("compensate", transport, picture, "--weights", black, *out)
+    none_counts.refused(f"{black}: weights range from 0 to 0")
+    for option in ("--weights", "--background"):
+        refused = program("compensate", transport, picture, option, colour, *out)
+        refused.refused(f"{colour}: {option[2:]} has 1 frame(s) of 3 colour(s)")
 
 
 def test_out_that_is_a_file_is_refused(

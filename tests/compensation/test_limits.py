@@ -56,8 +56,11 @@ def test_never_worse_than_clamping_and_never_far_from_the_least(
         scene.T @ clamped - target
     ) + 2e-5 * np.linalg.norm(desired)
     best = least(scene.T, target, bounds=(low, 1.0))
-    assert error(found, target) - c.gap <= best + 1e-5
-    assert c.gap <= max(rtol, 1e-4) * (1 + 1e-6)
+    share = np.linalg.norm(target) / np.linalg.norm(desired)  # error and gap are relative to desired
+    assert c.error - c.gap <= best * share + 1e-5
+    assert c.gap <= max(rtol * share, 1e-4) * (1 + 1e-5)
+    at_bound = (c.pattern == np.float32(low)) | (c.pattern == np.float32(1.0))
+    assert c.clipped <= at_bound.mean()
     assert c.error == pytest.approx(np.linalg.norm(found - target) / np.linalg.norm(desired), abs=1e-5)
 
 
@@ -137,7 +140,8 @@ def test_a_rectangular_T_has_no_method_of_solve(device):
     with pytest.raises(InputError, match=r"method is 'jacobi', but this T has no S .* must be 'auto'"):
         ltcl.compensate(T, np.ones((2, 3)), method="jacobi")
     with pytest.raises(
-        InputTypeError, match=r"unknown option 'omega'; for a T without S there are atol, maxiter"
+        InputTypeError,
+        match=r"unknown option 'omega'; compensate has bounds, .*, rtol, atol, maxiter, callback, throw$",
     ):
         ltcl.compensate(T, np.ones((2, 3)), omega=1.5)
     with pytest.raises(InputError, match=r"desired has shape \(4, 6\); it must be \(2, 3\)"):
@@ -153,3 +157,122 @@ def test_a_limit_of_steps_is_told(device):
     c = ltcl.compensate(T, desired, method="direct", rtol=1e-4, maxiter=1, throw=False)
     assert c.gap > 1e-4
     assert not c.limited[0].converged
+
+
+@pytest.fixture(scope="module")
+def closed(device):
+    return ltcl.scenes.box(8, sides=6, albedo=0.8).transport(device=device)
+
+
+BRIGHT = 0.05 + 1.5 * np.random.default_rng(1).random((16, 24))
+
+
+@pytest.mark.parametrize(("bounds", "gain"), [((0.1, 0.6), 1.0), ((0.0, 1.0), 2.0), ((0.0, 1.0), 1.0)])
+def test_clipped_is_of_the_pattern_that_comes_back(closed, bounds, gain):
+    """Against the gradient in float64: at a bound, and the error falls beyond it."""
+    desired = np.resize(BRIGHT, closed.grid)
+    c = ltcl.compensate(closed, desired, bounds=bounds, gain=gain)
+    T = np.asarray(closed.matrices[0], np.float64)
+    p = c.pattern.ravel().astype(np.float64)
+    slope = T.T @ (T @ p - gain * desired.ravel())
+    low, high = (p == np.float32(bound) for bound in bounds)
+    wants = (low & (slope > 0)) | (high & (slope < 0))
+    assert c.clipped == pytest.approx(wants.mean(), abs=0.01)
+    assert 0.1 < c.clipped <= (low | high).mean()
+
+
+def test_nothing_clipped_is_nothing_out_of_reach(device):
+    """Though the solve leaves an error up to its tolerance, here a few pixels of far more."""
+    scene = lambertian(N, 2.0, seed=9)
+    T = ltcl.Transport(scene.T, GRID, device=device)
+    c = ltcl.compensate(T, scene.T @ random.uniform(0.2, 0.8, N), method="jacobi", rtol=0.5, throw=False)
+    assert c.clipped == 0.0
+    assert c.error > 1e-3
+    assert not c.out_of_reach.any()
+
+
+def test_out_of_reach_leaves_out_what_the_tolerance_explains(device):
+    scene = lambertian(N, 0.5, seed=9)
+    T = ltcl.Transport(scene.T, GRID, device=device)
+    desired = 0.5 * scene.T.sum(axis=1)
+    desired[3] *= 4
+    weights = np.ones(N)
+    c = ltcl.compensate(T, desired, rtol=1e-2)
+    missing = c.target.astype(float) - c.appearance
+    explained = 3 * 1e-2 * np.sqrt(np.mean(desired**2))
+    np.testing.assert_allclose(
+        c.out_of_reach, np.where(np.abs(missing) > explained, missing, 0), atol=1e-5 * desired.max()
+    )
+    assert c.out_of_reach[3] > 0.0
+    weights[3] = 0.0
+    told = ltcl.compensate(T, desired, weights=weights, rtol=1e-2)
+    assert told.clipped > 0.0
+    assert told.out_of_reach[3] == 0.0
+    assert abs(told.target[3] - told.appearance[3]) > explained
+
+
+def test_error_and_gap_are_relative_to_the_same(device):
+    """With a bright background gain * desired - background is another measure."""
+    scene = lambertian(N, 1.0, seed=9)
+    T = ltcl.Transport(scene.T, GRID, device=device)
+    desired = random.uniform(0.5, 2, N) * scene.T.sum(axis=1)
+    dark = 0.8 * desired * random.uniform(0, 1, N)
+    c = ltcl.compensate(T, desired, background=dark, rtol=1e-2)
+    p = lsq_linear(scene.T, desired - dark, (0, 1), tol=1e-14).x
+    best = float(np.linalg.norm(scene.T @ p + dark - desired) / np.linalg.norm(desired))
+    assert c.error - c.gap <= best + 1e-6 <= c.error + 1e-5
+    seen = scene.T @ c.pattern.astype(float) + dark
+    assert c.error == pytest.approx(np.linalg.norm(seen - desired) / np.linalg.norm(desired), rel=1e-4)
+
+
+def test_results_compare_by_identity(device):
+    T = ltcl.Transport(lambertian(N, 0.5, seed=9).T, GRID, device=device)
+    one, two = (ltcl.compensate(T, np.ones(N)) for _ in range(2))
+    assert one == one
+    assert one != two
+    assert one.limited[0] != two.limited[0]
+    assert one.solution != two.solution
+    assert ltcl.separate(T, np.ones(N)) != ltcl.separate(T, np.ones(N))
+
+
+def test_one_number_is_a_background(device):
+    T = ltcl.Transport(lambertian(N, 0.5, seed=9).T, GRID, device=device)
+    one, all_ = (ltcl.compensate(T, np.ones(N), background=b) for b in (0.1, np.full(N, 0.1)))
+    np.testing.assert_array_equal(one.pattern, all_.pattern)
+
+
+def test_a_picture_of_bytes_is_worth_a_warning(device, caplog):
+    T = ltcl.Transport(lambertian(N, 0.5, seed=9).T, GRID, device=device)
+    ltcl.compensate(T, np.full(GRID, 255, np.uint8))
+    (record,) = caplog.records
+    assert record.getMessage().startswith("desired holds uint8, up to 255; it is taken as linear radiance")
+    ltcl.compensate(T, np.ones(GRID, int))
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            {"bounds": (np.zeros(GRID), np.ones(GRID))},
+            r"bounds\[0\] is an array of shape \(4, 6\); it must be one",
+        ),
+        ({"bounds": np.zeros((3, 2))}, r"bounds is an array of shape \(3, 2\); it must be \(low, high\)"),
+        ({"gain": None}, "gain is None; it must be 'auto' or a finite number above 0"),
+        ({"gain": True}, "gain is True; it must be 'auto' or"),
+        ({"gain": np.ones(3)}, r"gain is an array of shape \(3,\); it must be 'auto' or"),
+        ({"gain": "auto", "desired": np.zeros(GRID)}, "desired is 0 everywhere"),
+        ({"background": np.nan}, "background is nan"),
+    ],
+)
+def test_refusals_are_short(device, change, says):
+    T = ltcl.Transport(lambertian(N, 0.5, seed=9).T, GRID, device=device)
+    with pytest.raises(InputError, match=says):
+        ltcl.compensate(T, **{"desired": np.ones(GRID), **change})
+
+
+def test_a_misspelt_keyword_is_told_from_those_of_compensate():
+    T = ltcl.Transport(lambertian(N, 0.5, seed=9).T, GRID, device="there is no such device")
+    says = r"unknown option 'gian'; compensate has bounds, background, gain, loss, .* throw, x0$"
+    with pytest.raises(InputTypeError, match=says):
+        ltcl.compensate(T, np.ones(GRID), gian="auto")
