@@ -126,6 +126,10 @@ def _shape(S: Any) -> tuple[int, ...]:
     """The shape of whatever was given for S, before it becomes an operator on a device."""
     if isinstance(S, (tuple, list)) and any(isinstance(part, Operator) for part in S):
         raise InputTypeError(f"S is {len(S)} operators, one per colour channel; it must be one: solve each")
+    if hasattr(S, "interreflection"):
+        raise InputTypeError(
+            f"S is a {type(S).__name__}; give its interreflection operator, T.interreflection"
+        )
     return getattr(S, "shape", None) or checks.real("S", S).shape
 
 
@@ -144,6 +148,8 @@ def _rule(
     atol = checks.number("atol", atol, least=0.0)
     if rtol == 0.0 and atol == 0.0:
         raise InputError("rtol and atol are both 0; one of them must be positive")
+    if callback is not None and not callable(callback):
+        raise InputTypeError(f"callback is {callback!r}; it must be callable(iteration, relative residual)")
     return Rule(rtol, atol, _MAXITER if maxiter is None else checks.count("maxiter", maxiter), callback)
 
 

@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 import math
+import numbers
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from ltcl import checks
+from ltcl.errors import InputTypeError
 from ltcl.operators import Operator
-from ltcl.theory.spectrum import POWER_ITERATION, SpectralRadius
+from ltcl.theory.spectrum import POWER_ITERATION, SpectralRadius, require_operator
 
 FREE_BOUNDS, SWEEPS, RITZ = "free bounds", "trial sweeps", "ritz values"
 NOTHING, BEYOND = "none", "none: float32 cannot confirm this rtol"
@@ -72,6 +74,9 @@ def forecasts(
     gmres 6 ritz values
     bicgstab 7 ritz values
     """
+    require_operator("S", S)
+    if not isinstance(rho, SpectralRadius):
+        raise InputTypeError(f"rho is a {type(rho).__name__}; it must be what theory.spectral_radius returns")
     decided = not rho.lower < 1.0 <= rho.upper
     series = Forecast(series_products(rho.value, rtol), rho.certificate if decided else POWER_ITERATION)
     sweeps = gauss_seidel_forecast(S, rtol)
@@ -110,7 +115,7 @@ def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
     >>> gauss_seidel_forecast(as_operator([[1.0, 0.5], [0.5, 1.0]]), 1e-2).products  # rho is 1/4
     3
     """
-    n = S.shape[0]
+    n = require_operator("S", S).shape[0]
     if n > _LARGEST_SWEEP or 2 * 8 * n * n > checks.host_memory():
         return Forecast(math.nan, NOTHING)
     left, made, rho = _trial_sweeps(S.to_dense(), rtol)
@@ -148,6 +153,7 @@ def series_products(rho: float, rtol: float) -> float:
     >>> series_products(0.5, 1e-2), series_products(1.0, 1e-2)
     (7, inf)
     """
+    _numbers(rho=rho, rtol=rtol)
     if rho >= 1.0:
         return math.inf
     return 1 if rho <= rtol else math.ceil(math.log(rtol) / math.log(rho))
@@ -162,6 +168,7 @@ def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     >>> chebyshev_products(0.5, 5.0, 1e-2)
     9
     """
+    _numbers(lower=lower, upper=upper, rtol=rtol)
     if upper <= lower:
         return 1
     centre = (upper + lower) / (upper - lower)
@@ -177,5 +184,13 @@ def richardson_products(lower: float, upper: float, rtol: float) -> int:
     >>> richardson_products(0.5, 5.0, 1e-2)
     23
     """
+    _numbers(lower=lower, upper=upper, rtol=rtol)
     factor = (upper - lower) / (upper + lower)
     return 1 if factor <= rtol else math.ceil(math.log(rtol) / math.log(factor))
+
+
+def _numbers(**values: object) -> None:
+    """Refuse what is no real number."""
+    for name, value in values.items():
+        if not isinstance(value, numbers.Real) or isinstance(value, bool):
+            raise InputTypeError(f"{name} is {value!r}; it must be a real number")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from numpy.polynomial.chebyshev import Chebyshev
 
 import ltcl
 from ltcl import theory
-from ltcl.operators import Dense, IdentityPlus
+from ltcl.errors import InputTypeError
+from ltcl.operators import Dense, IdentityPlus, as_operator
 from ltcl.theory import SpectralRadius, forecast
 from tests.problems import enclosure, lambertian
 
@@ -162,3 +164,22 @@ def test_float32_confirms_no_tolerance_below_its_rounding(device):
     for name in set(found) - {"jacobi", "neumann", "block_gauss_seidel", "southwell"}:
         assert math.isnan(found[name].products)
         assert found[name].certificate == "none: float32 cannot confirm this rtol"
+
+
+BAD: Any = "x"
+WRONG = {
+    "R": lambda: theory.spectral_radius(BAD),
+    "S of bounds": lambda: theory.free_bounds(BAD),
+    "S of sweeps": lambda: theory.gauss_seidel_forecast(BAD, 1e-2),
+    "rho": lambda: theory.series_products(BAD, 1e-2),
+    "rtol": lambda: theory.series_products(0.5, BAD),
+    "lower": lambda: theory.chebyshev_products(BAD, 1.0, 1e-2),
+    "upper": lambda: theory.richardson_products(0.5, BAD, 1e-2),
+    "rho of forecasts": lambda: theory.forecasts(IdentityPlus(as_operator(np.eye(2))), BAD, (0.5, 2.0), 1e-2),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_type_is_refused_by_name(name):
+    with pytest.raises(InputTypeError, match=f"^{name.split()[0]} is .*; it must be "):
+        WRONG[name]()
