@@ -99,6 +99,33 @@ def solve(
     ConvergenceError
         Divergence or ``maxiter``, with the best iterate in ``.solution``.
 
+    See Also
+    --------
+    ltcl.solvers.matrix_series, ltcl.solvers.matrix_iteration : the whole inverse at once, eq. 8, 10 and 21
+
+    Notes
+    -----
+    "auto" factorizes small or precise systems; else it compares the products that methods need, by the row
+    sums of S and a survey of three products, and tries others where its choice fails: see ``.reason``.
+
+    ====================  =======================================================================
+    method                options: what they are; their defaults
+    ====================  =======================================================================
+    jacobi, neumann       none
+    richardson            omega: damping, above 0; the best for the free bounds
+    chebyshev             spectrum: (lower, upper), between which that of S lies; the free bounds
+    |                     arnoldi: steps that refine it, 0 or at least 2; 2, or 0 with a spectrum
+    gauss_seidel          block: rows of a block, for speed alone
+    sor                   omega: in (0, 2); 1. block: as above
+    block_gauss_seidel    block: rows solved together; 128
+    southwell             rows: relaxed in one step; a 64th of the picture
+    cg                    weights: (N,) of the inner product; those of S
+    |                     normal: solve S^T S x = S^T b; False
+    gmres                 restart: directions of a cycle; 20
+    bicgstab              none
+    direct, auto          none
+    ====================  =======================================================================
+
     Examples
     --------
     >>> import ltcl, numpy

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import re
 from typing import Any
 
 import numpy as np
@@ -210,10 +212,7 @@ def test_an_unknown_method_is_refused_with_those_there_are(method):
 
 def test_bad_input_is_refused_before_the_matrix_goes_to_a_device(monkeypatch):
     """`as_operator` is what uploads."""
-    module = importlib.import_module(
-        "ltcl.solvers.solve"
-    )  # the package's attribute of this name is the function
-    monkeypatch.setattr(module, "as_operator", lambda S: pytest.fail("uploaded"))
+    monkeypatch.setattr(module_of_solve(), "as_operator", lambda S: pytest.fail("uploaded"))
     for change, error, says in BAD.values():
         if "matrix" in says:  # checked by the operator itself
             continue
@@ -234,3 +233,16 @@ def test_the_advice_is_another_method(method, status):
 def test_an_exact_end_reads_well(device):
     said = str(ltcl.solve(as_operator(np.eye(3), device), np.ones(3), "jacobi"))
     assert said.endswith("relative residual 0: the true residual is within the tolerance")
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_help_tells_the_options_of_every_method(method):
+    _, _, table = (ltcl.solve.__doc__ or "").partition("method                options")
+    assert re.search(rf"\b{method}\b", table)
+    for option in dataclasses.fields(module_of_solve().ITERATIVE[method]):
+        assert re.search(rf"\b{option.name}: ", table), option.name
+
+
+def module_of_solve() -> Any:
+    """The package's attribute of this name is the function."""
+    return importlib.import_module("ltcl.solvers.solve")
