@@ -30,7 +30,6 @@ class Status(enum.Enum):
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
-_OTHERS = {Status.DIVERGED: ("chebyshev", "gmres", "direct"), Status.STAGNATED: ("gmres", "direct")}
 _SERIES = ("jacobi", "neumann", "matrix_iteration", "matrix_series")
 
 
@@ -40,12 +39,13 @@ def _advice(status: Status, method: str) -> str:
     >>> _advice(Status.DIVERGED, "chebyshev")
     "the residual grew; try method='gmres' or 'direct'"
     """
-    others = [f"{name!r}" for name in _OTHERS.get(status, ()) if name != method]
-    grew = status is Status.DIVERGED and method in _SERIES
-    why = ": the series converges only where the spectral radius of R is below 1" if grew else ""
-    hint = f"; try method={', '.join(others[:-1])} or {others[-1]}" if len(others) > 1 else ""
-    hint = f"; try method={others[0]}" if len(others) == 1 else hint
-    return f"{status.value}{why}{hint}"
+    if status is Status.STAGNATED and method != "direct":
+        return f"{status.value} or try method='direct'"
+    if status is not Status.DIVERGED:
+        return status.value
+    series = ": the series converges only where the spectral radius of R is below 1"
+    other = "gmres" if method == "chebyshev" else "chebyshev"
+    return f"{status.value}{series if method in _SERIES else ''}; try method='{other}' or 'direct'"
 
 
 @dataclass(frozen=True)
