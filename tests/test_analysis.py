@@ -135,7 +135,7 @@ def test_every_iterative_method_has_an_entry(device):
     """One-way light leaves Krylov methods without a forecast, tolerances below float32 all of them."""
     scene = enclosure(40, 0.45)
     (channel,) = ltcl.analyze(transport(scene, device)).channels
-    assert {"sor", "southwell", "cg", "gmres", "bicgstab"} <= set(channel.products) <= set(ITERATIVE)
+    assert set(channel.products) == set(ITERATIVE)
     assert channel.certificates["cg"] == "ritz values"
     assert channel.certificates["southwell"] == "none"
     one_way = ltcl.Transport(np.eye(40) + 0.9 * np.roll(np.eye(40), 1, axis=1), GRID, device=device)

@@ -68,7 +68,7 @@ def _show(found: list[dict[str, Any]], rtol: float) -> None:
         "S between",
     )
     console.table((*columns, "first bounce"), _rows(found, _spectrum))
-    typer.echo(f"\nProducts with S (sweeps of Gauss-Seidel) to a relative residual of {rtol:g}")
+    typer.echo(f"\nProducts with S, or sweeps of about the cost of one, to a relative residual of {rtol:g}")
     console.table(("file", "channel", *methods), _rows(found, _forecast))
     for name in methods:
         certificates = {channel["certificates"][name] for entry in found for channel in entry["channels"]}
@@ -111,11 +111,16 @@ def _spectrum(channel: dict[str, Any]) -> tuple:
 
 
 def _forecast(channel: dict[str, Any]) -> tuple:
-    """JSON has None for both: what has a certificate but no number diverges."""
     return tuple(
-        "diverges" if products is None and not channel["certificates"][name].startswith("none") else products
-        for name, products in channel["products"].items()
+        _count(products, channel["certificates"][name]) for name, products in channel["products"].items()
     )
+
+
+def _count(products: float | None, certificate: str) -> Any:
+    """JSON has None for both: what has a certificate but no number diverges."""
+    if products is None:
+        return None if certificate.startswith("none") else "diverges"
+    return f"{products:g} sweeps" if "sweeps" in certificate else products
 
 
 def _series(channel: dict[str, Any]) -> tuple:

@@ -52,20 +52,20 @@ def plan(S: Operator, rtol: float, columns: int = 1) -> Iterator[Choice]:
     """
     n = S.shape[0]
     if n <= SMALL:
-        yield Choice(Direct(), f"{n} pixels are few enough for a dense factorization")
+        yield Choice(Direct(), f"direct: {n} pixels are few enough for a dense factorization")
         return
     if rtol < _PRECISE:
-        yield Choice(Direct(), f"rtol={rtol:g} is below what float32 products reach")
+        yield Choice(Direct(), f"direct: rtol={rtol:g} is below what float32 products reach")
         return
     rho = float(np.max(np.abs(S.row_sums() - 1.0)))
     if not math.isfinite(rho):
-        yield Choice(GMRES(), "row sums of S leave float32")
+        yield Choice(GMRES(), "gmres: it needs no bounds, and row sums of S leave float32")
         return
     plain = theory.series_products(rho, rtol)
     chebyshev = theory.chebyshev_products(*theory.free_bounds(S), rtol)
     if plain <= chebyshev:
-        why = f"row sums of R are at most {rho:.2g}: {plain} products, chebyshev {chebyshev}"
-        yield Choice(Jacobi(), why)
+        ahead = _foreseen("jacobi", plain, "chebyshev", chebyshev, "less work in each")
+        yield Choice(Jacobi(), f"{ahead}; row sums of R are at most {rho:.2g}")
     yield from _surveyed(S, rtol, columns)
 
 
@@ -75,38 +75,60 @@ def _surveyed(S: Operator, rtol: float, columns: int) -> Iterator[Choice]:
     found = survey(S)
     spent = 0 if before else found.products
     first, why, products = _fewest(found, rtol)
+    why += " made before" if before else ""
     part = _direct_part(S, products, columns)
     if part < 1.0:
-        share = f"a factorization takes {part:.2g} of the time of {products:g} products for each"
-        yield Choice(Direct(), f"{why}; {columns} right-hand side(s): {share}", spent)
+        share = f"takes {part:.2g} of the time of {products:g} products for each of {columns}"
+        yield Choice(Direct(), f"direct: a factorization {share} right-hand side(s); else {why}", spent)
         why, spent = "", 0
     yield Choice(first, why, spent)
     if not isinstance(first, GMRES):
-        yield Choice(GMRES())
+        yield Choice(GMRES(), "gmres: next, as it needs no bounds")
     if _has_transpose(S):
-        yield Choice(CG(normal=True), products=1)
+        yield Choice(CG(normal=True), "cg: next, on the normal equations", products=1)
     if S.shape[0] <= LARGEST_DIRECT and part >= 1.0:
-        yield Choice(Direct())
+        yield Choice(Direct(), "direct: last, as products did not do")
 
 
 def _fewest(found: Survey, rtol: float) -> tuple[Any, str, float]:
     """The method, the reason and the products foreseen."""
     krylov = found.krylov_products(rtol)
-    least, most = np.min(np.real(found.ritz), initial=np.inf), np.max(np.real(found.ritz), initial=-np.inf)
-    seen = f"{found.products} Arnoldi steps see eigenvalues of S from {least:.2g} to {most:.2g}"
     if not found.in_an_interval:
-        shape = f"imaginary parts up to {found.imaginary:.2g}, {found.defect:.0%} of R not self-adjoint"
-        return GMRES(), f"{seen}, {shape}: gmres needs no bounds on them", krylov
+        return GMRES(), f"gmres: it needs no bounds on eigenvalues; {_seen(found)}", krylov
     chebyshev, products = _chebyshev(found, rtol)
     other = CG() if found.self_adjoint else GMRES()
+    if krylov < products:
+        ahead = _foreseen(other.name, krylov, "chebyshev", products, "")
+        return other, f"{ahead}; {_seen(found)}", krylov
+    ahead = _foreseen("chebyshev", products, other.name, krylov, "no inner products")
+    return chebyshev, f"{ahead}; {_seen(found)}", products
+
+
+def _foreseen(name: str, products: float, other: str, others: float, merit: str) -> str:
+    """Which method leads, by how many products, or, where it is a tie, by what.
+
+    >>> _foreseen("cg", 4, "chebyshev", 7, "")
+    'cg: 4 products foreseen, chebyshev 7'
+    >>> _foreseen("jacobi", 1, "chebyshev", 1, "less work in each")
+    'jacobi: 1 product foreseen, as many as chebyshev, but less work in each'
+    """
+    count = f"{products:g} product{'' if products == 1 else 's'}"
+    return f"{name}: {count} foreseen, " + (
+        f"as many as {other}, but {merit}" if products == others else f"{other} {others:g}"
+    )
+
+
+def _seen(found: Survey) -> str:
+    """What the survey tells, in words."""
+    least, most = np.min(np.real(found.ritz), initial=np.inf), np.max(np.real(found.ritz), initial=-np.inf)
+    turning = "" if found.in_an_interval else f" with imaginary parts up to {found.imaginary:.2g}"
     how = (
         f"R is self-adjoint to {found.defect:.1g}"
         if found.self_adjoint
         else f"{found.defect:.0%} of R is not self-adjoint"
     )
-    forecast = f"chebyshev {products} products, {other.name} {krylov:g}"
-    method, fewest = (other, krylov) if krylov < products else (chebyshev, products)
-    return method, f"{seen}, {how}: {forecast}", fewest
+    between = f"eigenvalues of S seen between {least:.2g} and {most:.2g}{turning}"
+    return f"{how}, {between} by {found.products} products"
 
 
 def _chebyshev(found: Survey, rtol: float) -> tuple[Chebyshev, int]:

@@ -10,17 +10,14 @@ import numpy as np
 
 
 class Status(enum.Enum):
-    """How a solve ended; the value says what to try next."""
+    """How a solve ended; the value says why, and most say what to try next."""
 
     CONVERGED = "the true residual is within the tolerance"
     MAXITER = "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try another method"
-    DIVERGED = (
-        "the residual grew: the series converges only where the spectral radius of R is below 1; "
-        "try method='chebyshev' or 'direct'"
-    )
+    DIVERGED = "the residual grew"
     STAGNATED = (
         "the residual stopped falling, or the tolerance is below what float32 products can tell, about 1e-6; "
-        "loosen rtol or try method='direct'"
+        "loosen rtol"
     )
     INDEFINITE = (
         "S is not positive definite in the inner product of cg, which then has no next step; "
@@ -31,6 +28,24 @@ class Status(enum.Enum):
         "try method='gmres', 'cg' with normal=True, or 'direct'"
     )
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
+
+
+_SERIES = ("jacobi", "neumann", "matrix_iteration", "matrix_series")
+
+
+def _advice(status: Status, method: str) -> str:
+    """Why a solve ended and what else to try: never the method that just failed.
+
+    >>> _advice(Status.DIVERGED, "chebyshev")
+    "the residual grew; try method='gmres' or 'direct'"
+    """
+    if status is Status.STAGNATED and method != "direct":
+        return f"{status.value} or try method='direct'"
+    if status is not Status.DIVERGED:
+        return status.value
+    series = ": the series converges only where the spectral radius of R is below 1"
+    other = "gmres" if method == "chebyshev" else "chebyshev"
+    return f"{status.value}{series if method in _SERIES else ''}; try method='{other}' or 'direct'"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +99,10 @@ class Solution:
 
     def __str__(self) -> str:
         best, last = self.residual, self.residuals[-1]
-        residual = f"{best:.2g}" if best > 0 else "lost in rounding"
+        residual = f"{best:.2g}"
         if last > best:
             residual += f" at best and {last:.2g} at the end"
         return (
             f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, "
-            f"{self.products} products, relative residual {residual}: {self.status.value}"
+            f"{self.products} products, relative residual {residual}: {_advice(self.status, self.method)}"
         )

@@ -99,6 +99,33 @@ def solve(
     ConvergenceError
         Divergence or ``maxiter``, with the best iterate in ``.solution``.
 
+    See Also
+    --------
+    ltcl.solvers.matrix_series, ltcl.solvers.matrix_iteration : the whole inverse at once, eq. 8, 10 and 21
+
+    Notes
+    -----
+    "auto" factorizes small or precise systems; else it compares the products that methods need, by the row
+    sums of S and a survey of three products, and tries others where its choice fails: see ``.reason``.
+
+    ====================  =======================================================================
+    method                options: what they are; their defaults
+    ====================  =======================================================================
+    jacobi, neumann       none
+    richardson            omega: damping, above 0; the best for the free bounds
+    chebyshev             spectrum: (lower, upper), between which that of S lies; the free bounds
+    |                     arnoldi: steps that refine it, 0 or at least 2; 2, or 0 with a spectrum
+    gauss_seidel          block: rows of a block, for speed alone
+    sor                   omega: in (0, 2); 1. block: as above
+    block_gauss_seidel    block: rows solved together; 128
+    southwell             rows: relaxed in one step; a 64th of the picture
+    cg                    weights: (N,) of the inner product; those of S
+    |                     normal: solve S^T S x = S^T b; False
+    gmres                 restart: directions of a cycle; 20
+    bicgstab              none
+    direct, auto          none
+    ====================  =======================================================================
+
     Examples
     --------
     >>> import ltcl, numpy
@@ -126,6 +153,10 @@ def _shape(S: Any) -> tuple[int, ...]:
     """The shape of whatever was given for S, before it becomes an operator on a device."""
     if isinstance(S, (tuple, list)) and any(isinstance(part, Operator) for part in S):
         raise InputTypeError(f"S is {len(S)} operators, one per colour channel; it must be one: solve each")
+    if hasattr(S, "interreflection"):
+        raise InputTypeError(
+            f"S is a {type(S).__name__}; give its interreflection operator, T.interreflection"
+        )
     return getattr(S, "shape", None) or checks.real("S", S).shape
 
 
@@ -144,6 +175,8 @@ def _rule(
     atol = checks.number("atol", atol, least=0.0)
     if rtol == 0.0 and atol == 0.0:
         raise InputError("rtol and atol are both 0; one of them must be positive")
+    if callback is not None and not callable(callback):
+        raise InputTypeError(f"callback is {callback!r}; it must be callable(iteration, relative residual)")
     return Rule(rtol, atol, _MAXITER if maxiter is None else checks.count("maxiter", maxiter), callback)
 
 

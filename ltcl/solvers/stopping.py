@@ -144,6 +144,15 @@ class Monitor:
         """End the solve where the method has no next step; the best iterate stays."""
         self.status = status
 
+    def forgive(self, x: Array, r: Array) -> bool:
+        """Whether a solve that grew may go on, with another choice of its method, from its best iterate."""
+        if self.status is not Status.DIVERGED or self.best is None or self.iterations >= self.rule.maxiter:
+            return False
+        self.status, self._rises, self._finite = None, 0, True
+        self.norms = vectors.norm(self.system.residual(x.copy_from(self.best), r))
+        self.unsolved = self.above(self.norms)
+        return True
+
     def _may_wait(self, x: Array, r: Array, target: np.ndarray) -> bool:
         """Queue the residual of a step where nothing has to be decided yet."""
         if self.best is None:

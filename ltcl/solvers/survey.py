@@ -110,7 +110,7 @@ def _explore(S: Operator) -> Survey:
         if not h[0, -1] > 0.0:
             break
     ritz = problem.ritz_values()
-    spectrum = refined(theory.free_bounds(S), ritz)
+    spectrum = refined(theory.free_bounds(S), ritz, even_quotient(S))
     return Survey(ritz, spectrum, tuple(falls), _defect(S, basis, columns), len(columns))
 
 
@@ -127,18 +127,32 @@ def _defect(S: Operator, basis: list[Array], columns: list[np.ndarray]) -> float
     return float(np.linalg.norm(G - G.T)) / whole if whole > 0.0 else 0.0
 
 
-def refined(bounds: tuple[float, float], ritz: np.ndarray) -> tuple[float, float]:
+def refined(bounds: tuple[float, float], ritz: np.ndarray, even: float | None = None) -> tuple[float, float]:
     """Bounds drawn in to a margin around the Ritz values, which lie inside the spectrum of self-adjoint S.
+
+    `even` is the Rayleigh quotient of the even picture, near the eigenvalue that dominates R or A. An end
+    of the bounds beyond it is drawn in only where the Ritz values reach it, too: else they come from a
+    picture with hardly any part of that eigenvector, and cannot tell where it is. Below 1 it is that of an
+    I - A: there the upper end stays, since walls that face each other have eigenvalues of A in pairs of
+    either sign, and an even picture shows one of them only.
 
     >>> refined((0.5, 5.0), np.array([1.0, 2.0]))
     (0.75, 2.25)
+    >>> refined((0.5, 5.0), np.array([1.0, 2.0]), even=4.0)
+    (0.75, 5.0)
     """
     if len(ritz) < 2:
         return bounds
     least, most = float(np.min(np.real(ritz))), float(np.max(np.real(ritz)))
     margin = _MARGIN * (most - least)
-    inner = max(bounds[0], least - margin), min(bounds[1], most + margin)
-    return widened(inner if inner[0] < inner[1] else bounds, ritz)
+    lower = bounds[0] if even is not None and even < least else max(bounds[0], least - margin)
+    upper = bounds[1] if even is not None and (even > most or even < 1.0) else min(bounds[1], most + margin)
+    return widened((lower, upper) if lower < upper else bounds, ritz)
+
+
+def even_quotient(S: Operator) -> float:
+    """<1, S 1> / <1, 1> in the inner product of `S.weights`, from the row sums: no product beyond theirs."""
+    return float(np.average(S.row_sums().astype(np.float64), weights=S.weights))
 
 
 def widened(bounds: tuple[float, float], ritz: np.ndarray) -> tuple[float, float]:

@@ -4,20 +4,24 @@
 from __future__ import annotations
 
 import math
+import numbers
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from ltcl import checks
+from ltcl.errors import InputTypeError
 from ltcl.operators import Operator
-from ltcl.theory.spectrum import POWER_ITERATION, SpectralRadius
+from ltcl.theory.spectrum import POWER_ITERATION, SpectralRadius, require_operator
 
-FREE_BOUNDS, SWEEPS, RITZ = "free bounds", "power iteration of sweeps", "ritz values"
+FREE_BOUNDS, SWEEPS, RITZ = "free bounds", "trial sweeps", "ritz values"
 NOTHING, BEYOND = "none", "none: float32 cannot confirm this rtol"
 _FLOAT32 = 2.0**-23  # relative residual that is rounding
 _LARGEST_SWEEP = 4096  # pixels: a sweep on the host takes hundredths of a second
-_SETTLING, _SWEEPS = 10, 30  # sweeps before growth is measured, and in all
+_LATE = 30  # trial sweeps at least, the later half of which tells the growth
+_TRIAL = 300_000_000  # entries that trial sweeps read at most, beyond those: about a second
+_DIVERGED = 1e30
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class Forecast:
         Infinite where the method diverges, NaN where nothing is known.
     certificate : str
         That of rho(R), "collatz-wielandt" or "power iteration"; "free bounds" on the spectrum of S, which
-        are those of Lambertian scenes; "power iteration of sweeps" and "ritz values", estimates; or "none",
+        are those of Lambertian scenes; "trial sweeps" and "ritz values", estimates; or "none",
         with a reason where there is more to say.
     """
 
@@ -51,7 +55,7 @@ def forecasts(
     Where 1 lies between certified bounds on rho(R), they do not tell whether the series converges: its
     forecast then rests on the power iteration alone. Krylov methods are foretold by the Chebyshev polynomial
     on `spectrum`, an estimate of the positive interval that holds the eigenvalues of S, where there is one;
-    they may well need less. Nothing foretells Southwell's method.
+    they may well need less. Nothing foretells Southwell's method, nor the blocks of block_gauss_seidel.
 
     >>> from ltcl.operators import IdentityPlus, as_operator
     >>> S = IdentityPlus(as_operator([[0.0, 0.5], [0.5, 0.0]]))
@@ -62,13 +66,17 @@ def forecasts(
     neumann 7 power iteration
     richardson 7 free bounds
     chebyshev 5 free bounds
-    gauss_seidel 4 power iteration of sweeps
-    sor 4 power iteration of sweeps
+    gauss_seidel 3 trial sweeps
+    sor 3 trial sweeps
+    block_gauss_seidel nan none
     southwell nan none
     cg 6 ritz values
     gmres 6 ritz values
     bicgstab 7 ritz values
     """
+    require_operator("S", S)
+    if not isinstance(rho, SpectralRadius):
+        raise InputTypeError(f"rho is a {type(rho).__name__}; it must be what theory.spectral_radius returns")
     decided = not rho.lower < 1.0 <= rho.upper
     series = Forecast(series_products(rho.value, rtol), rho.certificate if decided else POWER_ITERATION)
     sweeps = gauss_seidel_forecast(S, rtol)
@@ -85,6 +93,7 @@ def forecasts(
         "chebyshev": Forecast(chebyshev_products(*bounds, rtol), FREE_BOUNDS),
         "gauss_seidel": sweeps,
         "sor": sweeps,  # omega = 1
+        "block_gauss_seidel": Forecast(math.nan, NOTHING),
         "southwell": Forecast(math.nan, NOTHING),
         **{name: Forecast(n, NOTHING if math.isnan(n) else RITZ) for name, n in krylov.items()},
     }
@@ -97,35 +106,45 @@ def _beyond(forecast: Forecast) -> Forecast:
 
 
 def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
-    """Sweeps of Gauss-Seidel, from the growth of errors under -(D + L)^-1 U, S = L + D + U.
+    """Sweeps of Gauss-Seidel until the residual of a random positive picture is below `rtol`.
 
+    The first ones are made, in float64; from there on errors grow as under -(D + L)^-1 U, S = L + D + U.
     On the host, densely, so for small N only; others have no forecast.
 
     >>> from ltcl.operators import as_operator
     >>> gauss_seidel_forecast(as_operator([[1.0, 0.5], [0.5, 1.0]]), 1e-2).products  # rho is 1/4
-    4
+    3
     """
-    n = S.shape[0]
+    n = require_operator("S", S).shape[0]
     if n > _LARGEST_SWEEP or 2 * 8 * n * n > checks.host_memory():
         return Forecast(math.nan, NOTHING)
-    rho = _sweep_radius(S.to_dense())
-    return Forecast(series_products(rho, rtol), SWEEPS) if math.isfinite(rho) else Forecast(math.nan, NOTHING)
+    left, made, rho = _trial_sweeps(S.to_dense(), rtol)
+    if left <= rtol:
+        return Forecast(made, SWEEPS)
+    more = series_products(rho, rtol / left) if math.isfinite(rho) else math.nan
+    return Forecast(made + more, NOTHING if math.isnan(more) else SWEEPS)
 
 
-def _sweep_radius(S: np.ndarray) -> float:
-    """rho of -(D + L)^-1 U as the mean growth of an error once it has settled; NaN with a zero on D."""
+def _trial_sweeps(S: np.ndarray, rtol: float) -> tuple[float, int, float]:
+    """Relative residual after so many sweeps, to `rtol` at best, and how errors grew in late ones."""
     if not np.diagonal(S).all():
-        return math.nan
+        return 1.0, 0, math.nan
     S = np.asfortranarray(S)
     upper = np.triu(S, 1)
-    error, growth = np.random.default_rng(0).uniform(0.5, 1.5, len(S)), []
-    for _ in range(_SWEEPS):
-        error = scipy.linalg.solve_triangular(S, upper @ error, lower=True, check_finite=False)
+    error, size = np.random.default_rng(0).uniform(0.5, 1.5, len(S)), 1.0
+    first, left, growth = float(np.linalg.norm(S @ error)), 1.0, []
+    given = upper @ error
+    while left > rtol and len(growth) < max(_LATE, _TRIAL // S.size) and size < _DIVERGED:
+        error = -scipy.linalg.solve_triangular(S, given, lower=True, check_finite=False)
         growth.append(float(np.linalg.norm(error)))
         if growth[-1] == 0.0 or not math.isfinite(growth[-1]):
-            return 0.0 if growth[-1] == 0.0 else math.nan
-        error /= -growth[-1]
-    return math.exp(float(np.mean(np.log(growth[_SETTLING:]))))
+            return (0.0 if growth[-1] == 0.0 else 1.0), len(growth), math.nan
+        error /= growth[-1]
+        size *= growth[-1]
+        before, given = given / growth[-1], upper @ error
+        left = size * float(np.linalg.norm(given - before)) / first  # S e = (D + L) e + U e
+    settled = growth[-_LATE // 2 :]
+    return left, len(growth), math.exp(float(np.mean(np.log(settled)))) if settled else math.nan
 
 
 def series_products(rho: float, rtol: float) -> float:
@@ -134,6 +153,7 @@ def series_products(rho: float, rtol: float) -> float:
     >>> series_products(0.5, 1e-2), series_products(1.0, 1e-2)
     (7, inf)
     """
+    _numbers(rho=rho, rtol=rtol)
     if rho >= 1.0:
         return math.inf
     return 1 if rho <= rtol else math.ceil(math.log(rtol) / math.log(rho))
@@ -148,6 +168,7 @@ def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     >>> chebyshev_products(0.5, 5.0, 1e-2)
     9
     """
+    _numbers(lower=lower, upper=upper, rtol=rtol)
     if upper <= lower:
         return 1
     centre = (upper + lower) / (upper - lower)
@@ -163,5 +184,13 @@ def richardson_products(lower: float, upper: float, rtol: float) -> int:
     >>> richardson_products(0.5, 5.0, 1e-2)
     23
     """
+    _numbers(lower=lower, upper=upper, rtol=rtol)
     factor = (upper - lower) / (upper + lower)
     return 1 if factor <= rtol else math.ceil(math.log(rtol) / math.log(factor))
+
+
+def _numbers(**values: object) -> None:
+    """Refuse what is no real number."""
+    for name, value in values.items():
+        if not isinstance(value, numbers.Real) or isinstance(value, bool):
+            raise InputTypeError(f"{name} is {value!r}; it must be a real number")

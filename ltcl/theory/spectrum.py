@@ -6,10 +6,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ltcl.device import Array, vectors
+from ltcl.errors import InputTypeError
 from ltcl.operators import Norms, Operator
 
 _FLOOR = 1e-12  # of the largest value of a vector: far above what underflows
@@ -54,6 +56,14 @@ class SpectralRadius:
         return self.value / (1.0 + self.value)
 
 
+def require_operator(name: str, value: Any) -> Operator:
+    """Return `value` if it is an Operator; refuse others."""
+    if not isinstance(value, Operator):
+        what = f"{name} is a {type(value).__name__}"
+        raise InputTypeError(f"{what}; it must be an Operator, as ltcl.operators.as_operator makes one")
+    return value
+
+
 def spectral_radius(
     R: Operator, *, rtol: float = 1e-3, maxiter: int = 200, seed: int = 0, norms: Norms | None = None
 ) -> SpectralRadius:
@@ -74,6 +84,7 @@ def spectral_radius(
     >>> round(rho.value, 3), rho.certificate, rho.error < 1e-3
     (0.5, 'collatz-wielandt', True)
     """
+    require_operator("R", R)
     start = np.random.default_rng(seed).uniform(0.5, 1.5, R.shape[0])
     v = R.device.upload(start / np.linalg.norm(start))
     w = v.like()
@@ -144,7 +155,7 @@ def free_bounds(S: Operator) -> tuple[float, float]:
     >>> free_bounds(as_operator([[1.0, 0.5], [0.5, 1.0]]))
     (0.5, 1.5)
     """
-    sums = S.row_sums()
+    sums = require_operator("S", S).row_sums()
     if float(np.mean(sums)) >= 1.0:
         return 0.5, float(np.max(sums))
     g = float(np.max(1.0 - sums))

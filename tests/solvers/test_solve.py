@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import re
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from scipy.sparse.linalg import aslinearoperator
 import ltcl
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.operators import CSR, Dense, Host, IdentityPlus, as_operator
+from ltcl.solvers import Solution, Status
 from tests.problems import lambertian, residual
 from tests.solvers.helpers import ITERATIVE, METHODS, READS_ROWS
 
@@ -179,6 +182,12 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "maxiter is a fraction": ({"maxiter": 2.5}, InputError, "maxiter is 2.5"),
     "x0 is short": ({"x0": np.ones(3)}, InputError, r"x0 has shape \(3,\); it must be \(4,\)"),
     "x0 has NaN": ({"x0": [np.nan] * N}, InputError, "x0 has 4 NaN or infinite value"),
+    "callback is a number": ({"callback": 3}, InputTypeError, "callback is 3; it must be callable"),
+    "S is a transport": (
+        {"S": ltcl.Transport(np.eye(N), (2, 2))},
+        InputTypeError,
+        "S is a Transport; give .*T.interreflection",
+    ),
     "unknown option": ({"samples": 3}, InputTypeError, "unknown option 'samples'"),
 }
 
@@ -203,13 +212,37 @@ def test_an_unknown_method_is_refused_with_those_there_are(method):
 
 def test_bad_input_is_refused_before_the_matrix_goes_to_a_device(monkeypatch):
     """`as_operator` is what uploads."""
-    module = importlib.import_module(
-        "ltcl.solvers.solve"
-    )  # the package's attribute of this name is the function
-    monkeypatch.setattr(module, "as_operator", lambda S: pytest.fail("uploaded"))
+    monkeypatch.setattr(module_of_solve(), "as_operator", lambda S: pytest.fail("uploaded"))
     for change, error, says in BAD.values():
         if "matrix" in says:  # checked by the operator itself
             continue
         for method in METHODS:
             with pytest.raises(error, match=says):
                 ltcl.solve(**({"S": np.eye(N), "b": np.ones(N), "method": method} | change))
+
+
+@pytest.mark.parametrize("method", ["jacobi", "richardson", "southwell", "chebyshev", "gmres", "bicgstab"])
+@pytest.mark.parametrize("status", [Status.DIVERGED, Status.STAGNATED])
+def test_the_advice_is_another_method(method, status):
+    said = str(Solution(np.zeros(1), status, 3, 3, (1.0, 200.0), 0.0, method))
+    assert f"'{method}'" not in said
+    assert said.endswith("'direct'")
+    assert ("spectral radius" in said) == (status is Status.DIVERGED and method == "jacobi")
+
+
+def test_an_exact_end_reads_well(device):
+    said = str(ltcl.solve(as_operator(np.eye(3), device), np.ones(3), "jacobi"))
+    assert said.endswith("relative residual 0: the true residual is within the tolerance")
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_help_tells_the_options_of_every_method(method):
+    _, _, table = (ltcl.solve.__doc__ or "").partition("method                options")
+    assert re.search(rf"\b{method}\b", table)
+    for option in dataclasses.fields(module_of_solve().ITERATIVE[method]):
+        assert re.search(rf"\b{option.name}: ", table), option.name
+
+
+def module_of_solve() -> Any:
+    """The package's attribute of this name is the function."""
+    return importlib.import_module("ltcl.solvers.solve")

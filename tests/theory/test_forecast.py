@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from numpy.polynomial.chebyshev import Chebyshev
 
 import ltcl
 from ltcl import theory
-from ltcl.operators import Dense, IdentityPlus
-from ltcl.theory import SpectralRadius
+from ltcl.errors import InputTypeError
+from ltcl.operators import Dense, IdentityPlus, as_operator
+from ltcl.theory import SpectralRadius, forecast
 from tests.problems import enclosure, lambertian
 
 
@@ -43,18 +45,51 @@ def test_a_spectrum_of_one_point_takes_one_product():
     assert theory.chebyshev_products(2.0, 2.0, 1e-9) == 1
 
 
-def radius_of_sweeps(S: np.ndarray) -> float:
-    return float(np.abs(np.linalg.eigvals(-np.linalg.solve(np.tril(S), np.triu(S, 1)))).max())
+def sweeps(S: np.ndarray, b: np.ndarray, rtol: float) -> int:
+    """Gauss-Seidel as eq. 17-20 have it, until the residual is below rtol."""
+    x, lower, count = np.zeros(len(b)), np.tril(S), 0
+    while np.linalg.norm(b - S @ x) > rtol * np.linalg.norm(b):
+        x += np.linalg.solve(lower, b - S @ x)
+        count += 1
+    return count
 
 
-@pytest.mark.parametrize("rho", [0.3, 0.9, 4.0])
+@pytest.mark.parametrize("rtol", [1e-2, 1e-4])
+@pytest.mark.parametrize("rho", [0.3, 0.9, 4.0, 9.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_gauss_seidel_has_the_radius_of_its_iteration_matrix(device, rho, seed):
+def test_gauss_seidel_takes_the_sweeps_foreseen(device, seed, rho, rtol):
     scene = lambertian(40, rho, seed)
-    wanted = theory.series_products(radius_of_sweeps(scene.S), 1e-6)
-    found = theory.gauss_seidel_forecast(IdentityPlus(Dense(device, scene.R)), 1e-6)
-    assert found.certificate == "power iteration of sweeps"
-    assert found.products == pytest.approx(wanted, rel=0.1, abs=1)
+    S = IdentityPlus(Dense(device, scene.R))
+    found = theory.gauss_seidel_forecast(S, rtol)
+    assert found.certificate == "trial sweeps"
+    b = scene.S @ np.random.default_rng(seed + 5).uniform(0.5, 1.5, 40)
+    assert abs(found.products - sweeps(scene.S, b, rtol)) <= 1
+    assert abs(found.products - ltcl.solve(S, b, "gauss_seidel", rtol=rtol).iterations) <= 1
+
+
+@pytest.mark.parametrize("sides", [2, 3, 6])
+@pytest.mark.parametrize("albedo", [0.3, 0.7, 0.9])
+def test_so_it_does_in_boxes_where_the_diagonal_is_the_first_bounce(device, albedo, sides):
+    T = ltcl.scenes.box(6, sides, albedo).transport(device=device)
+    (S,) = T.systems
+    found = theory.gauss_seidel_forecast(S, 1e-2)
+    b = S.to_dense() @ np.random.default_rng(6).uniform(0.5, 1.5, S.shape[0])
+    assert abs(found.products - ltcl.solve(S, b, "gauss_seidel").iterations) <= 1
+
+
+def test_sweeps_beyond_those_tried_go_on_at_their_rate(device, monkeypatch):
+    scene = enclosure(40, 0.97)
+    S = IdentityPlus(Dense(device, scene.R))
+    every = theory.gauss_seidel_forecast(S, 1e-5).products
+    monkeypatch.setattr(forecast, "_TRIAL", 0)
+    assert every > 2 * forecast._LATE
+    assert theory.gauss_seidel_forecast(S, 1e-5).products == pytest.approx(every, rel=0.1)
+
+
+def test_sweeps_that_diverge_are_foreseen(device):
+    found = theory.gauss_seidel_forecast(Dense(device, [[1.0, 2.0], [2.0, 1.0]]), 1e-2)  # rho is 4
+    assert math.isinf(found.products)
+    assert found.certificate == "trial sweeps"
 
 
 @pytest.mark.parametrize("albedo", [0.45, 0.51, 0.8])
@@ -113,7 +148,7 @@ def test_what_nothing_foretells_is_said(device):
     S = IdentityPlus(Dense(device, enclosure(40, 0.6).R))
     radius = theory.spectral_radius(S.R)
     found = theory.forecasts(S, radius, theory.free_bounds(S), 1e-2, spectrum=None)
-    for name in ("southwell", "cg", "gmres", "bicgstab"):
+    for name in ("block_gauss_seidel", "southwell", "cg", "gmres", "bicgstab"):
         assert math.isnan(found[name].products)
         assert found[name].certificate == "none"
     lopsided = theory.forecasts(S, radius, theory.free_bounds(S), 1e-2, (0.5, 3.0), self_adjoint=False)
@@ -126,6 +161,25 @@ def test_float32_confirms_no_tolerance_below_its_rounding(device):
     S = IdentityPlus(Dense(device, enclosure(40, 0.6).R))
     found = theory.forecasts(S, theory.spectral_radius(S.R), theory.free_bounds(S), 1e-8, (0.5, 3.0))
     assert math.isinf(found["jacobi"].products)  # rho is 1.5
-    for name in set(found) - {"jacobi", "neumann", "southwell"}:
+    for name in set(found) - {"jacobi", "neumann", "block_gauss_seidel", "southwell"}:
         assert math.isnan(found[name].products)
         assert found[name].certificate == "none: float32 cannot confirm this rtol"
+
+
+BAD: Any = "x"
+WRONG = {
+    "R": lambda: theory.spectral_radius(BAD),
+    "S of bounds": lambda: theory.free_bounds(BAD),
+    "S of sweeps": lambda: theory.gauss_seidel_forecast(BAD, 1e-2),
+    "rho": lambda: theory.series_products(BAD, 1e-2),
+    "rtol": lambda: theory.series_products(0.5, BAD),
+    "lower": lambda: theory.chebyshev_products(BAD, 1.0, 1e-2),
+    "upper": lambda: theory.richardson_products(0.5, BAD, 1e-2),
+    "rho of forecasts": lambda: theory.forecasts(IdentityPlus(as_operator(np.eye(2))), BAD, (0.5, 2.0), 1e-2),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_type_is_refused_by_name(name):
+    with pytest.raises(InputTypeError, match=f"^{name.split()[0]} is .*; it must be "):
+        WRONG[name]()
