@@ -7,6 +7,8 @@ A twin is named after its kernel; the `_stream` and `_group` variants of a kerne
 from __future__ import annotations
 
 import itertools
+import math
+from fractions import Fraction
 
 import numpy as np
 import scipy.sparse
@@ -146,6 +148,88 @@ def southwell_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray,
     return southwell_dense(
         scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray().T, *arguments
     )
+
+
+def random_philox(counters: np.ndarray, seed: int) -> np.ndarray:
+    """Philox4x32-10 of counters (n, 4) and a key of 64 bits, as (n, 4) uint32."""
+    c = [counters[:, i].astype(np.uint64) for i in range(4)]
+    low, key = np.uint64(0xFFFFFFFF), [seed & 0xFFFFFFFF, seed >> 32]
+    for _ in range(10):
+        a, b = np.uint64(0xD2511F53) * c[0], np.uint64(0xCD9E8D57) * c[2]
+        high_a, high_b = a >> np.uint64(32), b >> np.uint64(32)
+        c = [high_b ^ c[1] ^ np.uint64(key[0]), b & low, high_a ^ c[3] ^ np.uint64(key[1]), a & low]
+        key = [(key[0] + 0x9E3779B9) & 0xFFFFFFFF, (key[1] + 0xBB67AE85) & 0xFFFFFFFF]
+    return np.stack(c, axis=1).astype(np.uint32)
+
+
+def _scaled(values: np.ndarray, shift: int) -> list[int]:
+    """|value| 2^shift rounded half up, exactly."""
+    exact = (Fraction(float(abs(value))) * Fraction(2) ** shift for value in values)
+    return [math.floor(value + Fraction(1, 2)) for value in exact]
+
+
+def _integers(values: np.ndarray, cdf: bool) -> tuple[list[int], Fraction]:
+    """The row scaled by a power of two so that its sum has as many bits as fit, and its sum unscaled."""
+    n, largest = len(values), float(np.max(np.abs(values)))
+    exponent = max(math.frexp(largest)[1], -125)  # of the smallest normal float32
+    budget = 41 if cdf else min(45, 63 - n.bit_length())
+    rough = 31 - exponent
+    shift = rough + budget - 1 - (sum(_scaled(values, rough)) + n).bit_length()
+    scaled = _scaled(values, shift)
+    return scaled, Fraction(sum(scaled)) / Fraction(2) ** shift
+
+
+def _alias(n: int, masses: list[int], capacity: int, targets: list[int]) -> list[int]:
+    """Table entries by one sweep, as Huebschle-Schneider and Sanders describe it, algorithm 4."""
+    light = [t for t in range(n) if masses[t] <= capacity] + [n]
+    heavy = [t for t in range(n) if masses[t] > capacity] + [n]
+    i = j = 0
+    left = masses[heavy[0]] if heavy[0] < n else 0
+    bins = [0] * n
+
+    def put(own: int, mass: int, other: int) -> None:
+        threshold = (mass * 2**18 + capacity // 2) // capacity
+        whole = threshold == 2**18
+        bins[own] = (0 if whole else threshold) << 46 | targets[own] << 23 | targets[own if whole else other]
+
+    while heavy[j] < n:
+        if left > capacity:
+            put(light[i], masses[light[i]], heavy[j])
+            left -= capacity - masses[light[i]]
+            i += 1
+        else:
+            following = heavy[j + 1]
+            put(heavy[j], left, following if following < n else heavy[j])
+            left += masses[following] - capacity if following < n else 0
+            j += 1
+    for t in light[i:-1]:
+        put(t, capacity, t)
+    return bins
+
+
+def alias_dense(values: np.ndarray, sampler: str) -> tuple[int, np.float32, list[int]]:
+    """Entries that count, |R_i| and the table of one row, columns 0, 1, ..."""
+    return alias_csr(np.arange(len(values)), values, sampler)
+
+
+def alias_csr(columns: np.ndarray, values: np.ndarray, sampler: str) -> tuple[int, np.float32, list[int]]:
+    """Entries that count, |R_i| and the table of one row."""
+    n = len(values)
+    if not np.any(values):
+        return 0, np.float32(0), []
+    scaled, exact = _integers(values, sampler == "cdf")
+    total = np.float32(float(exact))
+    count = n if total >= np.finfo(np.float32).tiny else 0
+    targets = [int(c) << 1 | int(np.signbit(v)) for c, v in zip(columns, values, strict=True)]
+    if sampler == "alias":
+        table = _alias(n, [n * mass for mass in scaled], sum(scaled), targets)
+    elif sampler == "cdf":
+        sums = itertools.accumulate(scaled)
+        table = [part << 23 | target for part, target in zip(sums, targets, strict=True)]
+    else:
+        bits = np.asarray(values, np.float32).view(np.uint32)
+        table = [int(bit) << 32 | int(c) for bit, c in zip(bits, columns, strict=True)]
+    return count, total if count else np.float32(0), table
 
 
 def gamma(roundings: float) -> float:

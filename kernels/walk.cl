@@ -1,0 +1,243 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Random walks over the rows of R, which estimate x_i = sum over k >= 1 of c_k (R^k b)_i (eq. 22 to 26).
+//
+//   walk_rows      sums over the samples of a pixel: the walk starts there and reads b where it comes
+//   walk_columns   the adjoint: the walk ends at a pixel and writes what it brings there, one record a sample;
+//                  rows are those of R^T, and one more row, from which all walks start, is that of b
+//
+// A step goes from i to j with probability |R_ij| / |R_i| and multiplies the weight by sign(R_ij) |R_i|, so that
+// the products of eq. 26 cancel. After step k the walk goes on with probability steps[k].y / 2^22; what it then
+// is worth is weight * b_j * steps[k].x, where steps[k].x holds c_k over the probability to be scored there:
+//   ENDPOINT     scored where it ends, the paper's eq. 26
+//   COLLISION    scored at every step
+// Rows without entries end a walk.
+//
+// A work-item takes WALKS chunks of CHUNK samples of one pixel, one walk of each at a time: their loads do not
+// wait for each other. Samples of a chunk are summed in order, with the rounding errors of the sums kept
+// (Knuth's two-sum). So the result does not depend on WALKS, nor on how chunks are spread over work-items.
+// Arithmetic is + and * in this order, without contraction: the same bits on every device, as long as nothing
+// falls below 2^-126, where devices round differently.
+//
+// Required defines: TABLE, see common/table.h; CHUNK; WALKS; K, the right-hand sides of one launch;
+// ESTIMATOR: 0 ENDPOINT, 1 COLLISION (walk_columns: ENDPOINT).
+// Counters of random numbers: pixel, sample, step / 2, stream; a step takes half a block.
+// Layout: chunk c of a pixel holds samples first + c CHUNK up to `end`; `chunks` chunks a pixel. b is row-major
+// with `stride` columns, of which offset .. offset + K - 1 are taken. Out of walk_rows: (units, K) of (sum, its
+// rounding, sum of squares, its rounding).
+
+#include "common/random.h"
+#include "common/real.h"
+#include "common/table.h"
+
+#pragma OPENCL FP_CONTRACT OFF
+
+#if !defined(CHUNK) || !defined(WALKS) || !defined(K) || !defined(ESTIMATOR)
+#error "walk.cl needs -DCHUNK=<samples> -DWALKS=<at a time> -DK=<right-hand sides> -DESTIMATOR=<0 or 1>"
+#endif
+#define ENDPOINT 0
+#define COLLISION 1
+
+#define GO_ON_BITS 22
+#define SLOT_BITS 42  // the rest of 64
+
+#if TABLE == TABLE_CDF
+// The first entry whose cumulative sum is above a uniform part of the total.
+inline ulong draw_entry(global const ulong *entries, uint n, ulong word)
+{
+    const ulong part = mul_hi(word & ~(((ulong)1 << GO_ON_BITS) - 1), entries[n - 1] >> TARGET_BITS);
+    uint low = 0, high = n - 1;
+    while (low < high) {
+        const uint half_way = low + (high - low) / 2;
+        if (entries[half_way] >> TARGET_BITS <= part)
+            low = half_way + 1;
+        else
+            high = half_way;
+    }
+    return entries[low];
+}
+#endif
+
+// One entry of the row with this record: its column and sign, and what the weight is multiplied by.
+inline uint draw(uint4 record, global const ulong *entries, ulong word, real *factor)
+{
+    entries += (ulong)record.y << 32 | record.x;
+    const ulong place = (word >> GO_ON_BITS) * record.z;
+#if TABLE == TABLE_ALIAS
+    const ulong entry = entries[place >> SLOT_BITS];
+    const uint fraction = (uint)(place >> (SLOT_BITS - THRESHOLD_BITS)) & ((1u << THRESHOLD_BITS) - 1);
+    const uint threshold = (uint)(entry >> (2 * TARGET_BITS));
+    *factor = as_float(record.w);
+    return (uint)(fraction < threshold ? entry >> TARGET_BITS : entry) & TARGET_MASK;
+#elif TABLE == TABLE_CDF
+    *factor = as_float(record.w);
+    return record.z ? (uint)draw_entry(entries, record.z, word) & TARGET_MASK : 0;
+#else
+    const ulong entry = entries[place >> SLOT_BITS];
+    *factor = (real)record.z * fabs(as_float((uint)(entry >> 32)));
+    return ((uint)entry << 1) | (uint)(entry >> 63);
+#endif
+}
+
+// sum + low += value
+inline void two_sum(real value, real *sum, real *low)
+{
+    const real total = *sum + value;
+    const real added = total - *sum;
+    *low += (*sum - (total - added)) + (value - added);
+    *sum = total;
+}
+
+// The walks of a work-item, side by side.
+typedef struct {
+    uint pixel[WALKS], start[WALKS], next[WALKS], stop[WALKS];  // samples start .. stop, `next` comes next
+    uint row[WALKS], step[WALKS];
+    int alive[WALKS];
+    real weight[WALKS];
+} walks;
+
+inline void set_out(walks *walk, int units, int chunks, uint first, uint end, global const uint *pixels)
+{
+    for (int w = 0; w < WALKS; ++w) {
+        const int unit = get_global_id(0) * WALKS + w;
+        const int known = unit < units;
+        walk->pixel[w] = known ? pixels[unit / chunks] : 0;
+        walk->start[w] = walk->next[w] = first + (uint)(known ? unit % chunks : 0) * CHUNK;
+        walk->stop[w] = known ? walk->start[w] + min(end - walk->start[w], (uint)CHUNK) : walk->start[w];
+        walk->row[w] = walk->pixel[w];
+        walk->step[w] = 0;
+        walk->alive[w] = 0;
+        walk->weight[w] = 0;
+    }
+}
+
+// Start the next samples where walks have ended; 0 when there are none, and none under way.
+inline int start_ended(walks *walk)
+{
+    int busy = 0;
+    for (int w = 0; w < WALKS; ++w) {
+        if (!walk->alive[w] && walk->next[w] < walk->stop[w]) {
+            ++walk->next[w];
+            walk->row[w] = walk->pixel[w];
+            walk->step[w] = 0;
+            walk->weight[w] = 1;
+            walk->alive[w] = 1;
+        }
+        busy |= walk->alive[w];
+    }
+    return busy;
+}
+
+// The two words of 64 bits that the next two steps of each walk take.
+inline void draw_words(const walks *walk, ulong seed, uint stream, ulong words[2][WALKS])
+{
+    for (int w = 0; w < WALKS; ++w) {
+        const uint4 counter = (uint4)(walk->pixel[w], walk->next[w] - 1, walk->step[w] / 2, stream);
+        const uint4 block = philox(counter, (uint2)((uint)seed, (uint)(seed >> 32)));
+        words[0][w] = (ulong)block.y << 32 | block.x;
+        words[1][w] = (ulong)block.w << 32 | block.z;
+    }
+}
+
+// One step of every walk: `target` gets columns and signs, `factor` what weights are multiplied by. `alive`
+// ends where the row is empty. Walks that have ended take it too, on the row they were in, and nobody looks.
+inline void draw_targets(
+    walks *walk, const ulong *words, global const uint4 *rows, global const ulong *entries, uint *target,
+    real *factor)
+{
+    uint4 record[WALKS];
+    for (int w = 0; w < WALKS; ++w)
+        record[w] = rows[walk->row[w]];
+    for (int w = 0; w < WALKS; ++w) {
+        target[w] = draw(record[w], entries, words[w], factor + w);
+        factor[w] = record[w].z ? factor[w] : 0;
+    }
+}
+
+// Move walk w; returns whether it goes on after its score, and in `worth` what a score is multiplied by.
+inline int move(walks *walk, int w, ulong word, uint target, real factor, global const uint2 *steps, real *worth)
+{
+    const uint2 step = steps[walk->step[w]++];
+    walk->row[w] = target >> 1;
+    walk->weight[w] *= target & 1 ? -factor : factor;
+    *worth = walk->weight[w] * as_float(step.x);
+    return ((uint)word & ((1u << GO_ON_BITS) - 1)) < step.y;
+}
+
+kernel void walk_rows(
+    int units, int chunks, uint first, uint end, ulong seed, uint stream, int stride, int offset,
+    global const uint *pixels, global const uint4 *rows, global const ulong *entries, global const uint2 *steps,
+    global const real *b, global real4 *out)
+{
+    walks walk;
+    real score[WALKS][K], sum[WALKS][K], low[WALKS][K], square[WALKS][K], square_low[WALKS][K];
+    ulong words[2][WALKS];
+    uint target[WALKS];
+    real factor[WALKS];
+    set_out(&walk, units, chunks, first, end, pixels);
+    for (int w = 0; w < WALKS; ++w)
+        for (int c = 0; c < K; ++c)
+            score[w][c] = sum[w][c] = low[w][c] = square[w][c] = square_low[w][c] = 0;
+    while (start_ended(&walk)) {
+        draw_words(&walk, seed, stream, words);
+        for (int part = 0; part < 2; ++part) {
+            draw_targets(&walk, words[part], rows, entries, target, factor);
+            for (int w = 0; w < WALKS; ++w) {
+                if (!walk.alive[w])
+                    continue;
+                int goes_on = 0;
+                if (factor[w] != 0) {
+                    real worth;
+                    goes_on = move(&walk, w, words[part][w], target[w], factor[w], steps, &worth);
+                    if (ESTIMATOR == COLLISION || !goes_on)
+                        for (int c = 0; c < K; ++c)
+                            score[w][c] += worth * b[(int)walk.row[w] * stride + offset + c];
+                }
+                if (goes_on)
+                    continue;
+                walk.alive[w] = 0;
+                for (int c = 0; c < K; ++c) {
+                    two_sum(score[w][c], &sum[w][c], &low[w][c]);
+                    two_sum(score[w][c] * score[w][c], &square[w][c], &square_low[w][c]);
+                    score[w][c] = 0;
+                }
+            }
+        }
+    }
+    for (int w = 0; w < WALKS; ++w) {
+        const int unit = get_global_id(0) * WALKS + w;
+        if (unit < units)
+            for (int c = 0; c < K; ++c)
+                out[unit * K + c] = (real4)(sum[w][c], low[w][c], square[w][c], square_low[w][c]);
+    }
+}
+
+// Sample s writes ends[s - first] and scores[s - first]; `pixel` is the row of b behind those of R^T.
+kernel void walk_columns(
+    int units, uint first, uint end, ulong seed, uint stream, global const uint *pixel, global const uint4 *rows,
+    global const ulong *entries, global const uint2 *steps, global uint *ends, global real *scores)
+{
+    walks walk;
+    ulong words[2][WALKS];
+    uint target[WALKS];
+    real factor[WALKS];
+    set_out(&walk, units, units, first, end, pixel);
+    while (start_ended(&walk)) {
+        draw_words(&walk, seed, stream, words);
+        for (int part = 0; part < 2; ++part) {
+            draw_targets(&walk, words[part], rows, entries, target, factor);
+            for (int w = 0; w < WALKS; ++w) {
+                if (!walk.alive[w])
+                    continue;
+                int goes_on = 0;
+                real worth = 0;
+                if (factor[w] != 0)
+                    goes_on = move(&walk, w, words[part][w], target[w], factor[w], steps, &worth);
+                if (goes_on)
+                    continue;
+                walk.alive[w] = 0;
+                ends[walk.next[w] - 1 - first] = walk.row[w];
+                scores[walk.next[w] - 1 - first] = worth;
+            }
+        }
+    }
+}
