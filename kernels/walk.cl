@@ -138,8 +138,8 @@ inline void draw_words(const walks *walk, ulong seed, uint stream, ulong words[2
     }
 }
 
-// One step of every walk: `target` gets columns and signs, `factor` what weights are multiplied by. `alive`
-// ends where the row is empty. Walks that have ended take it too, on the row they were in, and nobody looks.
+// One step of every walk: `target` gets columns and signs, `factor` what weights are multiplied by, 0 where
+// the row is empty. Walks that have ended take it too, from their start, and nobody looks.
 inline void draw_targets(
     walks *walk, const ulong *words, global const uint4 *rows, global const ulong *entries, uint *target,
     real *factor)
@@ -151,6 +151,12 @@ inline void draw_targets(
         target[w] = draw(record[w], entries, words[w], factor + w);
         factor[w] = record[w].z ? factor[w] : 0;
     }
+}
+
+inline void end_walk(walks *walk, int w)
+{
+    walk->alive[w] = 0;
+    walk->row[w] = walk->pixel[w];
 }
 
 // Move walk w; returns whether it goes on after its score, and in `worth` what a score is multiplied by.
@@ -194,7 +200,7 @@ kernel void walk_rows(
                 }
                 if (goes_on)
                     continue;
-                walk.alive[w] = 0;
+                end_walk(&walk, w);
                 for (int c = 0; c < K; ++c) {
                     two_sum(score[w][c], &sum[w][c], &low[w][c]);
                     two_sum(score[w][c] * score[w][c], &square[w][c], &square_low[w][c]);
@@ -234,9 +240,9 @@ kernel void walk_columns(
                     goes_on = move(&walk, w, words[part][w], target[w], factor[w], steps, &worth);
                 if (goes_on)
                     continue;
-                walk.alive[w] = 0;
                 ends[walk.next[w] - 1 - first] = walk.row[w];
                 scores[walk.next[w] - 1 - first] = worth;
+                end_walk(&walk, w);
             }
         }
     }

@@ -6,6 +6,7 @@ A twin is named after its kernel; the `_stream` and `_group` variants of a kerne
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from fractions import Fraction
@@ -230,6 +231,85 @@ def alias_csr(columns: np.ndarray, values: np.ndarray, sampler: str) -> tuple[in
         bits = np.asarray(values, np.float32).view(np.uint32)
         table = [int(bit) << 32 | int(c) for bit, c in zip(bits, columns, strict=True)]
     return count, total if count else np.float32(0), table
+
+
+def walk(
+    tables: tuple[np.ndarray, np.ndarray, str],
+    steps: np.ndarray,
+    b: np.ndarray | None,
+    pixels: np.ndarray,
+    samples: np.ndarray,
+    seed: int,
+    stream: int = 0,
+    collision: bool = True,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Walks from pixels[w], sample samples[w], all at once: scores (w, k) float32, ends and lengths (w,).
+
+    `tables` are records, entries and the sampler; steps are (L, 2) uint32. Without b a walk scores its weight
+    where it ends, the adjoint.
+    """
+    records, entries, sampler = tables
+    row, step = np.array(pixels), np.zeros(len(pixels), np.int64)
+    weight = np.ones(len(row), np.float32)
+    scores = np.zeros((len(row), 1 if b is None else b.shape[1]), np.float32)
+    alive = np.ones(len(row), bool)
+    while alive.any():
+        counters = np.stack([pixels, samples, step // 2, np.full(len(row), stream)], axis=1)
+        words = random_philox(counters.astype(np.uint32), seed).astype(np.uint64).reshape(-1, 2, 2)
+        word = words[np.arange(len(row)), step % 2]
+        word = word[:, 0] | word[:, 1] << np.uint64(32)
+        target, factor = _draw(records[row], entries, word, sampler)
+        alive &= factor != 0
+        here = np.flatnonzero(alive)
+        row[here] = target[here] >> 1
+        weight[here] *= np.where(target[here] & 1, -factor[here], factor[here])
+        worth = weight[here] * np.ascontiguousarray(steps[step[here], 0]).view(np.float32)
+        goes_on = (word[here] & np.uint64(2**22 - 1)) < steps[step[here], 1]
+        step[here] += 1
+        scored = here if collision else here[~goes_on]
+        value = worth if collision else worth[~goes_on]
+        scores[scored] += value[:, None] * (1 if b is None else b[row[scored]])
+        alive[here] = goes_on
+    return scores, row, step
+
+
+def _draw(
+    records: np.ndarray, entries: np.ndarray, word: np.ndarray, sampler: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Column and sign in one number, and what weights are multiplied by, of one entry of each row."""
+    count = records[:, 2].astype(np.uint64)
+    start = records[:, 0].astype(np.uint64) | records[:, 1].astype(np.uint64) << np.uint64(32)
+    factor = np.ascontiguousarray(records[:, 3]).view(np.float32)
+    place = (word >> np.uint64(22)) * count
+    slot = np.where(count > 0, start + (place >> np.uint64(42)), 0)
+    entry = entries[slot] if entries.size else np.zeros(len(slot), np.uint64)
+    if sampler == "alias":
+        fraction = place >> np.uint64(24) & np.uint64(2**18 - 1)
+        own = fraction < entry >> np.uint64(46)
+        target = np.where(own, entry >> np.uint64(23), entry) & np.uint64(2**23 - 1)
+        return target.astype(np.int64), factor
+    if sampler == "uniform":
+        value = (entry >> np.uint64(32)).astype(np.uint32).view(np.float32)
+        target = (entry & np.uint64(2**32 - 1)).astype(np.int64) * 2 + np.signbit(value)
+        return target, np.where(count > 0, count.astype(np.float32) * np.abs(value), np.float32(0))
+    target = np.zeros(len(word), np.int64)
+    for w in np.flatnonzero(count):
+        table = [int(e) for e in entries[int(start[w]) : int(start[w] + count[w])]]
+        sums = [e >> 23 for e in table]
+        part = (int(word[w]) >> 22) * sums[-1] >> 42
+        target[w] = table[bisect.bisect_right(sums, part)] & (2**23 - 1)
+    return target, factor
+
+
+def two_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over the first axis in float32, in order, and what their rounding took (Knuth)."""
+    total, low = (np.zeros(values.shape[1:], np.float32) for _ in range(2))
+    for value in values:
+        new = total + value
+        added = new - total
+        low = low + ((total - (new - added)) + (value - added))
+        total = new
+    return total, low
 
 
 def gamma(roundings: float) -> float:
