@@ -64,8 +64,8 @@ def geometric(q: float, sign: float) -> Lengths:
     >>> lengths.coefficients[:3].tolist(), (lengths.chances[:3] / 2**22).tolist()
     ([-1.0, 1.0, -1.0], [0.5, 0.5, 0.5])
     """
-    chance = round(q * _CERTAIN)
-    count = 1 + (int(np.ceil(_NEVER / -np.log2(chance / _CERTAIN))) if chance else 0)
+    chance = max(1, round(q * _CERTAIN))  # never 0, which would leave terms out
+    count = 1 + int(np.ceil(_NEVER / -np.log2(chance / _CERTAIN)))
     chances = np.full(count, chance, np.uint32)
     chances[-1] = 0
     return Lengths(sign ** np.arange(1, count + 1), chances)

@@ -30,6 +30,10 @@ class Status(enum.Enum):
         "the method has no next step here, not even started anew; "
         "try method='gmres', 'cg' with normal=True, or 'direct'"
     )
+    SAMPLED = (
+        "the samples are spent, what is left is noise, told by .standard_error; raise samples=, "
+        "or take gather=True"
+    )
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
@@ -53,7 +57,9 @@ class Solution:
     method : str
         The one that ran; for "auto" the one chosen.
     reason : str
-        Why "auto" chose it, else empty.
+        Why "auto" chose it, or what a method that samples has sampled, else empty.
+    standard_error : like x, optional
+        Of a method that samples, where it knows it.
     """
 
     x: np.ndarray
@@ -64,6 +70,7 @@ class Solution:
     seconds: float
     method: str
     reason: str = ""
+    standard_error: np.ndarray | None = None
 
     @property
     def converged(self) -> bool:
@@ -81,6 +88,8 @@ class Solution:
     def __str__(self) -> str:
         best, last = self.residual, self.residuals[-1]
         residual = f"{best:.2g}" if best > 0 else "lost in rounding"
+        if np.isnan(last) and self.status is Status.SAMPLED:
+            residual = "unknown of some pixels alone"
         if last > best:
             residual += f" at best and {last:.2g} at the end"
         return (

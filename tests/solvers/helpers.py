@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
-from ltcl.solvers.solve import METHODS
+from ltcl.solvers.solve import METHODS as ALL
+from ltcl.solvers.solve import SAMPLED as _SAMPLED
 
 ITERATIVE = tuple(_ITERATIVE)
+METHODS = tuple(method for method in ALL if method not in _SAMPLED)  # those that keep a tolerance
 READS_ROWS = (
     "gauss_seidel",
     "sor",
     "southwell",
 )  # methods that refuse operators whose entries cannot be read
 
-__all__ = ["ITERATIVE", "METHODS", "READS_ROWS"]
+__all__ = ["ALL", "ITERATIVE", "METHODS", "READS_ROWS"]
