@@ -130,11 +130,11 @@ inline int start_ended(walks *walk)
 // The two words of 64 bits that the next two steps of each walk take.
 inline void draw_words(const walks *walk, ulong seed, uint stream, ulong words[2][WALKS])
 {
-    for (int w = 0; w < WALKS; ++w) {
-        const uint4 counter = (uint4)(walk->pixel[w], walk->next[w] - 1, walk->step[w] / 2, stream);
-        const uint4 block = philox(counter, (uint2)((uint)seed, (uint)(seed >> 32)));
-        words[0][w] = (ulong)block.y << 32 | block.x;
-        words[1][w] = (ulong)block.w << 32 | block.z;
+    for (int i = 0; i < WALKS; ++i) {
+        uint x = walk->pixel[i], y = walk->next[i] - 1, z = walk->step[i] / 2, w = stream;
+        philox(&x, &y, &z, &w, (uint)seed, (uint)(seed >> 32));
+        words[0][i] = (ulong)y << 32 | x;
+        words[1][i] = (ulong)w << 32 | z;
     }
 }
 

@@ -6,16 +6,20 @@
 #ifndef LTCL_RANDOM_H
 #define LTCL_RANDOM_H
 
-inline uint4 philox(uint4 counter, uint2 key)
+// The block of counter (x, y, z, w) in its place. In scalars, so that a loop over blocks becomes vectors.
+inline void philox(uint *x, uint *y, uint *z, uint *w, uint key, uint other_key)
 {
-    for (int round = 0; round < 10; ++round) {
-        const ulong a = (ulong)0xD2511F53u * counter.x;
-        const ulong b = (ulong)0xCD9E8D57u * counter.z;
-        counter = (uint4)(
-            (uint)(b >> 32) ^ counter.y ^ key.x, (uint)b, (uint)(a >> 32) ^ counter.w ^ key.y, (uint)a);
-        key += (uint2)(0x9E3779B9u, 0xBB67AE85u);
+#ifdef __clang__
+#pragma clang loop unroll(full)
+#endif
+    for (uint round = 0; round < 10; ++round) {
+        const ulong a = (ulong)0xD2511F53u * *x;
+        const ulong b = (ulong)0xCD9E8D57u * *z;
+        *x = (uint)(b >> 32) ^ *y ^ (key + round * 0x9E3779B9u);
+        *z = (uint)(a >> 32) ^ *w ^ (other_key + round * 0xBB67AE85u);
+        *y = (uint)b;
+        *w = (uint)a;
     }
-    return counter;
 }
 
 #endif
