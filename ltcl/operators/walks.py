@@ -108,9 +108,11 @@ class Launching:
     group: int
 
     @classmethod
-    def best(cls, device: Device) -> Launching:
-        """Several walks an item where few items run, so that their loads do not wait for each other."""
-        return cls(8, 1) if device.is_cpu else cls(1, 64)
+    def best(cls, device: Device, units: int) -> Launching:
+        """Many walks an item where few items run, so that their loads do not wait for each other."""
+        if not device.is_cpu:
+            return cls(1, 64)
+        return cls(32 if units >= 128 * device.compute_units else 4, 1)
 
 
 @dataclass(frozen=True)
@@ -203,7 +205,7 @@ class Walker:
         return Sums(samples, total, squares)
 
     def _launch(self, name: str, estimator: str, width: int, units: int, *arguments: object) -> None:
-        how = self.launching or Launching.best(self.tables.device)
+        how = self.launching or Launching.best(self.tables.device, units)
         kernel = self.tables.device.kernel(
             "walk",
             name,

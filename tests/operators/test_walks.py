@@ -15,7 +15,7 @@ from tests import gallery, reference
 
 SEED = 0x0123456789ABCDEF
 FORMATS = {"csr": lambda device, M: CSR(device, scipy.sparse.csr_array(M)), "dense": Dense}
-LAUNCHINGS = [Launching(1, 1), Launching(3, 7), Launching(8, 16), Launching(16, 1)]
+LAUNCHINGS = [Launching(1, 1), Launching(3, 7), Launching(8, 16), Launching(32, 1)]
 
 
 def _with_empty_rows() -> np.ndarray:
@@ -97,7 +97,7 @@ def test_dense_rows_and_other_lengths_too(device, lengths):
 @pytest.mark.parametrize("launching", LAUNCHINGS)
 @pytest.mark.parametrize("units", [1, 5, 1 << 18])
 def test_no_bit_depends_on_how_it_is_launched(device, monkeypatch, units, launching):
-    R, b = MATRICES["positive"], gallery.vectors(29, 2)
+    R, b = MATRICES["positive"], gallery.vectors(29, 11)
     made, pixels = tables(Dense(device, R)), np.arange(29)
     wanted = Walker(made, geometric(0.7, -1.0), "collision", SEED).rows(device.upload(b), pixels, 0, 200)
     monkeypatch.setattr("ltcl.operators.walks._UNITS", units)
