@@ -96,7 +96,9 @@ class Sums:
         """Of the mean; infinite of a single sample, which tells nothing about it."""
         if self.samples < 2:
             return np.full_like(self.total, np.inf)
-        spread = np.maximum(self.squares - self.total**2 / self.samples, 0.0)
+        with np.errstate(invalid="ignore", over="ignore"):
+            spread = np.maximum(self.squares - self.total**2 / self.samples, 0.0)
+        spread = np.where(np.isnan(spread), np.inf, spread)  # of scores whose squares are beyond float32
         return np.sqrt(spread / (self.samples * (self.samples - 1.0)))
 
 

@@ -112,7 +112,7 @@ class MonteCarlo:
         first, lengths, reason = self._lengths(system, R, sign, rule)
         pixels = np.arange(len(x)) if self.pixels is None else _pixels(self.pixels, len(x))
         rest, error = self._walk(R, lengths, r, pixels, unit)
-        x = x[pixels] + first * r.get()[pixels].astype(np.float64) + rest
+        x = _within_float32(x[pixels] + first * r.get()[pixels].astype(np.float64) + rest)
         found = Estimate(x, error, whole=self.pixels is None, reason=reason)
         return _gather(system, R, found) if self.gather else found
 
@@ -121,11 +121,12 @@ class MonteCarlo:
         if self.series == "chebyshev":
             bounds = theory.free_bounds(system.S)
             degree = max(1, chebyshev_degree(rule.rtol, bounds)) if self.degree is None else self.degree
-            c = chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1)
+            c = _within_float32(chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1))
             bias = chebyshev_bias(degree, bounds)
             reason = f"Chebyshev series of degree {degree}, which leaves {bias:.2g} of the residual"
             return float(c[0]), whole(c[1:]), reason
-        q = chance_to_go_on(second_moment_radius(R, tables(R, self.sampler)), self.albedo)
+        made = tables_of_columns(R) if self.adjoint else tables(R, self.sampler)
+        q = chance_to_go_on(second_moment_radius(R, made, self.adjoint), self.albedo)
         return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}"
 
     def _walk(
@@ -171,6 +172,15 @@ class MonteCarlo:
             raise InputTypeError("adjoint=True estimates whole pictures; leave pixels= and error= out")
         if self.estimator == "collision" or self.sampler != "alias":
             raise InputTypeError("adjoint=True has estimator='endpoint' and sampler='alias'; leave them out")
+
+
+def _within_float32(values: np.ndarray) -> np.ndarray:
+    """Coefficients or estimates of a polynomial of too high a degree are infinite, or NaN."""
+    if not np.all(np.abs(values) <= np.finfo(np.float32).max):
+        raise InputError(
+            "the terms of this series are beyond float32; lower degree=, or use method='chebyshev'"
+        )
+    return values
 
 
 def _pixels(pixels: Any, n: int) -> np.ndarray:

@@ -35,25 +35,26 @@ class SecondMoments(Operator):
     ----------
     R : CSR or Dense, (N, N)
     made : Tables
-        Of R, for the sampler in question.
+        Of R for the sampler in question, or with `columns` of R^T, over which the walks of the adjoint go.
+    columns : bool
     """
 
-    def __init__(self, R: CSR | Dense, made: Tables) -> None:
+    def __init__(self, R: CSR | Dense, made: Tables, columns: bool = False) -> None:
         super().__init__(R.device, R.shape)
         uniform = made.sampler == "uniform"
-        self._entries = mapped(R, np.square if uniform else np.abs)
+        self._entries, self._columns = mapped(R, np.square if uniform else np.abs), columns
         d = made.counts() if uniform else made.sums()
-        self._d = R.device.upload(d)
+        self._d = R.device.upload(d[: R.shape[0]])
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
         if transpose or add is not None:
             raise TypeError("SecondMoments is for power iteration only")
-        self._entries._product(x, out, scale, None, False)
+        self._entries._product(x, out, scale, None, self._columns)
         vectors.scale_rows(self._d, out, out)
 
 
-def second_moment_radius(R: CSR | Dense, made: Tables) -> float:
-    """q times the spectral radius of Q, by power iteration; kept with R.
+def second_moment_radius(R: CSR | Dense, made: Tables, columns: bool = False) -> float:
+    """q times the spectral radius of Q, by power iteration; kept with R. See `SecondMoments`.
 
     >>> import ltcl
     >>> from ltcl.operators.alias import tables
@@ -61,9 +62,9 @@ def second_moment_radius(R: CSR | Dense, made: Tables) -> float:
     >>> round(second_moment_radius(R, tables(R)), 6)
     0.25
     """
-    key = f"second moments, {made.sampler}"
+    key = f"second moments, {'columns' if columns else made.sampler}"
     if key not in R.tables:
-        R.tables[key] = spectral_radius(SecondMoments(R, made)).value
+        R.tables[key] = spectral_radius(SecondMoments(R, made, columns)).value
     return R.tables[key]
 
 

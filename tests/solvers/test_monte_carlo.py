@@ -284,6 +284,27 @@ def test_an_infinite_variance_is_refused_with_the_reason(device, rho):
             ltcl.solve(S, np.ones(30), "monte_carlo", **options)
 
 
+def test_walks_from_b_have_a_variance_of_their_own(device):
+    """A strong row makes rows heavy and columns light: each kind of walk is judged by its own moments."""
+    R = np.full((30, 30), 0.01)
+    R[0] = 0.5
+    S = IdentityPlus(Dense(device, R))
+    rows, columns = (np.abs(np.linalg.eigvals(M.sum(axis=1)[:, None] * M)).max() for M in (R, R.T))
+    assert columns < 1.0 < rows
+    with pytest.raises(InputError, match="no finite variance"):
+        ltcl.solve(S, np.ones(30), "monte_carlo")
+    exact = np.linalg.solve(np.eye(30) + R, np.ones(30))
+    found = ltcl.solve(S, np.ones(30), "monte_carlo", adjoint=True, samples=2000)
+    assert np.all(np.abs(found.x - exact) <= 4 * error_of(found))
+
+
+@pytest.mark.parametrize("degree", [60, 500])
+def test_a_degree_that_float32_cannot_hold_is_refused(device, degree):
+    S = IdentityPlus(Dense(device, lambertian(20, 9.0).R))
+    with pytest.raises(InputError, match=r"beyond float32; lower degree=, or use method='chebyshev'"):
+        ltcl.solve(S, np.ones(20), "monte_carlo", series="chebyshev", degree=degree)
+
+
 def test_rows_that_overflow_are_refused(device):
     R = np.zeros((4, 4))
     R[2] = 3e38

@@ -9,7 +9,7 @@ import scipy.sparse
 
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Dense
-from ltcl.operators.alias import tables
+from ltcl.operators.alias import tables, tables_of_columns
 from ltcl.operators.walks import Walker, geometric
 from ltcl.theory.walks import chance_to_go_on, second_moment_radius
 from tests import gallery
@@ -31,6 +31,8 @@ def test_radii_are_those_of_the_matrices_of_moments(device, R, form):
     entries = (R != 0).sum(axis=1) if form == "csr" else np.full(len(R), R.shape[1])
     uniform = entries[:, None] * R**2
     assert second_moment_radius(M, tables(M, "uniform")) == pytest.approx(radius(uniform), rel=1e-3)
+    columns = np.abs(R).sum(axis=0)[:, None] * np.abs(R).T
+    assert second_moment_radius(M, tables_of_columns(M), True) == pytest.approx(radius(columns), rel=1e-3)
     assert radius(np.abs(R)) ** 2 <= radius(drawn) * (1 + 1e-9)  # Cauchy and Schwarz
 
 
