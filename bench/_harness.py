@@ -60,9 +60,9 @@ class Row:
 def options(description: str) -> Options:
     """Parse the command line and open the device."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--smoke", action="store_true", help="tiny sizes: does it run, not how fast")
+    parser.add_argument("--smoke", action="store_true", help="tiny sizes: does it run")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
-    parser.add_argument("--plot", type=Path, help="draw the ratios into this PNG")
+    parser.add_argument("--plot", type=Path, help="draw what was found into this PNG")
     parser.add_argument("--device", help="as ltcl.open_device takes it")
     given = parser.parse_args()
     return Options(given.smoke, given.json, given.plot, ltcl.open_device(given.device))
@@ -120,13 +120,19 @@ def report(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -
         table.add_row(row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict)
     console.print(table)
     if given.json is not None:
-        given.json.parent.mkdir(parents=True, exist_ok=True)
-        given.json.write_text(json.dumps(_record(given, title, rows, facts), indent=1) + "\n")
+        write_json(given.json, record(given, title, facts) | {"rows": [_row(row) for row in rows]})
     if given.plot is not None:
         _draw(given.plot, title, rows)
 
 
-def _record(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -> dict[str, Any]:
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a record, making its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def record(given: Options, title: str, facts: dict[str, Any]) -> dict[str, Any]:
+    """What every JSON file of a bench opens with: the question, the device and the versions."""
     return {
         "title": title,
         "smoke": given.smoke,
@@ -139,8 +145,11 @@ def _record(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) 
             "scipy": scipy.__version__,
         },
         "facts": facts,
-        "rows": [{**asdict(row), "verdict": row.verdict} for row in rows],
     }
+
+
+def _row(row: Row) -> dict[str, Any]:
+    return {**asdict(row), "verdict": row.verdict}
 
 
 def _draw(path: Path, title: str, rows: list[Row]) -> None:

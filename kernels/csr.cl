@@ -29,10 +29,7 @@ kernel void csr_matvec(
     real sum[K];
     for (int c = 0; c < K; ++c)
         sum[c] = 0;
-    const int end = pointers[row + 1];
-    for (int j = pointers[row]; j < end; ++j)
-        for (int c = 0; c < K; ++c)
-            sum[c] = values[j] * x[columns[j] * stride + offset + c] + sum[c];
+    csr_add(sum, columns, values, x + offset, stride, pointers[row], pointers[row + 1], 1);
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c)
         LTCL_STORE(out, i + c, sum[c], scale, adds, add);
@@ -63,10 +60,9 @@ kernel void csr_matvec_group(
     real sum[K];
     for (int c = 0; c < K; ++c)
         sum[c] = 0;
-    const int end = pointers[row + 1];
-    for (int j = pointers[row] + get_local_id(0); j < end; j += get_local_size(0))
-        for (int c = 0; c < K; ++c)
-            sum[c] = values[j] * x[columns[j] * stride + offset + c] + sum[c];
+    csr_add(
+        sum, columns, values, x + offset, stride, pointers[row] + get_local_id(0), pointers[row + 1],
+        get_local_size(0));
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c) {
         const real total = group_sum(sum[c], scratch);

@@ -15,10 +15,7 @@
 #include "common/lanes.h"
 #include "common/reduce.h"
 #include "common/row_sums.h"
-
-#ifndef LANES
-#error "dense.cl needs -DLANES=<columns one item of dense_rmatvec sums: 1 or 8>"
-#endif
+#include "common/stretch.h"
 
 kernel void dense_matvec(
     int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
@@ -32,9 +29,7 @@ kernel void dense_matvec(
     real sum[K];
     for (int c = 0; c < K; ++c)
         sum[c] = 0;
-    for (int j = 0; j < width; ++j)
-        for (int c = 0; c < K; ++c)
-            sum[c] = a[j] * x[j * stride + offset + c] + sum[c];
+    dense_add(sum, a, x + offset, stride, 0, width, 1);
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c)
         LTCL_STORE(out, i + c, sum[c], scale, adds, add);
@@ -64,9 +59,7 @@ kernel void dense_matvec_group(
     real sum[K];
     for (int c = 0; c < K; ++c)
         sum[c] = 0;
-    for (int j = get_local_id(0); j < width; j += get_local_size(0))
-        for (int c = 0; c < K; ++c)
-            sum[c] = a[j] * x[j * stride + offset + c] + sum[c];
+    dense_add(sum, a, x + offset, stride, get_local_id(0), width, get_local_size(0));
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c) {
         const real total = group_sum(sum[c], scratch);
@@ -74,19 +67,6 @@ kernel void dense_matvec_group(
             LTCL_STORE(out, i + c, total, scale, adds, add);
     }
 }
-
-#if LANES == 8
-typedef real8 stretch;
-#define LOAD_STRETCH(a) LOAD8(a)
-#else
-typedef real stretch;
-#define LOAD_STRETCH(a) (*(a))
-#endif
-
-typedef union {
-    stretch vector;
-    real item[LANES];
-} stretch_items;
 
 // out = scale * (slab^T x) + add, where x is read from row `first` on. The host adds the slabs up, one
 // launch after the other, so the sum has one order.

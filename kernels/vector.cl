@@ -62,6 +62,36 @@ kernel void vector_dot(
         out[first + get_group_id(0) * k + column] = sum;
 }
 
+// The largest weights[c] squares[c] of k columns, NaN where one of them is.
+inline real largest(int k, global const real *weights, global const real *squares)
+{
+    real worst = 0;
+    for (int c = 0; c < k; c++) {
+        const real value = weights[c] * squares[c];
+        worst = value > worst || isnan(value) ? value : worst;
+    }
+    return worst;
+}
+
+// best = x where row `slot` of squares (slot + 1, k), weighted as above, is at most `lowest` and no row before
+// it is lower: the best iterate stays, and the host need not know which it was. Nothing counts after a row
+// that is not finite. Each item copies every get_global_size(0)-th value.
+kernel void vector_keep(
+    int count, int k, int slot, real lowest, global const real *weights, global const real *squares,
+    global const real *x, global real *best)
+{
+    for (int s = 0; s < slot; s++) {
+        const real before = largest(k, weights, squares + s * k);
+        if (!isfinite(before))
+            return;
+        lowest = before < lowest ? before : lowest;
+    }
+    if (!(largest(k, weights, squares + slot * k) <= lowest))
+        return;
+    for (int i = get_global_id(0); i < count; i += get_global_size(0))
+        best[i] = x[i];
+}
+
 // out = a b + c: the STREAM triad, the yardstick of bench/.
 kernel void vector_triad(int count, real a, global const real8 *b, global const real8 *c, global real8 *out)
 {

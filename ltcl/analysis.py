@@ -14,6 +14,7 @@ from ltcl import checks, energy, reciprocity, theory
 from ltcl.energy import Energy
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
+from ltcl.solvers.survey import survey
 from ltcl.transport import Transport, require
 
 
@@ -140,7 +141,9 @@ def _channel(T: Any, F: np.ndarray, S: IdentityPlus, rtol: float) -> ChannelAnal
         norms = None
     rho = theory.spectral_radius(S.R, norms=norms)
     bounds = theory.free_bounds(S)
-    forecasts = theory.forecasts(S, rho, bounds, rtol)
+    seen = survey(S)
+    spectrum = seen.spectrum if seen.in_an_interval else None
+    forecasts = theory.forecasts(S, rho, bounds, rtol, spectrum, seen.self_adjoint)
     lit = F[F > 0]
     return ChannelAnalysis(
         norm_one=norms.one if norms else math.nan,

@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 
-from ltcl import checks, first_bounces, inverse_diagonal, layout, reciprocity
+from ltcl import channels, checks, first_bounces, inverse_diagonal, layout, reciprocity
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import CSR, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
+from ltcl.operators import CSR, Coupled, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
 
 logger = logging.getLogger(__name__)
 
@@ -28,9 +26,10 @@ class Transport:
 
     Parameters
     ----------
-    matrix : (M, N) array, scipy.sparse matrix, LinearOperator, or a sequence of 3 of them for RGB
+    matrix : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3 for RGB, or 3 x 3 of them
         T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j; pixels
-        are row-major.
+        are row-major. matrix[c][d] is what camera channel c sees of projector channel d; such a T has no S of
+        one channel, it relights and compensates.
     grid : (h, w)
         Of the projector; N = h * w.
     first_bounce : "diagonal", "exact", "estimate" or array (N,) or (3, N)
@@ -39,12 +38,15 @@ class Transport:
         of the same by products on the device, opened at once, which "exact" becomes where a dense inverse
         does not fit the host; or F itself.
     camera_grid : (h, w), optional
-        Of the camera where T is rectangular, M = h * w; S then does not exist and T only relights.
+        Of the camera where T is rectangular, M = h * w; S then does not exist: T relights and compensates.
     device : Device or str, optional
         As `open_device` takes it; opened at the first product only.
     on_dark : "raise" or "mask"
         What to do where F is zero or negative: refuse, or never light these projector pixels in a
         compensation. Relighting stays exact: what a pattern lights there is seen.
+    mixing : (3, 3), optional
+        Of the projector's colours, for a T of 3 channels: the light that channel c of T answers to is
+        mixing[c] @ (red, green, blue) of the pattern.
     probes, seed : int
         Of the estimate, whose error falls as 1 / sqrt(probes), each of about 20 products; at least 2.
 
@@ -52,6 +54,7 @@ class Transport:
     ----------
     matrices : tuple of 1 or 3
         T on the host, as given and checked.
+        Of 3 x 3 matrices, those on the diagonal; all of them are in `blocks`, else None.
     masked : (N,) bool
         Projector pixels dropped by ``on_dark="mask"``, in any channel.
     first_bounce_error : array like first_bounce, or None
@@ -61,7 +64,7 @@ class Transport:
     ------
     InputError
         Wrong shapes, NaN or infinite values, malformed sparse structure, a first bounce that is not
-        positive.
+        positive, a mixing that cannot be undone.
 
     Examples
     --------
@@ -80,10 +83,15 @@ class Transport:
         device: Device | str | None = None,
         *,
         on_dark: str = "raise",
+        mixing: Any = None,
         probes: int = 128,
         seed: int = 0,
     ) -> None:
-        self.matrices = _channels(matrix)
+        self.blocks = channels.blocks(matrix)
+        self.matrices = (
+            channels.own(matrix) if self.blocks is None else tuple(self.blocks[c][c] for c in range(3))
+        )
+        self.mixing = None if mixing is None else channels.mixing(mixing, self.channels, self.blocks)
         self.shape: tuple[int, int] = self.matrices[0].shape
         self.grid = checks.grid("grid", grid, self.shape[1])
         self.camera_grid = _camera_grid(camera_grid, self.shape, self.grid)
@@ -97,7 +105,8 @@ class Transport:
         self._reciprocity_defect: float | None = None
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
         if not self.is_square and not (isinstance(first_bounce, str) and first_bounce == "diagonal"):
-            raise InputError(f"first_bounce is given, but T is {self.shape}; only a square T has one")
+            kind = self.shape if self.blocks is None else "of 3 x 3 blocks"
+            raise InputError(f"first_bounce is given, but T is {kind}; only a square T of channels has one")
         if self.is_square:
             F = self._find_first_bounce(first_bounce, probes, seed)
             dark = F <= 0.0
@@ -119,8 +128,13 @@ class Transport:
 
     @property
     def is_square(self) -> bool:
-        """Whether camera and projector have the same pixels, so that S exists."""
-        return self.camera_grid == self.grid
+        """Whether S exists: camera and projector have the same pixels, and colours no blocks between them."""
+        return self.camera_grid == self.grid and self.blocks is None
+
+    @property
+    def couples(self) -> bool:
+        """Whether the light of one colour is seen in another."""
+        return self.blocks is not None or self.mixing is not None
 
     @property
     def first_bounce(self) -> np.ndarray:
@@ -165,27 +179,50 @@ class Transport:
 
     @property
     def operators(self) -> tuple[Operator, ...]:
-        """T of each channel on the device; S F where that is all of T, so that nothing is stored twice."""
+        """T of each channel on the device, or one `Coupled` of all; see `join`."""
         if self._forward is None:
-            if self.is_square and not self.masked.any():
-                F = self._require_first_bounce()
-                self._forward = tuple(ScaledColumns(S, f) for S, f in zip(self.systems, F, strict=True))
+            if self.blocks is not None:
+                self._forward = (
+                    Coupled([[as_operator(T, self.device) for T in row] for row in self.blocks]),
+                )
+            elif self.mixing is not None:
+                self._forward = (Coupled.mixed(self._own_channels(), self.mixing),)
             else:
-                self._forward = tuple(as_operator(matrix, self.device) for matrix in self.matrices)
+                self._forward = self._own_channels()
         return self._forward
+
+    def _own_channels(self) -> tuple[Operator, ...]:
+        """S F where that is all of T, so that nothing is stored twice."""
+        if not self.is_square or self.masked.any():
+            return tuple(as_operator(matrix, self.device) for matrix in self.matrices)
+        F = self._require_first_bounce()
+        return tuple(ScaledColumns(S, f) for S, f in zip(self.systems, F, strict=True))
+
+    def join(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """What `operators` take, of one (N, k) a channel: the same, or all below each other, (3 N, k)."""
+        return [np.concatenate(columns)] if self.couples else list(columns)
+
+    def split(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """One array a channel again."""
+        return np.split(parts[0], 3) if self.couples else list(parts)
 
     def __matmul__(self, pattern: Any) -> np.ndarray:
         """Relight: the picture (float32) under `pattern`, frames and colours as in `ltcl.relight`."""
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
-        pictures = [_product(T, x) for T, x in zip(self.operators, columns, strict=True)]
-        return shape.pack(pictures, self.camera_grid)
+        pictures = [_product(T, x) for T, x in zip(self.operators, self.join(columns), strict=True)]
+        return shape.pack(self.split(pictures), self.camera_grid)
 
     def to_light(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 at masked pixels."""
-        return [
+        light = [
             np.divide(l_d, F[:, None], out=np.zeros(l_d.shape), where=F[:, None] > 0)
             for l_d, F in zip(columns, self._require_first_bounce(), strict=True)
         ]
+        return (
+            light
+            if self.mixing is None
+            else list(np.einsum("ij,jnk->ink", np.linalg.inv(self.mixing), light))
+        )
 
     def _find_first_bounce(self, wanted: Any, probes: int, seed: int) -> np.ndarray:
         checks.count("probes", probes, least=2)
@@ -204,11 +241,16 @@ class Transport:
         return F
 
     def _require_first_bounce(self) -> np.ndarray:
+        if self.blocks is not None:
+            raise InputError(
+                "T has blocks between colours, which the S of one channel does not undo; this T can only "
+                "relight and compensate"
+            )
         if self._first_bounce is None:
             (h, w), (rows, columns) = self.grid, self.camera_grid
             raise InputError(
                 f"T maps a projector of {h} x {w} pixels to a camera of {rows} x {columns}; S = T F^-1 needs "
-                "both on one grid, this T can only relight"
+                "both on one grid, this T can only relight and compensate"
             )
         return self._first_bounce
 
@@ -225,43 +267,6 @@ def require(T: Any, *, square: bool = True) -> Transport:
 def _product(T: Operator, x: np.ndarray) -> np.ndarray:
     """T x on the host for x (N, k)."""
     return T.apply(T.device.upload(x)).get()
-
-
-def _channels(matrix: Any) -> tuple[Any, ...]:
-    """The checked matrices of 1 or 3 channels."""
-    if _is_matrix(matrix):
-        parts = [matrix]
-    elif isinstance(matrix, (list, tuple)) and any(_is_matrix(part) for part in matrix):
-        parts = list(matrix)
-    else:
-        array = checks.real("matrix", matrix)
-        parts = list(array) if array.ndim == 3 else [array]
-    if len(parts) not in (1, 3):
-        raise InputError(f"matrix has {len(parts)} channels; it must be one matrix, or three for RGB")
-    names = ["matrix"] if len(parts) == 1 else [f"matrix[{channel}]" for channel in range(3)]
-    checked = tuple(_checked(name, part) for name, part in zip(names, parts, strict=True))
-    shapes = [part.shape for part in checked]
-    if len(set(shapes)) > 1:
-        raise InputError(f"matrix has channels of shapes {shapes}; all must be the same")
-    return checked
-
-
-def _is_matrix(part: Any) -> bool:
-    return scipy.sparse.issparse(part) or hasattr(part, "matvec") or getattr(part, "ndim", 0) == 2
-
-
-def _checked(name: str, part: Any) -> Any:
-    if len(np.shape(part)) != 2:
-        raise InputError(f"{name} has shape {np.shape(part)}; it must be (M, N)")
-    if scipy.sparse.issparse(part):
-        result = checks.csr(name, part)
-    elif hasattr(part, "matvec"):
-        result = scipy.sparse.linalg.aslinearoperator(part)
-    else:
-        result = checks.finite(name, checks.real(name, part))
-    if 0 in (result.shape or ()):
-        raise InputError(f"{name} has shape {result.shape}; it must have at least one row and one column")
-    return result
 
 
 def _camera_grid(camera_grid: Any, shape: tuple[int, int], grid: tuple[int, int]) -> tuple[int, int]:

@@ -74,18 +74,33 @@ def vector_dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.atleast_1d(np.sum(np.asarray(x, np.float64) * np.asarray(y, np.float64), axis=0))
 
 
+def vector_keep(
+    weights: np.ndarray, squares: np.ndarray, slot: int, lowest: float, x: np.ndarray, best: np.ndarray
+) -> np.ndarray:
+    """x where the weighted residual of row `slot` is at most `lowest` and those before, all finite."""
+    worst = np.max(np.float32(weights) * np.float32(squares[: slot + 1]), axis=1)  # NaN comes through
+    whole = np.isfinite(worst[:-1]).all()
+    return x if whole and worst[-1] <= min([np.float32(lowest), *worst[:-1]]) else best
+
+
 def vector_triad(a: float, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return vector_axpby(a, b, 1.0, c)
 
 
 def relax_dense(
-    M: np.ndarray, rows: slice, shift: float, scale: float, x: np.ndarray, b: np.ndarray, carry: np.ndarray
+    M: np.ndarray,
+    start: int,
+    shift: float,
+    scale: float,
+    x: np.ndarray,
+    y: np.ndarray,
+    b: np.ndarray,
+    carry: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """s, r and the next carry of a block of rows; S = shift I + scale M."""
-    M, x = np.asarray(M, np.float64), np.asarray(x, np.float64)
-    upper = scale * (np.triu(M, 1) @ x)[rows]
-    s = (b - shift * x - scale * (M @ x))[rows]
-    return s, carry[rows] - upper, upper
+    """s, r and the next carry of all rows; S = shift I + scale M, times y before column `start`."""
+    M, x, y = (np.asarray(values, np.float64) for values in (M, x, y))
+    lower, upper = scale * (M[:, :start] @ y[:start]), shift * x + scale * (M[:, start:] @ x[start:])
+    return b - lower - upper, carry - upper, b - lower
 
 
 def relax_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
@@ -96,20 +111,28 @@ def relax_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *ar
     )
 
 
-def relax_dense_triangle(
-    M: np.ndarray, rows: slice, shift: float, scale: float, omega: float, s: np.ndarray
+def relax_finish(
+    S: np.ndarray, omega: float | None, before: int, start: int, stop: int, s: np.ndarray, delta: np.ndarray
 ) -> np.ndarray:
-    """delta of (D / omega + L)_BB delta = s_B."""
-    block = scale * np.asarray(M, np.float64)[rows, rows]
-    np.fill_diagonal(block, shift + block.diagonal())
-    return np.linalg.solve(np.tril(block, -1) + np.diag(block.diagonal() / omega), s)
+    """The delta of P_AA delta_A = s_A - S_AO delta_O: of relax_substitute, where O is empty, and the others.
+
+    P is the triangle with D / omega, or S where omega is None.
+    """
+    own = np.asarray(S, np.float64)[start:stop, start:stop]
+    P = own if omega is None else np.tril(own, -1) + np.diag(own.diagonal() / omega)
+    return np.linalg.solve(P, s[start:stop] - S[start:stop, before:start] @ delta[before:start])
 
 
-def relax_csr_triangle(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
-    """The same of a sparse M."""
-    n = len(pointers) - 1
-    matrix = scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray()
-    return relax_dense_triangle(matrix, *arguments)
+def block_gauss_seidel(
+    S: np.ndarray, x: np.ndarray, b: np.ndarray, block: int, sweeps: int = 1
+) -> np.ndarray:
+    """Sweeps of block Gauss-Seidel as in a textbook, block after block in place."""
+    x = np.array(x, np.float64)
+    for _ in range(sweeps):
+        for start in range(0, len(x), block):
+            B = slice(start, start + block)
+            x[B] += np.linalg.solve(S[B, B], b[B] - S[B] @ x)
+    return x
 
 
 def sor(S: np.ndarray, x: np.ndarray, b: np.ndarray, omega: float = 1.0, sweeps: int = 1) -> np.ndarray:
@@ -312,6 +335,88 @@ def two_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return total, low
 
 
+def form_factor_pair(
+    p: np.ndarray, q: np.ndarray, n: np.ndarray, m: np.ndarray, clip: bool = True
+) -> np.ndarray:
+    """cos cos / (pi r^2) of all points p (M, 3) with normals n and points q (N, 3) with normals m: (M, N)."""
+    d = q[None] - p[:, None]
+    r2 = (d**2).sum(axis=2)
+    here, there = np.einsum("mnc,mc->mn", d, n), -np.einsum("mnc,nc->mn", d, m)
+    faces = (here > 1e-6) & (there > 1e-6) if clip else r2 > 0
+    return np.divide(here * there, np.pi * r2**2, out=np.zeros_like(r2), where=faces)
+
+
+def form_factor_entries(geometry: np.ndarray, blocks: np.ndarray, outer: float, inner: float) -> np.ndarray:
+    """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6); see `kernels/form_factor.cl`."""
+    centre, right, down, normal = (geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4))
+    angle = np.arange(8) * np.pi / 4
+    place = np.sqrt(2 / 3) / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)  # on a circle, in edges
+    points = [centre + u * right + v * down for u, v in place]
+
+    def between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return form_factor_pair(p, q, normal, normal) * ~blocked(p[:, None], q[None], blocks)
+
+    eight = sum(between(points[k], points[3 * k % 8]) for k in range(8)) / 8
+    one = between(centre, centre)
+    # Half the second derivative along each edge times its variance, 1 / 12, by differences.
+    curved, step = form_factor_pair(centre, centre, normal, normal, clip=False), 1e-2
+    middle = curved.copy()
+    for edge in (right, down):
+        for end in (-step * edge, step * edge):
+            curved += (form_factor_pair(centre + end, centre, normal, normal, clip=False) - middle) / (
+                24 * step**2
+            )
+            curved += (form_factor_pair(centre, centre + end, normal, normal, clip=False) - middle) / (
+                24 * step**2
+            )
+    curved *= ~blocked(centre[:, None], centre[None], blocks)
+    d = centre[None] - centre[:, None]
+    height = np.einsum("mnc,mc->mn", d, normal)
+    rise = sum(np.abs(normal @ edge.T) for edge in (right, down)) / 2
+    above, below = height + rise > 1e-6, height - rise < -1e-6
+    r2, sizes = (d**2).sum(axis=2), geometry[12] + geometry[12][:, None]
+    hard = (r2 < inner**2 * sizes) | below | below.T
+    close = np.where(above & above.T, np.where(hard, eight, curved), 0.0)
+    return np.where(r2 < outer**2 * sizes, close, one)
+
+
+def form_factor_weigh(right: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """diag(right) x, each of k right-hand sides as a row: (k, N)."""
+    return (right * np.asarray(x, np.float64).T).reshape(-1, len(right))
+
+
+def form_factor_matvec(
+    G: np.ndarray, left: np.ndarray, right: np.ndarray, x: np.ndarray, scale: float, add: np.ndarray | None
+) -> np.ndarray:
+    """out = scale * diag(left) G diag(right) x + add."""
+    return dense_matvec(left[:, None] * G * right, x, scale, add)
+
+
+def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Whether the way from p to q (..., 3) passes through a box (B, 6) given as centre and half sides.
+
+    By slabs: the stretches of the way within each pair of faces have a part in common.
+    """
+    p, q = np.broadcast_arrays(np.asarray(p, np.float64), np.asarray(q, np.float64))
+    result = np.zeros(p.shape[:-1], bool)
+    for box in np.asarray(blocks, np.float64):
+        low, high = box[:3] - box[3:], box[:3] + box[3:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (low - p) / (q - p), (high - p) / (q - p)
+        along = q == p  # never leaves the slab, or never enters it
+        inside = (low <= p) & (p <= high)
+        enter = np.where(along, np.where(inside, -np.inf, np.inf), np.minimum(a, b)).max(axis=-1)
+        leave = np.where(along, np.where(inside, np.inf, -np.inf), np.maximum(a, b)).min(axis=-1)
+        result |= np.maximum(enter, 0) <= np.minimum(leave, 1)
+    return result
+
+
+def visibility_rows(starts: np.ndarray, ends: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Share of the rays from starts (rays, 3, M) to ends (rays, 3, N) that meet no box, (M, N)."""
+    rays = zip(starts, ends, strict=True)
+    return np.mean([~blocked(a.T[:, None], b.T[None], blocks) for a, b in rays], axis=0)
+
+
 def gamma(roundings: float) -> float:
     """Relative error of that many roundings in a row.
 
@@ -342,3 +447,45 @@ def dot_error(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """
     roundings = np.ceil(len(x) / _LEAVES) + 2 * np.log2(_LEAVES) + 2
     return gamma(roundings) * vector_dot(np.abs(x), np.abs(y))
+
+
+def bounded_look(
+    lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray, d: np.ndarray, h: np.ndarray
+) -> np.ndarray:
+    """Gap, z.z, z.h and z.d of every column, (4, k); bounds are (N,), the rest (N, k)."""
+    lower, upper, x, g, d, h = (np.asarray(part, np.float64) for part in (lower, upper, x, g, d, h))
+    lower, upper = lower[:, None], upper[:, None]
+    z = _free(lower, upper, x, g)
+    gap = np.maximum(g * (x - lower), g * (x - upper))
+    return np.stack([part.sum(axis=0) for part in (gap, z * z, z * h, z * d)])
+
+
+def bounded_direction(
+    alpha: np.ndarray,
+    beta: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    x: np.ndarray,
+    g: np.ndarray,
+    d: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """d (N, k); then g.d, d.d and the largest share of the way to a bound of every column, (3, k)."""
+    lower, upper, x, g, d = (np.asarray(part, np.float64) for part in (lower, upper, x, g, d))
+    lower, upper = lower[:, None], upper[:, None]
+    z = _free(lower, upper, x, g)
+    step = np.clip(x + alpha * np.where(z == 0, 0, z + beta * d), lower, upper) - x
+    way = np.where(step > 0, upper, lower) - x
+    share = np.divide(step, way, out=np.zeros_like(step), where=step != 0)
+    return step, np.stack([(g * step).sum(axis=0), (step * step).sum(axis=0), share.max(axis=0)])
+
+
+def bounded_move(
+    step: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: np.ndarray, x: np.ndarray
+) -> np.ndarray:
+    """x + step d, clipped, with (k,) steps."""
+    return np.clip(np.asarray(x, np.float64) + step * d, lower[:, None], upper[:, None])
+
+
+def _free(lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """-g, 0 where x is at a bound and -g points out."""
+    return np.where(((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0)), 0.0, -g)

@@ -13,6 +13,7 @@ from scipy.sparse.linalg import aslinearoperator
 
 import ltcl
 from ltcl.errors import InputError
+from ltcl.solvers.solve import ITERATIVE
 from tests.problems import enclosure, lambertian
 
 GRID = (5, 8)
@@ -128,3 +129,19 @@ def test_the_forecast_of_richardson_is_met(device):
     for _ in range(int(channel.products["richardson"])):
         r = r - omega * (scene.S @ r)
     assert np.linalg.norm(r) <= 1e-2 * start
+
+
+def test_every_iterative_method_has_an_entry(device):
+    """One-way light leaves Krylov methods without a forecast, tolerances below float32 all of them."""
+    scene = enclosure(40, 0.45)
+    (channel,) = ltcl.analyze(transport(scene, device)).channels
+    assert {"sor", "southwell", "cg", "gmres", "bicgstab"} <= set(channel.products) <= set(ITERATIVE)
+    assert channel.certificates["cg"] == "ritz values"
+    assert channel.certificates["southwell"] == "none"
+    one_way = ltcl.Transport(np.eye(40) + 0.9 * np.roll(np.eye(40), 1, axis=1), GRID, device=device)
+    (turning,) = ltcl.analyze(one_way).channels
+    assert math.isnan(turning.products["gmres"])
+    assert math.isfinite(turning.products["jacobi"])
+    (precise,) = ltcl.analyze(transport(scene, device), rtol=1e-9).channels
+    assert all(math.isnan(products) for products in precise.products.values())
+    assert precise.certificates["chebyshev"].startswith("none: float32")

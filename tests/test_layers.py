@@ -27,7 +27,7 @@ LAYERS: list[set[str]] = [
     {"checks"},
     {"files"},
     {"images", "device"},
-    {"operators", "layout", "first_bounces", "reciprocity"},
+    {"operators", "layout", "channels", "first_bounces", "reciprocity"},
     {"theory", "inverse_diagonal", "transport"},
     {"solvers"},
     {

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -32,7 +33,8 @@ SOLUTIONS = {
 
 def test_every_solution_has_its_curve_and_name() -> None:
     axes = plots.convergence(SOLUTIONS, rtol=1e-2).axes[0]
-    assert len(axes.get_lines()) == len(SOLUTIONS) + 1  # and the tolerance
+    curves = [line for line in axes.get_lines() if line.get_linewidth() > 1.0]  # thin ones lead to names
+    assert len(curves) == len(SOLUTIONS) + 1  # and the tolerance
     names = {text.get_text().rstrip(" \u2193") for text in axes.texts}
     assert names == {*SOLUTIONS, "tolerance"}
     assert axes.get_xlim() == (0, 4)
@@ -49,6 +51,23 @@ def test_names_do_not_overlap() -> None:
 def test_nothing_to_draw_is_refused(solutions: dict[str, Solution], rtol: float) -> None:
     with pytest.raises(InputError):
         plots.convergence(solutions, rtol)
+
+
+@pytest.mark.parametrize("rtol", [1e-2, 1e-4])
+def test_the_names_of_many_methods_do_not_touch(rtol):
+    """Curves that end at nearly one place, and one far off at the same height."""
+    rng, names = np.random.default_rng(0), [f"method_{i}" for i in range(11)]
+    solutions = {
+        name: solution(name, (1.0, float(rng.uniform(0.5, 1.0)) * rtol), int(rng.integers(3, 7)))
+        for name in names
+    } | {"far": solution("far", (1.0, rtol), 40)}
+    figure = plots.convergence(solutions, rtol)
+    figure.canvas.draw()
+    boxes = {text.get_text(): text.get_window_extent() for text in figure.axes[0].texts}
+    for one, other in itertools.combinations([*names, "far"], 2):
+        assert not boxes[one].overlaps(boxes[other]), (one, other)
+    y = figure.axes[0].transData.inverted().transform(boxes["far"].get_points())[:, 1]
+    assert y[0] < rtol < y[1]  # nothing is near it, so it stays beside its curve
 
 
 def sheet(colour: tuple[float, ...] = (0.5, 0.2, 0.1)) -> plots.Sheet:

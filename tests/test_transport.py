@@ -118,7 +118,7 @@ def test_operators_of_ltcl_are_taken_too(device):
 
 
 @pytest.mark.parametrize("form", ["array", "csr", "operator"])
-def test_a_rectangular_T_only_relights(device, form):
+def test_a_rectangular_T_relights_and_has_no_S(device, form):
     matrix = pattern(12, 35)
     T = transport(FORMS[form](matrix), camera_grid=(3, 4), device=device)
     np.testing.assert_allclose((T @ pattern(*GRID)).ravel(), matrix @ pattern(35), rtol=ROUNDING)
@@ -126,7 +126,6 @@ def test_a_rectangular_T_only_relights(device, form):
     refuses = [
         lambda: T.first_bounce,
         lambda: T.interreflection,
-        lambda: ltcl.compensate(T, pattern(3, 4)),
         lambda: ltcl.separate(T, pattern(3, 4)),
         lambda: ltcl.analyze(T),
     ]
@@ -140,7 +139,7 @@ def test_grids_that_differ_cannot_share_pixels(device):
     T = transport(SCENE.T, camera_grid=(7, 5), device=device)
     assert (T @ pattern(*GRID)).shape == (7, 5)
     with pytest.raises(InputError, match="only relight"):
-        ltcl.compensate(T, pattern(7, 5))
+        ltcl.separate(T, pattern(7, 5))
 
 
 # Bad input: (matrix, other arguments, error, what the message says).

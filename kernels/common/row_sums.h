@@ -1,11 +1,31 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Sums over a row, or parts of it, times x, in wide loads, for K right-hand sides: for CPUs, where a row is a
-// stream. x points at the first right-hand side of the launch; a sparse sum can be cut in two on its way.
+// Sums over a row, or parts of it, times x, for K right-hand sides; x points at the first of the launch.
+// As in a textbook, by one work-item or by many side by side (_add), and in wide loads (_sum, _sums): for CPUs,
+// where a row is a stream.
 
 #ifndef LTCL_ROW_SUMS_H
 #define LTCL_ROW_SUMS_H
 
 #include "common/lanes.h"
+
+// Every `step`-th entry of a sparse row from j on.
+inline void csr_add(
+    real *sum, global const int *columns, global const real *values, global const real *x, int stride, int j,
+    int end, int step)
+{
+    for (; j < end; j += step)
+        for (int c = 0; c < K; ++c)
+            sum[c] = values[j] * x[columns[j] * stride + c] + sum[c];
+}
+
+// Every `step`-th column of a dense row from j on.
+inline void dense_add(
+    real *sum, global const real *a, global const real *x, int stride, int j, int end, int step)
+{
+    for (; j < end; j += step)
+        for (int c = 0; c < K; ++c)
+            sum[c] = a[j] * x[j * stride + c] + sum[c];
+}
 
 #if K == 1
 
@@ -15,7 +35,7 @@ typedef union {
 } sums;
 
 typedef struct {
-    sums lower, all;
+    sums lower, upper;
 } row_sums;
 
 inline real8 gather8(global const real *x, int stride, global const int *columns)
@@ -26,7 +46,7 @@ inline real8 gather8(global const real *x, int stride, global const int *columns
 
 // The next 16 entries. Columns ascend and are unique, so these are neighbours in x when the ends are 15
 // apart: then two wide loads replace 16 gathers. A pixel of a transport sees many such stretches.
-#define ADD_STRETCH(even, odd) \
+#define ADD_STRETCH(x, even, odd) \
     do { \
         const int column = columns[j]; \
         if (stride == 1 && columns[j + 15] == column + 15) { \
@@ -44,7 +64,7 @@ inline sums csr_sum(
 {
     real8 even = 0, odd = 0;
     for (; j + 16 <= end; j += 16)
-        ADD_STRETCH(even, odd);
+        ADD_STRETCH(x, even, odd);
     sums sum;
     sum.vector = sum8(even + odd);
     for (; j < end; ++j)
@@ -52,36 +72,52 @@ inline sums csr_sum(
     return sum;
 }
 
-// Entries j .. end of a row, and those up to `split` of them. The stretch that the split
-// cuts is masked, which leaves no more single entries than the product has.
-inline row_sums csr_sums(
-    global const int *columns, global const real *values, global const real *x, int stride, int j, int split,
-    int end)
+inline real8 gather8_of_two(
+    global const real *y, global const real *x, int start, int stride, global const int *columns)
 {
-    real8 s0 = 0, s1 = 0;
-    for (; j + 16 <= split; j += 16)
-        ADD_STRETCH(s0, s1);
-    real8 low = s0 + s1;
-    if (j < split && j + 16 <= end) {
-        const int8 lane = (int8)(0, 1, 2, 3, 4, 5, 6, 7);
-        real8 even = 0, odd = 0;
-        ADD_STRETCH(even, odd);
-        low += select((real8)(0), even, lane < split - j) + select((real8)(0), odd, lane + 8 < split - j);
-        s0 += even;
-        s1 += odd;
-        j += 16;
+#define PICK(c) ((c) < start ? y : x)[(c) * stride]
+    const int8 c = vload8(0, columns);
+    return (real8)(PICK(c.s0), PICK(c.s1), PICK(c.s2), PICK(c.s3), PICK(c.s4), PICK(c.s5), PICK(c.s6), PICK(c.s7));
+#undef PICK
+}
+
+// Entries j .. split of a row, whose columns are below `start`, times y, and split .. end times x. One loop, since
+// nobody can foretell how often two would run; the stretch that the split cuts is masked.
+inline row_sums csr_sums(
+    global const int *columns, global const real *values, global const real *y, global const real *x, int start,
+    int stride, int j, int split, int end)
+{
+    real8 s0 = 0, s1 = 0, low = 0;
+    global const real *from = y;
+    for (; j + 16 <= end; j += 16) {
+        const int left = split - j;
+        if ((uint)left < 16) {
+            low = s0 + s1;
+            s0 = s1 = 0;
+            from = x;
+            if (left > 0) {
+                const int8 lane = (int8)(0, 1, 2, 3, 4, 5, 6, 7);
+                const real8 even = LOAD8(values + j) * gather8_of_two(y, x, start, stride, columns + j);
+                const real8 odd = LOAD8(values + j + 8) * gather8_of_two(y, x, start, stride, columns + j + 8);
+                low += select((real8)(0), even, lane < left) + select((real8)(0), odd, lane + 8 < left);
+                s0 = select(even, (real8)(0), lane < left);
+                s1 = select(odd, (real8)(0), lane + 8 < left);
+                continue;
+            }
+        }
+        ADD_STRETCH(from, s0, s1);
     }
-    for (; j + 16 <= end; j += 16)
-        ADD_STRETCH(s0, s1);
+    if (j <= split) {
+        low = s0 + s1;
+        s0 = s1 = 0;
+    }
     row_sums sum;
     sum.lower.vector = sum8(low);
-    sum.all.vector = sum8(s0 + s1);
-    for (; j < end; ++j) {
-        const real product = values[j] * x[columns[j] * stride];
-        sum.all.vector += product;
-        if (j < split)
-            sum.lower.vector += product;
-    }
+    sum.upper.vector = sum8(s0 + s1);
+    for (; j < split; ++j)
+        sum.lower.vector = values[j] * y[columns[j] * stride] + sum.lower.vector;
+    for (; j < end; ++j)
+        sum.upper.vector = values[j] * x[columns[j] * stride] + sum.upper.vector;
     return sum;
 }
 
@@ -111,7 +147,7 @@ inline sums dense_sum(global const real *a, global const real *x, int stride, in
 typedef lanes_items sums;
 
 typedef struct {
-    sums lower, all;
+    sums lower, upper;
 } row_sums;
 
 // The K values of a pixel lie side by side: one wide load a nonzero.
@@ -133,12 +169,12 @@ inline sums csr_sum(
 }
 
 inline row_sums csr_sums(
-    global const int *columns, global const real *values, global const real *x, int stride, int j, int split,
-    int end)
+    global const int *columns, global const real *values, global const real *y, global const real *x, int start,
+    int stride, int j, int split, int end)
 {
     row_sums sum;
-    sum.lower = csr_sum(columns, values, x, stride, j, split);
-    sum.all.vector = csr_sum(columns, values, x, stride, split, end).vector + sum.lower.vector;
+    sum.lower = csr_sum(columns, values, y, stride, j, split);
+    sum.upper = csr_sum(columns, values, x, stride, split, end);
     return sum;
 }
 

@@ -112,7 +112,7 @@ def _spectrum(channel: dict[str, Any]) -> tuple:
 def _forecast(channel: dict[str, Any]) -> tuple:
     """JSON has None for both: what has a certificate but no number diverges."""
     return tuple(
-        "diverges" if products is None and channel["certificates"][name] != "none" else products
+        "diverges" if products is None and not channel["certificates"][name].startswith("none") else products
         for name, products in channel["products"].items()
     )
 

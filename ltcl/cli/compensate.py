@@ -15,7 +15,36 @@ from ltcl.cli import console, options, pictures, results, transports
 from ltcl.compensation import Compensation
 from ltcl.transport import Transport
 
-_GAIN = Annotated[float, typer.Option(metavar="FACTOR", help="Match FACTOR times the picture.")]
+
+def _gain(text: str) -> float | str:
+    try:
+        return "auto" if text == "auto" else float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no gain; write a number, or auto") from None
+
+
+_GAIN = Annotated[
+    str,
+    typer.Option(
+        parser=_gain,
+        metavar="FACTOR",
+        help="Match FACTOR times the picture; auto: the largest that the projector reaches.",
+    ),
+]
+_LOSS = Annotated[
+    float | None,
+    typer.Option(
+        metavar="FRACTION",
+        help="Error that --gain auto may cost. Default: none if possible, else a little above the least.",
+        show_default=False,
+    ),
+]
+_WEIGHTS = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Picture of how much the error at each pixel counts.", show_default=False
+    ),
+]
 _LOW = Annotated[float, typer.Option(metavar="LIGHT", help="Darkest light of the projector.")]
 _HIGH = Annotated[float, typer.Option(metavar="LIGHT", help="Brightest light of the projector.")]
 _BACKGROUND = Annotated[
@@ -34,14 +63,17 @@ def run(
     picture: options.Pictures,
     out: options.Out,
     grid: options.Grid = None,
+    camera_grid: options.CameraGrid = None,
     method: options.Method = "auto",
     rtol: options.Rtol = 1e-2,
     first_bounce: options.FirstBounce = None,
     on_dark: options.OnDark = "raise",
-    gain: _GAIN = 1.0,
+    gain: _GAIN = "1",
+    loss: _LOSS = None,
     low: _LOW = 0.0,
     high: _HIGH = 1.0,
     background: _BACKGROUND = None,
+    weights: _WEIGHTS = None,
     resize: options.Resize = False,
     encoding: options.Encoding = "auto",
     device: options.Device = None,
@@ -49,38 +81,50 @@ def run(
 ) -> None:
     """Find the projector patterns that make a scene look like PICTURE.
 
-    Writes for each picture the pattern and how the scene will look under it, exactly as .exr and for the eye
-    as .png, and compensate.json.
+    Writes for each picture the pattern, how the scene will look under it and what is out of the projector's
+    reach, exactly as .exr and for the eye as .png, and compensate.json.
     """
     from ltcl.compensation import compensate
 
-    T = transports.load(transport, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
-    reader = pictures.Reader(T.grid, "the projector", encoding, resize)
+    T = transports.load(
+        transport,
+        device,
+        needs="light",
+        grid=grid,
+        camera_grid=camera_grid,
+        first_bounce=first_bounce,
+        on_dark=on_dark,
+    )
+    reader = pictures.Reader(T.camera_grid, "the camera", encoding, resize)
     desired = reader.read_all(picture)
-    dark = None if background is None else reader.read(background)
+    dark, counts = (None if file is None else reader.read(file) for file in (background, weights))
     text = transports.heading(
         "compensate",
         transport,
         T,
         grid=grid,
+        camera_grid=camera_grid,
         method=method,
         rtol=rtol,
         first_bounce=first_bounce,
         on_dark=on_dark,
         gain=gain,
+        loss=loss,
         low=low,
         high=high,
         background=background,
+        weights=weights,
         resize=resize,
         encoding=encoding,
         device=device,
     )
-    settings = {"bounds": (low, high), "gain": gain, "method": method, "rtol": rtol}
+    settings = {"bounds": (low, high), "gain": gain, "loss": loss, "method": method, "rtol": rtol}
     entries = text["pictures"] = []
     with console.Steps(len(desired), T.channels) as steps, results.fill(out, text) as folder:
         for (name, wanted), file in zip(desired.items(), picture, strict=True):
             steps.item(file.name)
-            done = compensate(T, wanted, background=dark, callback=steps.solve(rtol), **settings)
+            pictured = {"background": dark, "weights": counts}
+            done = compensate(T, wanted, callback=steps.solve(rtol), **pictured, **settings)
             entries.append(
                 {"file": str(file), **_entry(T, done, low, high), **_under(done, dark)}
                 | _write(folder, name, done, high)
@@ -88,13 +132,15 @@ def run(
     if json:
         console.answer({"folder": out, **text})
     else:
-        _show(out, entries)
+        _show(out, entries, advise=gain != "auto")
 
 
 def _entry(T: Transport, done: Compensation, low: float, high: float) -> dict[str, Any]:
-    """What the report says of one picture; `too_dark` to `brightest` are of the light before clipping."""
+    """What the report says of one picture; `too_dark` to `brightest` are of the light without bounds."""
     solutions = done.solution if isinstance(done.solution, tuple) else (done.solution,)
-    light = T.to_light([solution.x.reshape(len(solution.x), -1) for solution in solutions])
+    light = [done.pattern]  # of a T that has no S, so that there is no other
+    if T.is_square:
+        light = T.to_light([solution.x.reshape(len(solution.x), -1) for solution in solutions])
     return {
         "gain": done.gain,
         "clipped": done.clipped,
@@ -102,7 +148,9 @@ def _entry(T: Transport, done: Compensation, low: float, high: float) -> dict[st
         "too_bright": float(np.mean(np.greater(light, high))),
         "brightest": float(np.max(light)),
         "error": done.error,
+        "gap": done.gap,
         "channels": report.solution(solutions),
+        "limited": report.solution(done.limited),
     }
 
 
@@ -118,21 +166,23 @@ def _under(done: Compensation, dark: np.ndarray | None) -> dict[str, float]:
 
 def _write(folder: Path, name: str, done: Compensation, high: float) -> dict[str, Any]:
     # Appearance / gain compares with the picture that was asked for, whatever the units of T.
+    missing = done.out_of_reach
     return {
         "pattern": pictures.write(folder, f"{name}_pattern", done.pattern, high if high > 0 else 1.0),
         "appearance": pictures.write(folder, f"{name}_appearance", done.appearance, done.gain),
+        "out_of_reach": pictures.write(folder, f"{name}_out_of_reach", missing, done.gain, np.abs(missing)),
     }
 
 
-def _show(out: Path, entries: list[dict[str, Any]]) -> None:
+def _show(out: Path, entries: list[dict[str, Any]], advise: bool) -> None:
     console.table(
-        ("picture", "method", "products", "residual", "clipped", "error", "pattern"),
+        ("picture", "method", "products", "gain", "clipped", "error", "pattern"),
         [
             (
                 Path(entry["file"]).name,
-                ", ".join(sorted({channel["method"] for channel in entry["channels"]})),
-                sum(channel["products"] for channel in entry["channels"]),
-                max(channel["residual"] for channel in entry["channels"]),
+                ", ".join(dict.fromkeys(solve["method"] for solve in _solves(entry))),
+                sum(solve["products"] for solve in _solves(entry)),
+                entry["gain"],
                 f"{100 * entry['clipped']:.1f} %",
                 f"{100 * entry['error']:.2f} %",
                 entry["pattern"]["exr"],
@@ -140,9 +190,14 @@ def _show(out: Path, entries: list[dict[str, Any]]) -> None:
             for entry in entries
         ],
     )
-    typer.echo(f"\npatterns and appearances as .exr and .png in {out}")
-    for entry in entries:
+    typer.echo(f"\npatterns, appearances and what is out of reach as .exr and .png in {out}")
+    for entry in entries if advise else ():
         _advise(entry)
+
+
+def _solves(entry: dict[str, Any]) -> list[dict[str, Any]]:
+    """Those without bounds and those within; of a T without S, they are the same."""
+    return entry["channels"] + [solve for solve in entry["limited"] if solve not in entry["channels"]]
 
 
 def _advise(entry: dict[str, Any]) -> None:

@@ -96,6 +96,7 @@ def describe(file: Path, record: Record) -> dict[str, Any]:
         "nbytes": sum(_nbytes(T) for T in record.matrices),
         "first_bounce": None if F is None else (float(F.min()), float(F.max())),
         "first_bounce_from": "diagonal" if record.first_bounce is None else "file",
+        "mixing": record.mixing,
         "dark_pixels": None if F is None else int(np.count_nonzero((F <= 0).any(axis=0))),
     }
 

@@ -69,8 +69,10 @@ def names(paths: Sequence[Path]) -> dict[str, Path]:
     return found
 
 
-def write(folder: Path, name: str, picture: np.ndarray, scale: float = 1.0) -> dict[str, Any]:
-    """Write ``name.exr`` with the values as they are and ``name.png`` with value / scale in sRGB.
+def write(
+    folder: Path, name: str, picture: np.ndarray, scale: float = 1.0, shown: np.ndarray | None = None
+) -> dict[str, Any]:
+    """Write ``name.exr`` with the values as they are and ``name.png`` with them, or `shown`, / scale in sRGB.
 
     Returns
     -------
@@ -80,7 +82,7 @@ def write(folder: Path, name: str, picture: np.ndarray, scale: float = 1.0) -> d
     from ltcl import images
 
     images.write(folder / f"{name}.exr", picture)
-    images.write(folder / f"{name}.png", picture / scale)
+    images.write(folder / f"{name}.png", (picture if shown is None else shown) / scale)
     return {"exr": f"{name}.exr", "png": f"{name}.png", "png_scale": scale}
 
 

@@ -30,7 +30,7 @@ def run(
     """
     from ltcl.relighting import relight
 
-    T = transports.load(transport, device, square=False, grid=grid, camera_grid=camera_grid, on_dark=on_dark)
+    T = transports.load(transport, device, needs="T", grid=grid, camera_grid=camera_grid, on_dark=on_dark)
     patterns = pictures.Reader(T.grid, "the projector", encoding, resize).read_all(pattern)
     text = transports.heading(
         "relight",

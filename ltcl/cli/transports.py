@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ltcl import report, store
 from ltcl.cli import console
@@ -14,23 +14,31 @@ from ltcl.store import formats
 from ltcl.transport import Transport
 
 
-def load(path: Path, device: str | None, *, square: bool = True, **options: Any) -> Transport:
+def load(
+    path: Path, device: str | None, *, needs: Literal["S", "light", "T"] = "S", **options: Any
+) -> Transport:
     """Open the device, then load: a mistyped device should not wait for a large file.
+
+    Parameters
+    ----------
+    needs
+        What the command is going to use: S, which only a square T has; patterns, in which masked pixels stay
+        unlit; or nothing but T.
 
     Raises
     ------
     FileError
-        As `store.load`; or `square` is asked for, and T maps to another number of pixels.
+        As `store.load`; or S is needed, and T maps to another number of pixels.
     """
     opened = open_device(device)
     try:
         T = store.load(path, device=opened, **options)
     except FileError as error:
-        if square and "grid=(" in str(error):  # no grid helps where T is rectangular
+        if needs == "S" and "grid=(" in str(error):  # no grid helps where T is rectangular
             _require_square(path)
         raise
     dark = int(T.masked.sum())
-    if dark and square:  # relighting needs no first bounce
+    if dark and needs != "T":  # relighting needs no first bounce
         console.note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
     return T
 
@@ -38,7 +46,7 @@ def load(path: Path, device: str | None, *, square: bool = True, **options: Any)
 def _require_square(path: Path) -> None:
     rows, columns = formats.read(path).shape
     if rows != columns:
-        raise FileError(f"{path}: T is {rows} x {columns}; only relight can use it")
+        raise FileError(f"{path}: T is {rows} x {columns}; only compensate and relight can use it")
 
 
 def heading(command: str, path: Path, T: Transport, **options: Any) -> dict[str, Any]:

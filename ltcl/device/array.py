@@ -63,14 +63,36 @@ class Array:
 
     def copy_from(self, other: Array) -> Array:
         """Overwrite with the values of another array of the device; returns this one."""
-        import pyopencl as cl
-
         if other.shape != self.shape:
             raise InputError(f"cannot copy an array of shape {other.shape} into one of {self.shape}")
-        if self.nbytes:
-            with failures.translated(f"copying on {self.device.name}"):
-                cl.enqueue_copy(self.device.queue, self.buffer, other.buffer, byte_count=self.nbytes)
+        self._copy(self, other, self.nbytes)
         return self
+
+    def rows(self, first: int, count: int) -> Array:
+        """A copy of `count` rows from `first` on."""
+        if not 0 <= first <= first + count <= self.shape[0]:
+            raise InputError(f"rows {first} to {first + count} are not among {self.shape[0]}")
+        part = self.device.empty((count, *self.shape[1:]), self.dtype)
+        self._copy(part, self, part.nbytes, src_offset=first * self._row_bytes)
+        return part
+
+    def set_rows(self, first: int, part: Array) -> Array:
+        """Overwrite the rows from `first` on with another array of the device; returns this one."""
+        if part.shape[1:] != self.shape[1:] or not 0 <= first <= self.shape[0] - part.shape[0]:
+            raise InputError(f"rows {first} on of an array of shape {self.shape} cannot hold {part.shape}")
+        self._copy(self, part, part.nbytes, dst_offset=first * self._row_bytes)
+        return self
+
+    @property
+    def _row_bytes(self) -> int:
+        return self.columns * self.dtype.itemsize
+
+    def _copy(self, to: Array, of: Array, nbytes: int, **offsets: Any) -> None:
+        import pyopencl as cl
+
+        if nbytes:
+            with failures.translated(f"copying on {self.device.name}"):
+                cl.enqueue_copy(self.device.queue, to.buffer, of.buffer, byte_count=nbytes, **offsets)
 
     def copy(self) -> Array:
         """Another array with the same values."""

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a solver does between two products: fill, axpby, axpby column by column, diagonal scaling, dot, norm.
+"""What a solver does between two products: fill, axpby, axpby column by column, scaling, dot, norm.
 
-Everything is queued and returns at once; only `dot` and `norm` give numbers to the host and so wait.
+Everything is queued and returns at once; only `dot`, `dots` and `norm` give numbers to the host and so wait.
 Sums are trees over a fixed number of slices: the same bits at every call on a given device.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +16,7 @@ from ltcl.device.array import Array
 from ltcl.errors import InputError
 
 _SLICES = 64  # partial sums of a dot product: enough groups for a large GPU, few enough for one last group
+_COPIERS = {True: 1 << 12, False: 1 << 16}  # items of `keep` on a CPU or not: each has a rule to work out
 
 
 def fill(x: Array, value: float) -> Array:
@@ -64,8 +67,28 @@ def scale_rows(d: Array, x: Array, out: Array) -> Array:
     return out
 
 
+def multiply(x: Array, y: Array, out: Array) -> Array:
+    """out = x y, entry by entry; `out` may be `x` or `y`."""
+    _same_shape(x, y, out)
+    _elementwise(out, "vector_scale_rows", 1, x, y, out)  # of one column as long as all
+    return out
+
+
 def dot(x: Array, y: Array) -> np.ndarray:
     """<x_c, y_c> of every column c, as (k,) float64; waits for the device."""
+    return dots([x], y)[0]
+
+
+def dots(xs: Sequence[Array], y: Array) -> np.ndarray:
+    """<x_c, y_c> of every column c for each x of `xs`, as (len(xs), k) float64; waits once for all."""
+    out = y.device.empty((len(xs), y.columns))
+    for slot, x in enumerate(xs):
+        queue_dot(x, y, out, slot)
+    return out.get().astype(np.float64)
+
+
+def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
+    """Row `slot` of `out` (slots, k) = <x_c, y_c> of every column c; does not wait."""
     _same_shape(x, y)
     device, k = x.device, x.columns
     rows = x.shape[0]
@@ -73,12 +96,25 @@ def dot(x: Array, y: Array) -> np.ndarray:
     group = 64 if device.is_cpu else 256
     group = min(group, kernel.largest_group())
     slices = min(_SLICES, max(1, -(-rows // group)))
-    # (slices, k) partial sums, then the k results behind them.
-    sums = device.empty(((slices + 1) * k,))
-    scratch = device.local(group)
+    sums, scratch = device.empty((slices, k)), device.local(group)
     kernel((slices * group, k), (group, 1), rows, k, 0, x, y, sums, 0, scratch)
-    kernel((group, k), (group, 1), slices, k, 1, sums, sums, sums, slices * k, scratch)
-    return sums.get()[slices * k :].astype(np.float64)
+    kernel((group, k), (group, 1), slices, k, 1, sums, sums, out, slot * k, scratch)
+
+
+def keep(weights: Array, squares: Array, slot: int, lowest: float, x: Array, best: Array) -> Array:
+    """best = x, where ``max(weights * squares[slot])`` is at most `lowest` and that of every row before.
+
+    `weights` are (k,), `squares` (slots, k), for the columns of `x`; nothing is read back. What comes after a
+    row that is not finite is no best.
+    """
+    _same_shape(x, best)
+    items = min(_COPIERS[x.device.is_cpu], x.size)
+    kernel = x.device.kernel("vector", "vector_keep")
+    group = min(64, kernel.largest_group())
+    with np.errstate(over="ignore"):
+        lowest = float(np.float32(lowest))
+    kernel(items, group, x.size, x.columns, slot, lowest, weights, squares, x, best)
+    return best
 
 
 def norm(x: Array) -> np.ndarray:

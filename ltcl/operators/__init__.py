@@ -10,12 +10,14 @@ import scipy.sparse
 from ltcl.device import Device, open_device
 from ltcl.operators.base import Norms, Operator, Transposed
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
 
 __all__ = [
     "CSR",
+    "Coupled",
     "Dense",
     "Host",
     "IdentityPlus",

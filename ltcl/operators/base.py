@@ -44,9 +44,12 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         Bytes of its matrix on the device.
     error : float
         Bound on the 2-norm of what a compressed operator dropped; 0 for exact ones.
+    weights : (N,) float64 or None
+        Of an inner product <x, y> = sum_i w_i x_i y_i in which it should be self-adjoint, where one is known.
     """
 
     error = 0.0
+    weights: np.ndarray | None = None
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         super().__init__(np.float32, shape)

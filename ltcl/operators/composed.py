@@ -26,6 +26,8 @@ class IdentityPlus(Operator):
         Global illumination R, or one bounce A.
     sign : float
         +1 for I + R, -1 for I - R.
+    weights : (N,), optional
+        All positive: S is self-adjoint in the inner product <x, y> = sum_i w_i x_i y_i, as far as is known.
 
     Examples
     --------
@@ -36,7 +38,7 @@ class IdentityPlus(Operator):
     [1.0, 0.5]
     """
 
-    def __init__(self, R: Operator, sign: float = 1.0) -> None:
+    def __init__(self, R: Operator, sign: float = 1.0, weights: np.ndarray | None = None) -> None:
         if R.shape[0] != R.shape[1]:
             raise InputError(f"R has shape {R.shape}; S = I + R needs a square one")
         if sign not in (1.0, -1.0):
@@ -45,6 +47,7 @@ class IdentityPlus(Operator):
         self.R = R
         self.sign = float(sign)
         self.error = R.error
+        self.weights = None if weights is None else checks.shape("weights", weights, R.shape[:1])
 
     @property
     def nbytes(self) -> int:

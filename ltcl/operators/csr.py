@@ -7,7 +7,7 @@ but the same speed and the same bits at every call, which scattered additions wo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -118,6 +118,11 @@ class CSR(RowOperator):
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64."""
         return self._host.diagonal().astype(np.float64)
+
+    def parts(self, places: Iterable[tuple[slice, slice]]) -> Iterator[np.ndarray]:
+        """Dense float64 copies of the places (rows, columns)."""
+        for rows, columns in places:
+            yield self._host[rows, columns].toarray().astype(np.float64)
 
     def norms(self) -> Norms:
         """Norms of the matrix as it was given."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,19 @@ class Dense(RowOperator):
         for first, block in self._blocks():
             dense[first : first + len(block)] = block
         return dense
+
+    def parts(self, places: Iterable[tuple[slice, slice]]) -> Iterator[np.ndarray]:
+        """Float64 copies of the places (rows, columns), rows ascending, so that a slab is read once."""
+        slabs = iter(self._blocks())
+        first, block = next(slabs)
+        for rows, columns in places:
+            while rows.start >= first + len(block):
+                first, block = next(slabs)
+            pieces = [block[rows.start - first : rows.stop - first, columns]]
+            while rows.stop > first + len(block):
+                first, block = next(slabs)
+                pieces.append(block[: rows.stop - first, columns])
+            yield np.concatenate(pieces)
 
     def _blocks(self):
         for slab in self.slabs:

@@ -31,13 +31,15 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
     Returns
     -------
     tuple of IdentityPlus
-        Sparse channels share one pattern where their nonzeros are in the same places.
+        Sparse channels share one pattern where their nonzeros are in the same places. Their `weights` are
+        1 / F, where no pixel is masked: if T is symmetric (reciprocity, patches of equal area), so is
+        F^-1 S = F^-1 T F^-1.
     """
     systems, pattern = [], None
     for matrix, f in zip(matrices, F, strict=True):
         R = _interreflection(matrix, f, device, pattern)
         pattern = R.pattern if isinstance(R, CSR) else None
-        systems.append(IdentityPlus(R))
+        systems.append(IdentityPlus(R, weights=1.0 / f if np.all(f > 0) else None))
     return tuple(systems)
 
 

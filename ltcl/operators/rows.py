@@ -58,7 +58,7 @@ class RowOperator(Operator):
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         super().__init__(device, shape)
         self._fastest: dict[tuple[int, int], Launch] = {}
-        self.relaxations: dict[tuple[float, float, int | None], Any] = {}  # of relaxation.py: lives as long
+        self.relaxations: dict[tuple[Any, ...], Any] = {}  # of relaxation.py: lives as long
         self.tables: dict[str, Any] = {}  # of alias.py
 
     @property

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 DPI = 100
 PAPER, INK, FAINT, GRID = "#15171b", "#f1efea", "#9aa1ab", "#2b2f36"
 COLOURS = {"chebyshev": "#5cc8ff", "jacobi": "#ff5d5d", "neumann": "#ffb347", "direct": "#8bd17c"}
-OTHERS = ("#c792ea", "#f78fb3", "#7fdbca", "#d6deeb")
+OTHERS = ("#c792ea", "#f78fb3", "#7fdbca", "#d6deeb", "#ffd866", "#9fb4ff", "#e0a37a", "#b5e853")
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:

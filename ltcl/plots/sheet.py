@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_LETTER, _LINE = 10, 21  # pixels that a letter and a line of names take
 _LOWEST = 1e-8  # of a residual worth drawing: float32 products end above
 
 
@@ -183,7 +184,7 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
     limits = min(float(values.min()), rtol) / 2, max(2.0, 2 * float(values.max()))
     axes.set_ylim(*limits)
     axes.plot([0, products], [rtol, rtol], color=FAINT, lw=1.2, ls=(0, (4, 4)))
-    axes.text(0.99 * products, rtol, "tolerance", color=FAINT, fontsize=11, va="bottom", ha="right")
+    axes.text(0.01 * products, rtol, "tolerance", color=FAINT, fontsize=11, va="bottom")
     others, ends = iter(OTHERS * len(solutions)), []
     for name, (x, y) in curves.items():
         colour = COLOURS.get(name) or next(others)
@@ -191,9 +192,24 @@ def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float
         axes.plot(x, y, color=colour, lw=2.6, ls=(0, (2, 2)) if name == "neumann" else "-", clip_on=False)
         label = name if solutions[name].residual >= _LOWEST else f"{name} \u2193"
         ends.append(_End(label, colour, float(x[-1]), float(y[-1])))
-    for end in _apart(ends, limits):
-        x = end.x + 0.025 * products
-        axes.text(x, end.y, end.name, color=end.colour, fontsize=12, va="center", fontweight="bold")
+    _name_curves(axes, ends, limits)
+
+
+def _name_curves(axes: Axes, ends: Sequence[_End], limits: tuple[float, float]) -> None:
+    """Write each name beside the end of its curve, or near it with a line to it."""
+    from matplotlib.patheffects import withStroke
+
+    size, products = axes.get_window_extent(), axes.get_xlim()[1]
+    height = _LINE / size.height * float(np.log(limits[1] / limits[0]))
+    gap, letter = 0.025 * products, _LETTER / size.width * products
+    edge = withStroke(linewidth=3, foreground=PAPER)  # where a name crosses other curves
+    for end, y in zip(ends, _apart(ends, limits, letter, height), strict=True):
+        if y != end.y:
+            axes.plot([end.x, end.x + gap], [end.y, y], color=end.colour, lw=0.8, alpha=0.6, clip_on=False)
+        text = axes.text(
+            end.x + gap, y, end.name, color=end.colour, fontsize=12, va="center", fontweight="bold"
+        )
+        text.set_path_effects([edge])
 
 
 def _dress(axes: Axes) -> None:
@@ -230,11 +246,28 @@ class _End:
     y: float
 
 
-def _apart(ends: Sequence[_End], limits: tuple[float, float]) -> list[_End]:
-    """The ends of curves from below, moved up just enough that their names do not touch."""
+def _apart(ends: Sequence[_End], limits: tuple[float, float], letter: float, height: float) -> list[float]:
+    """Heights for the names of curves, each as near to the end of its curve as others leave room for it.
+
+    `letter` is the width of one along x, `height` that of a line, in units of log y. Names that do not meet
+    along x may stand at one height.
+    """
     low, high = np.log(limits)
-    taken, placed = -np.inf, []
-    for end in sorted(ends, key=lambda end: end.y):
-        taken = max(float(np.log(end.y)), taken + 0.075 * (high - low))
-        placed.append(replace(end, y=float(np.exp(taken))))
-    return placed
+    placed: dict[int, float] = {}
+    for i in sorted(range(len(ends)), key=lambda i: ends[i].y):
+        end, wanted = ends[i], float(np.log(ends[i].y))
+        near = [y for j, y in placed.items() if _meet(end, ends[j], letter)]
+        places = [wanted, *(y + side * height for y in near for side in (1.0, -1.0))]
+        free = [
+            y for y in places if all(abs(y - other) >= 0.999 * height for other in near) and low <= y <= high
+        ]
+        placed[i] = min(free or [wanted], key=lambda y: abs(y - wanted))
+    return [
+        ends[i].y if placed[i] == np.log(ends[i].y) else float(np.exp(placed[i])) for i in range(len(ends))
+    ]
+
+
+def _meet(one: _End, other: _End, letter: float) -> bool:
+    """Whether two names at one height would touch."""
+    left, right = sorted((one, other), key=lambda end: end.x)
+    return right.x < left.x + letter * (len(left.name) + 1)

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from ltcl import checks
-from ltcl.errors import InputError
+from ltcl.device import Device
+from ltcl.errors import InputError, InputTypeError
+from ltcl.scenes.assembly import assemble
+from ltcl.scenes.blocks import Block
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
-from ltcl.scenes.walls import Wall, form_factors, spread_albedo
+from ltcl.scenes.walls import Wall
 
 WALLS = (
     Wall("left", corner=(1, 0, 1), right=(-1, 0, 0), down=(0, 0, -1)),
@@ -34,8 +35,14 @@ _ABOVE = Viewer(eye=(2.6, 2.6, 2.1), target=(0, 0, 0.25))
 _LEVEL = Viewer(eye=(2.6, 2.6, 0.5), target=(0, 0, 0.5))
 
 
-def box(n: int, sides: int = 6, albedo: Any = 0.7) -> Scene:
-    """A unit cube with some of its walls, n x n square patches each.
+def box(
+    n: int,
+    sides: int = 6,
+    albedo: Any = 0.7,
+    occluder: Block | None = None,
+    device: Device | str | None = None,
+) -> Scene:
+    """A unit cube with some of its walls, n x n square patches each, and what stands in it.
 
     Parameters
     ----------
@@ -47,43 +54,46 @@ def box(n: int, sides: int = 6, albedo: Any = 0.7) -> Scene:
     albedo : array_like in [0, 1)
         A scalar; (sides,), one per wall; (3,), one colour; (sides, 3), one colour per wall. With
         three sides, three numbers could mean both and are refused: write (3, 1) or (1, 3).
+    occluder : Block, optional
+        An opaque block inside the cube, which it may touch. It casts shadows; if it has an albedo, its faces
+        are part of the picture, except those that lie in a wall.
+    device : Device or str, optional
+        What traces rays past the occluder; the best one if omitted. Without an occluder none is opened.
 
     Returns
     -------
     Scene
-        Grid (n, sides * n), walls side by side in the order above. The floor's left edge meets the
+        Grid (n, sides * n), walls side by side in the order above, then the faces of the occluder in the
+        order of `Block.faces`, n x n patches each. The floor's left edge meets the
         left wall and its top edge the right one; the ceiling's are the other way round.
 
     Raises
     ------
     InputError
-        If n or sides or albedo is out of range, or albedo has another shape.
+        If n or sides or albedo is out of range, or albedo has another shape, or the occluder reaches out of
+        the cube.
     MemoryLimitError
         If form factors and transport would not fit in the memory of the host; nothing is allocated then.
 
     Notes
     -----
-    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.form_factors`.
+    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.cube_tables`; past an occluder they are
+    sampled, see `ltcl.scenes.occlusion`.
 
     Examples
     --------
     >>> room = box(4, sides=3, albedo=[(0.7, 0.1, 0.1), (0.1, 0.7, 0.1), (0.6, 0.6, 0.6)])
     >>> room.grid, room.channels, [wall.name for wall in room.walls]
     ((4, 12), 3, ['left', 'right', 'floor'])
+    >>> table = Block(corner=(0.3, 0.3, 0), size=(0.4, 0.4, 0.3), albedo=0.5)
+    >>> box(4, sides=3, occluder=table).grid
+    (4, 32)
     """
     if checks.count("sides", sides) > len(WALLS):
         raise InputError(f"sides is {sides}; it must be at most {len(WALLS)}")
     # From above a ceiling would show its back, and walls alone look best at eye level.
     viewer = _ABOVE if sides == 3 else _LEVEL
-    return cube_faces(f"box with {sides} side(s)", WALLS[:sides], n, albedo, viewer)
-
-
-def cube_faces(name: str, walls: tuple[Wall, ...], n: int, albedo: Any, viewer: Viewer) -> Scene:
-    """Scene of faces of the unit cube, n x n patches each; what `box` and `dihedral` share."""
-    n = checks.count("n", n)
-    pixels = n * n * len(walls)
-    # Form factors, transport, its copy for the device, and room to work.
-    checks.fits_host(f"{name}, {pixels} x {pixels}, with its transport,", 4 * 8 * pixels**2)
-    patches = spread_albedo(albedo, len(walls), n)
-    area = np.full(pixels, 1 / n**2)
-    return Scene(name, (n, len(walls) * n), form_factors(walls, n), patches, area, walls, viewer)
+    if not isinstance(occluder, Block | None):
+        raise InputTypeError(f"occluder is {occluder!r}; it must be an ltcl.scenes.Block")
+    name = f"box with {sides} side(s)" + (" and a block" if occluder else "")
+    return assemble(name, WALLS[:sides], n, albedo, viewer, occluder=occluder, device=device)

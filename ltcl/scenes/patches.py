@@ -40,6 +40,13 @@ class Patches:
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     @property
+    def frames(self) -> np.ndarray:
+        """Rows x (along `right`), y, z (the normal) of each patch's own axes, (N, 3, 3)."""
+        x = self.right / np.linalg.norm(self.right, axis=1, keepdims=True)
+        z = self.normal
+        return np.stack([x, np.cross(z, x), z], axis=1)
+
+    @property
     def area(self) -> np.ndarray:
         """Areas, (N,)."""
         return np.linalg.norm(np.cross(self.down, self.right), axis=1)

@@ -16,8 +16,10 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes import exchange
+from ltcl.scenes import crossing, exchange
+from ltcl.scenes import light as lighting
 from ltcl.scenes import viewer as viewing
+from ltcl.scenes.blocks import Block
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall, check_albedo
 from ltcl.transport import Transport
@@ -30,7 +32,7 @@ _LONGEST = 32766  # pixels along an image that OpenCV can still address
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Patches that light each other; made by `dihedral`, `box`, or from form factors of your own.
+    """Patches that light each other; made by `dihedral`, `trihedral`, `box`, or from own form factors.
 
     Parameters
     ----------
@@ -48,12 +50,15 @@ class Scene:
         Where the parts of the picture stand in space, left to right.
     viewer : Viewer
         Who looks in `view` and `sample`.
+    blocks : tuple of Block
+        What hides walls from the viewer and from lights; the form factors must know of them already.
 
     Raises
     ------
     InputError
         If shapes disagree, a value is NaN, infinite or negative, an albedo is not below 1, rows of the
-        form factors sum to more than 1, they break reciprocity, or the viewer sees no wall.
+        form factors sum to more than 1, they break reciprocity, two walls cut through each other, or the
+        viewer sees no wall.
 
     Examples
     --------
@@ -70,11 +75,14 @@ class Scene:
     area: np.ndarray = field(repr=False)
     walls: tuple[Wall, ...]
     viewer: Viewer
+    blocks: tuple[Block, ...] = ()
 
     def __post_init__(self) -> None:
         h, w = checks.grid("grid", self.grid)
         object.__setattr__(self, "grid", (h, w))
-        if not self.walls or w % len(self.walls):
+        if not self.walls:
+            raise InputError("walls are 0; a scene needs at least one")
+        if w % len(self.walls):
             raise InputError(f"walls are {len(self.walls)}; they must divide the {w} columns of the grid")
         for name, shapes in {
             "form_factors": [(h * w, h * w)],
@@ -89,6 +97,7 @@ class Scene:
             object.__setattr__(self, name, value)
         check_albedo(self.albedo)
         exchange.check(self.form_factors, self.area)
+        crossing.refuse((*self.walls, *self._screens))
         viewing.frame(self.viewer, self.walls)
 
     @property
@@ -206,7 +215,8 @@ class Scene:
         Returns
         -------
         ndarray, (H, W) or (H, W, 3), float32
-            The image; 0 beside the walls. Walls that show the viewer their back are left out.
+            The image; 0 beside the walls and on black blocks. Walls that show the viewer their back are
+        left out.
 
         Raises
         ------
@@ -226,7 +236,7 @@ class Scene:
         checks.shape("picture", picture, self.grid, (*self.grid, 3))
         size, supersample = checks.count("size", size), checks.count("supersample", supersample)
         _addressable("size", size)
-        return viewing.draw(self.viewer, self.walls, picture, size, supersample)
+        return viewing.draw(self.viewer, self.walls, picture, size, supersample, self._screens)
 
     def sample(self, image: Any) -> np.ndarray:
         """The picture on the walls that looks like a flat image from where the viewer stands.
@@ -242,7 +252,7 @@ class Scene:
         Returns
         -------
         ndarray, (h, w) or (h, w, 3), float32
-            On the patch grid; 0 on walls the viewer does not see.
+            On the patch grid; 0 on patches the viewer does not see.
 
         Raises
         ------
@@ -259,7 +269,44 @@ class Scene:
         if image.ndim not in (2, 3) or image.size == 0 or image.shape[2:] not in ((), (3,)):
             raise InputError(f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty")
         _addressable("image", max(image.shape))
-        return viewing.read(self.viewer, self.walls, image, self.grid)
+        return viewing.read(self.viewer, self.walls, image, self.grid, self._screens)
+
+    def irradiance(self, light: Any) -> np.ndarray:
+        """Light that falls on each patch straight from a point, shadows included, largest value 1.
+
+        It serves as a pattern: ``T @ scene.irradiance(light)`` is the room under that light.
+
+        Parameters
+        ----------
+        light : (x, y, z)
+            Where it stands; it shines alike in all directions.
+
+        Returns
+        -------
+        ndarray, (h, w), float32
+
+        Raises
+        ------
+        InputError
+            If the light is not three finite numbers, stands inside a block, or reaches no patch.
+
+        Notes
+        -----
+        See `ltcl.scenes.light`.
+
+        Examples
+        --------
+        >>> from ltcl.scenes import box
+        >>> picture = box(8, sides=3).irradiance(light=(0.9, 0.9, 0.9))
+        >>> picture.shape, float(picture.max())
+        ((8, 24), 1.0)
+        """
+        return lighting.irradiance(self.walls, self.grid, light, self.blocks)
+
+    @property
+    def _screens(self) -> tuple[Wall, ...]:
+        """Faces of the blocks that carry no part of the picture: black."""
+        return tuple(face for block in self.blocks for face in block.faces() if face not in self.walls)
 
     def _fits(self, matrices: int) -> None:
         pixels = len(self.area)

@@ -2,11 +2,13 @@
 """A pinhole viewer who looks at walls: draws pictures on them, and reads images off them.
 
 A point u right + v down of a wall, (u, v) in [0, 1]^2, appears at H (u, v, 1) in the image plane,
-so each wall has one homography H (3 x 3). Walls seen from behind are left out; occlusion is not
-handled, which is right inside a convex room. All values are linear and pass unclipped.
+so each wall has one homography H (3 x 3), which also tells its depth there: the last coordinate. Of
+walls that overlap in the image the nearest shows, point by point. Walls seen from behind are left out, and
+screens, which are walls without a picture, show black. All values are linear and pass unclipped.
 
 Drawing interpolates linearly between patch centres and averages supersample^2 points per pixel;
-reading averages a lattice of points per patch, about one per pixel of its footprint, 16 x 16 at most.
+reading averages a lattice of points per patch, about one per pixel of its footprint, 16 x 16 at most,
+without those that are hidden.
 """
 
 from __future__ import annotations
@@ -18,10 +20,12 @@ import cv2
 import numpy as np
 
 from ltcl.errors import InputError
+from ltcl.scenes import crossing
 from ltcl.scenes.walls import Vector, Wall
 
 _MARGIN = 0.03  # of the larger side, left free around the walls
 _BAND = 32  # output rows drawn at a time, so that supersampling stays small in memory
+_EDGE = 1e-9  # of a wall: points so far beside it count as on it, lest seams show as cracks
 _MOST_POINTS = 16  # along a patch: 256 points give a mean good to a fraction of a percent
 
 
@@ -103,14 +107,21 @@ def frame(viewer: Viewer, walls: Sequence[Wall]) -> Frame:
 
 
 def draw(
-    viewer: Viewer, walls: Sequence[Wall], picture: np.ndarray, size: int, supersample: int
+    viewer: Viewer,
+    walls: Sequence[Wall],
+    picture: np.ndarray,
+    size: int,
+    supersample: int,
+    screens: Sequence[Wall] = (),
 ) -> np.ndarray:
-    """Image (H, W[, 3]) float32 of a picture (h, w[, 3]) on the walls; 0 where there is no wall."""
-    visible = frame(viewer, walls)
+    """Image (H, W[, 3]) float32 of a picture (h, w[, 3]) on the walls; 0 on screens and beside all."""
+    visible = frame(viewer, (*walls, *screens))
     height, width = visible.pixels(size)
     scale = supersample * visible.scale(height, width)
     parts = np.split(np.asarray(picture, dtype=np.float32), len(walls), axis=1)
-    seen = [(viewer.homography(w), p) for w, p in zip(walls, parts, strict=True) if viewer.sees(w)]
+    black = np.zeros_like(parts[0][:1, :1])
+    pictured = [*zip(walls, parts, strict=True), *((screen, black) for screen in screens)]
+    seen = [(viewer.homography(wall), part) for wall, part in pictured if viewer.sees(wall)]
     image = np.zeros((height, width, *picture.shape[2:]), dtype=np.float32)
     x = (np.arange(width * supersample) + 0.5 - width * supersample / 2) / scale + visible.centre[0]
     y = (np.arange(height * supersample) + 0.5 - height * supersample / 2) / scale + visible.centre[1]
@@ -120,12 +131,19 @@ def draw(
     return image
 
 
-def read(viewer: Viewer, walls: Sequence[Wall], image: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+def read(
+    viewer: Viewer,
+    walls: Sequence[Wall],
+    image: np.ndarray,
+    grid: tuple[int, int],
+    screens: Sequence[Wall] = (),
+) -> np.ndarray:
     """Picture (h, w[, 3]) float32 on the walls' grid: means of an image (H, W[, 3]) over the patches.
 
-    The image just covers the frame, centred. Walls the viewer does not see are 0.
+    The image just covers the frame, centred. Of patches partly hidden the mean is over what shows; those
+    hidden or seen from behind are 0.
     """
-    visible = frame(viewer, walls)
+    visible = frame(viewer, (*walls, *screens))
     height, width = image.shape[:2]
     scale = visible.scale(height, width)
     # From the image plane to OpenCV's pixel coordinates, whose origin is the first pixel's centre.
@@ -133,12 +151,14 @@ def read(viewer: Viewer, walls: Sequence[Wall], image: np.ndarray, grid: tuple[i
     to_pixels = np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1]])
     patches = (grid[0], grid[1] // len(walls))
     image = np.asarray(image, dtype=np.float32)
-    parts = [
-        _read_wall(to_pixels @ viewer.homography(wall), image, patches)
-        if viewer.sees(wall)
-        else np.zeros((*patches, *image.shape[2:]), dtype=np.float32)
-        for wall in walls
-    ]
+    seen = {i: viewer.homography(wall) for i, wall in enumerate((*walls, *screens)) if viewer.sees(wall)}
+    parts = []
+    for i in range(len(walls)):
+        if i in seen:
+            hiding = [other for j, other in seen.items() if j != i and _overlap(seen[i], other)]
+            parts.append(_read_wall(seen[i], to_pixels, image, patches, hiding))
+        else:
+            parts.append(np.zeros((*patches, *image.shape[2:]), dtype=np.float32))
     return np.concatenate(parts, axis=1)
 
 
@@ -157,24 +177,60 @@ def _draw_points(seen: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray, y: np
     """What the viewer sees at points of the image plane, (len(y), len(x)[, 3]) float32."""
     points = _lattice(x, y)
     values = np.zeros((len(y), len(x), *seen[0][1].shape[2:]), dtype=np.float32)
+    nearest = np.zeros((len(y), len(x)))
     for homography, part in seen:
-        place = _apply(np.linalg.inv(homography), points)
-        inside = np.all((place >= 0) & (place <= 1), axis=-1)
-        if inside.any():
-            values[inside] = _interpolate(part, place * part.shape[1::-1] - 0.5)[inside]
+        place, nearness = _hit(homography, points)
+        shown = nearness > nearest
+        if shown.any():
+            nearest[shown] = nearness[shown]
+            values[shown] = _interpolate(part, place * part.shape[1::-1] - 0.5)[shown]
     return values
 
 
-def _read_wall(homography: np.ndarray, image: np.ndarray, patches: tuple[int, int]) -> np.ndarray:
-    """Mean of the image over the footprint of each patch of one wall."""
+def _hit(homography: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where on a wall points of the image plane (..., 3) lie, (..., 2), and 1 / depth there; 0 beside it."""
+    place = points @ np.linalg.inv(homography).T
+    nearness = place[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):  # where the wall's plane lies edge-on
+        place = place[..., :2] / nearness[..., None]
+    inside = np.all((place >= -_EDGE) & (place <= 1 + _EDGE), axis=-1)
+    return place, np.where(inside, nearness, 0)
+
+
+def _overlap(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether two walls overlap in the image by more than a rounding error."""
+    corners = np.array([(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 1)], dtype=np.float64)
+    one, other = (np.pad(_apply(homography, corners), ((0, 0), (0, 1))) for homography in (first, second))
+    return crossing.cover(one, other, touch=1e-9)
+
+
+def _read_wall(
+    homography: np.ndarray,
+    to_pixels: np.ndarray,
+    image: np.ndarray,
+    patches: tuple[int, int],
+    hiding: Sequence[np.ndarray],
+) -> np.ndarray:
+    """Mean of the image over the footprint of each patch of one wall, where walls `hiding` leave it open."""
     h, w = patches
-    borders = _apply(homography, _lattice(np.linspace(0, 1, w + 1), np.linspace(0, 1, h + 1)))
+    borders = _apply(to_pixels @ homography, _lattice(np.linspace(0, 1, w + 1), np.linspace(0, 1, h + 1)))
     sides = [np.linalg.norm(np.diff(borders, axis=axis), axis=-1).max() for axis in (0, 1)]
     points = int(np.clip(np.ceil(max(sides)), 2, _MOST_POINTS))
     u = (np.arange(w * points) + 0.5) / (w * points)
     v = (np.arange(h * points) + 0.5) / (h * points)
-    values = _interpolate(image, _apply(homography, _lattice(u, v)))
-    return _shrink(values, points)
+    projected = _lattice(u, v) @ homography.T
+    values = _interpolate(image, _apply(to_pixels, projected))
+    if not hiding:
+        return _shrink(values, points)
+    nearness = 1 / projected[..., 2]
+    places = projected * nearness[..., None]
+    # A little nearer does not hide: where walls meet, rounding decides.
+    shown = np.all([_hit(other, places)[1] <= nearness * (1 + 1e-6) for other in hiding], axis=0)
+    shown = shown.astype(np.float32)
+    weight = _shrink(shown, points)
+    shown = shown.reshape(*shown.shape, *[1] * (values.ndim - 2))
+    weight = weight.reshape(*weight.shape, *[1] * (values.ndim - 2))
+    return _shrink(values * shown, points) / np.maximum(weight, 1 / (2 * points**2))
 
 
 def _interpolate(image: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -16,14 +16,20 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes.form_factors import parallel, perpendicular
+from ltcl.scenes.cube_tables import parallel, perpendicular
 
 Vector = tuple[float, float, float]
 
 
+def vector(array: np.ndarray) -> Vector:
+    """Three floats of an array (3,)."""
+    x, y, z = (float(v) for v in array)
+    return x, y, z
+
+
 @dataclass(frozen=True)
 class Wall:
-    """A rectangle in space that carries part of a picture; z points up.
+    """A parallelogram in space that carries part of a picture; z points up.
 
     Parameters
     ----------
@@ -57,6 +63,11 @@ class Wall:
         """Unit normal of the side that carries the picture, (3,): down x right."""
         normal = np.cross(self.down, self.right).astype(np.float64)
         return normal / np.linalg.norm(normal)
+
+    @property
+    def area(self) -> float:
+        """Area of the parallelogram."""
+        return float(np.linalg.norm(np.cross(self.down, self.right)))
 
 
 def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:

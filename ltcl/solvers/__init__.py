@@ -3,8 +3,17 @@
 
 from __future__ import annotations
 
+from ltcl.solvers.bounded import Bounded
 from ltcl.solvers.matrices import matrix_iteration, matrix_series
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.solve import METHODS, solve
 
-__all__ = ["METHODS", "Solution", "Status", "matrix_iteration", "matrix_series", "solve"]
+__all__ = [
+    "METHODS",
+    "Bounded",
+    "Solution",
+    "Status",
+    "matrix_iteration",
+    "matrix_series",
+    "solve",
+]

@@ -3,9 +3,9 @@
 
 Of a Lambertian scene, S is self-adjoint in the inner product <x, y> = sum_i w_i x_i y_i with w = area /
 albedo: the transport T is symmetric (reciprocity) up to areas, and the first bounce F proportional to the
-albedo, so that with pixels of equal area w = 1 / F does for S = T F^-1. For one albedo w = 1, the default.
-Any other S is solved with its normal equations S^T S x = S^T b (CGNR), at two products a step and the square
-of the condition number.
+albedo, so that with pixels of equal area w = 1 / F does for S = T F^-1: the default where S comes from a
+transport. Elsewhere it is w = 1, that of one albedo. Any other S is solved with its normal equations
+S^T S x = S^T b (CGNR), at two products a step and the square of the condition number.
 
 Each right-hand side has coefficients of its own and rests once it is solved. Two or three inner products
 a step are read back.
@@ -35,7 +35,8 @@ class CG:
     Attributes
     ----------
     weights : (N,), optional
-        Of the inner product in which S is self-adjoint, all positive, in any unit; ones when not given.
+        Of the inner product in which S is self-adjoint, all positive, in any unit. When not given, the
+        `weights` that S brings along, which of a transport are 1 / F; ones where it has none.
     normal : bool
         Solve the normal equations, which ask nothing of S but products with its transpose.
     """
@@ -62,7 +63,8 @@ class CG:
         if self.normal:
             _normal_equations(system, x, r, monitor)
         else:
-            _conjugate_gradients(system, x, r, monitor, _Inner(system, self.weights))
+            weights = system.S.weights if self.weights is None else self.weights
+            _conjugate_gradients(system, x, r, monitor, _Inner(system, weights))
 
 
 class _Inner:

@@ -3,8 +3,8 @@
 
 Where the paper's series needs rho(R) < 1, this converges for every albedo below one: of a Lambertian scene
 the spectrum of S lies in [1/2, 1 + max row sum of R], which costs nothing to know (`theory.free_bounds`).
-No inner products after the start, so nothing is read back between products but the residual. Not for spectra
-with large imaginary parts, nor for eigenvalues on both sides of 0; there the monitor sees the residual grow.
+No inner products after the start, so nothing is read back but the residual, every few products. Not for
+spectra with large imaginary parts, nor with eigenvalues on both sides of 0: the monitor sees residuals grow.
 
 Of other scenes the bounds may leave out eigenvalues, and then the residual grows by their eigenvectors. A few
 steps of GMRES take those out and tell their eigenvalues; the bounds are widened and the iteration goes on.
@@ -20,20 +20,17 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
 from ltcl import checks, theory
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError
 from ltcl.solvers import gmres
 from ltcl.solvers.stopping import Monitor, System
+from ltcl.solvers.survey import refined, widened
 
 _GROWTH = 10.0  # times the residual at the start of a run: above what weights of surfaces may do to norms
 _REPAIRS = 3  # times that bounds are widened before the monitor alone decides
 _REPAIR_STEPS = 5
 _FIRST_STEPS = 2
-_MARGIN = 0.25  # of the width of the Ritz values, added on both sides: the outermost are not found at once
-_SAFETY = 0.05
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,7 @@ class Chebyshev:
             _, learnt = gmres.cycle(system, x, r, monitor, steps)
             if monitor.done(x, r):
                 return
-            bounds = _refined(bounds, learnt.ritz_values())
+            bounds = refined(bounds, learnt.ritz_values())
         for _ in range(_REPAIRS):
             if not _run(system, x, r, monitor, bounds, _GROWTH):
                 return
@@ -82,7 +79,7 @@ class Chebyshev:
             _, learnt = gmres.cycle(system, x, r, monitor, _REPAIR_STEPS)
             if monitor.done(x, r):
                 return
-            bounds = _widened(bounds, learnt.ritz_values())
+            bounds = widened(bounds, learnt.ritz_values())
         _run(system, x, r, monitor, bounds, math.inf)
 
 
@@ -96,43 +93,14 @@ def _run(
     radius = max((upper - lower) / 2, 1e-6 * centre)
     sigma = centre / radius  # 2.
     rho = 1.0 / sigma
+    monitor.factor = 1.0 / (sigma + math.sqrt(sigma**2 - 1.0))
     d = vectors.axpby(1.0 / centre, r, 0.0, r, r.like())
     while True:  # 3.
         vectors.axpy(1.0, d, x)  # 4.
         system.residual(x, r)  # 5., from x itself instead of by recursion: same cost, no drift
-        if monitor.done(x, r):
+        if monitor.done(x, r, lazy=True):
             return False
         if monitor.residuals[-1] > growth * first:
             return True
         previous, rho = rho, 1.0 / (2.0 * sigma - rho)  # 6.
         vectors.axpby(2.0 * rho / radius, r, rho * previous, d, d)  # 7.
-
-
-def _refined(bounds: tuple[float, float], ritz: np.ndarray) -> tuple[float, float]:
-    """Bounds drawn in to a margin around the Ritz values, which lie inside the spectrum of self-adjoint S.
-
-    >>> _refined((0.5, 5.0), np.array([1.0, 2.0]))
-    (0.75, 2.25)
-    """
-    if len(ritz) < 2:
-        return bounds
-    least, most = float(np.min(np.real(ritz))), float(np.max(np.real(ritz)))
-    margin = _MARGIN * (most - least)
-    inner = max(bounds[0], least - margin), min(bounds[1], most + margin)
-    return _widened(inner if inner[0] < inner[1] else bounds, ritz)
-
-
-def _widened(bounds: tuple[float, float], ritz: np.ndarray) -> tuple[float, float]:
-    """Bounds drawn out to hold the Ritz values; those on the wrong side of 0 no interval can hold.
-
-    >>> _widened((0.5, 1.0), np.array([0.75, 5.0, -1.0]))
-    (0.5, 5.25)
-    """
-    real = np.real(ritz)
-    positive = real[real > 0.0]
-    if not len(positive):
-        return bounds
-    least, most = float(np.min(positive)), float(np.max(positive))
-    lower = bounds[0] if least >= bounds[0] else least / (1.0 + _SAFETY)
-    upper = bounds[1] if most <= bounds[1] else most * (1.0 + _SAFETY)
-    return lower, upper

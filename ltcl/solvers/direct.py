@@ -38,6 +38,11 @@ class Direct:
         return x, b - factors.S @ x
 
 
+def known(S: Operator) -> bool:
+    """Whether S was factorized already."""
+    return S in _factors
+
+
 def _factorize(S: Operator) -> Factors:
     """Factors of S, kept as long as S lives: bounces and frames solve with one S many times."""
     if S not in _factors:

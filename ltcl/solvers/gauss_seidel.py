@@ -36,23 +36,21 @@ class GaussSeidel:
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
         if not monitor.done(x, r):
-            sweeps(system, x, r, monitor, relaxation(system.S, self.name, self.block), omega=1.0)
+            sweeps(system, x, r, monitor, relaxation(system.S, self.name, self.block))
 
 
-def sweeps(
-    system: System, x: Array, r: Array, monitor: Monitor, relaxation: Relaxation, omega: float
-) -> None:
+def sweeps(system: System, x: Array, r: Array, monitor: Monitor, relaxation: Relaxation) -> None:
     """Sweep until the monitor ends it with one of the iterates, which is then in `x`."""
-    state, before = Sweep(x, system.b, x.like(), r, x.like()), x.like()
-    _sweep(system, relaxation, state, omega)
+    state = Sweep(x, system.b, r)
+    _sweep(system, relaxation, state)
     while True:
-        before.copy_from(x)
-        _sweep(system, relaxation, state, omega)
-        if monitor.done(before, r, recursive=True):
-            x.copy_from(before)
-            return
+        _sweep(system, relaxation, state)
+        if monitor.done(state.before, r, recursive=True):
+            break
+    if state.before is not x:
+        x.copy_from(state.before)
 
 
-def _sweep(system: System, relaxation: Relaxation, state: Sweep, omega: float) -> None:
+def _sweep(system: System, relaxation: Relaxation, state: Sweep) -> None:
     system.products += 1
-    relaxation.sweep(state, omega)
+    relaxation.sweep(state)

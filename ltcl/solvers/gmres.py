@@ -2,8 +2,8 @@
 """GMRES with restarts: the smallest residual that so many products can reach, of any S, symmetric or not.
 
 Of all x in x_0 + span(r, S r, ..., S^(m-1) r) it takes the one with the smallest residual, which can then
-never grow. It needs no bounds, but memory for m + 1 directions and, at step j, j + 2 inner products that are
-read back: where products are cheap Chebyshev takes less time, in a few products more.
+never grow. It needs no bounds, but memory for m + 1 directions and, at step j, 2 j + 1 inner products, read
+back in two goes: where products are cheap Chebyshev takes less time, in a few products more.
 
 Each right-hand side has a space of its own and rests once it is solved. The residual is known before the
 iterate is, so that x is formed only at the end of a cycle; the true residual is computed there.

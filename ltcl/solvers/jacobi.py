@@ -24,6 +24,6 @@ class Jacobi:
 
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
-        while not monitor.done(x, r):
+        while not monitor.done(x, r, lazy=True):
             vectors.axpy(1.0, r, x)  # x = x + r, in place
             system.residual(x, r)  # r = l_out - S x: the next step, and the measure of this one

@@ -24,7 +24,7 @@ class Neumann:
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
         term, following = r, r.like()
-        while not monitor.done(x, term, recursive=True):
+        while not monitor.done(x, term, recursive=True, lazy=True):
             vectors.axpy(1.0, term, x)
             system.apply(term, following, scale=-1.0, add=term)  # -R term = term - S term
             term, following = following, term

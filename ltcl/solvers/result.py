@@ -43,13 +43,13 @@ class Solution:
 
     Attributes
     ----------
-    x : (N,) or (N, k) float32 (float64 of method "direct")
+    x : (N,) or (N, k) float32 (float64 of method "direct", and of values beyond float32)
         The solution; where `converged` is False, the iterate with the smallest residual.
     status : Status
     iterations : int
     products : int
-        Products with S, those for checks included; not the one that finds the free bounds of an operator,
-        which is made once in its life.
+        Products with S, those for checks included; of "auto" those of all methods tried, and of the survey
+        in the solve that made it. Not the one that finds the row sums, once in the life of an operator.
     residuals : tuple of float
         ``||b - S x|| / ||b||`` before each iteration and at the end; the largest over right-hand sides.
     seconds : float
@@ -58,6 +58,9 @@ class Solution:
         The one that ran; for "auto" the one chosen.
     reason : str
         Why "auto" chose it, or what a method that samples has sampled, else empty.
+    lowest : float, optional
+        Residual of the best iterate; the least of `residuals` when not given. Residuals that gmres foresees
+        are no iterate's.
     standard_error : like x, optional
         Of a method that samples, where it knows it.
     """
@@ -70,6 +73,7 @@ class Solution:
     seconds: float
     method: str
     reason: str = ""
+    lowest: float | None = None
     standard_error: np.ndarray | None = None
 
     @property
@@ -81,9 +85,9 @@ class Solution:
     def residual(self) -> float:
         """The relative residual of `x`."""
         finite = [value for value in self.residuals if np.isfinite(value)]
-        if not finite:
-            return float("inf")
-        return finite[-1] if self.converged else min(finite)
+        if self.converged or not finite:
+            return finite[-1] if finite else float("inf")
+        return min(finite) if self.lowest is None else self.lowest
 
     def __str__(self) -> str:
         best, last = self.residual, self.residuals[-1]

@@ -36,7 +36,7 @@ class Richardson:
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
         omega = _best(system.S) if self.omega is None else self.omega
-        while not monitor.done(x, r):
+        while not monitor.done(x, r, lazy=True):
             vectors.axpy(omega, r, x)
             system.residual(x, r)
 

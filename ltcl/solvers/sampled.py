@@ -7,6 +7,7 @@ true residual of what they found is measured with one product; it decides betwee
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,7 +35,9 @@ class Estimate:
     reason: str = ""
 
 
-def solution(method: Any, system: System, found: Estimate, rule: Rule, unit: np.ndarray) -> Solution:
+def solution(
+    method: Any, system: System, found: Estimate, rule: Rule, in_units: Callable[[np.ndarray], np.ndarray]
+) -> Solution:
     """The estimate in the caller's units, with its residual."""
     relative, met = np.nan, False
     if found.whole:
@@ -44,7 +47,7 @@ def solution(method: Any, system: System, found: Estimate, rule: Rule, unit: np.
         rule.callback(found.iterations, relative)
     error = found.standard_error
     return Solution(
-        (found.x * unit).astype(np.float32),
+        in_units(found.x),
         Status.CONVERGED if met else Status.SAMPLED,
         found.iterations,
         system.products,
@@ -52,7 +55,7 @@ def solution(method: Any, system: System, found: Estimate, rule: Rule, unit: np.
         0.0,
         method.name,
         found.reason,
-        standard_error=None if error is None else (error * unit).astype(np.float32),
+        standard_error=None if error is None else in_units(error),
     )
 
 

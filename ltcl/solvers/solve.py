@@ -17,6 +17,7 @@ from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
 from ltcl.solvers import auto, sampled
 from ltcl.solvers.bicgstab import BiCGStab
+from ltcl.solvers.block_gauss_seidel import BlockGaussSeidel
 from ltcl.solvers.cg import CG
 from ltcl.solvers.chebyshev import Chebyshev
 from ltcl.solvers.direct import Direct
@@ -41,6 +42,7 @@ ITERATIVE = {
         Chebyshev,
         GaussSeidel,
         SOR,
+        BlockGaussSeidel,
         Southwell,
         CG,
         GMRES,
@@ -74,8 +76,9 @@ def solve(
     b : (N,) or (N, k)
         k right-hand sides are solved together, each to its own tolerance.
     method : str
-        "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor", "southwell", "cg", "gmres",
-        "bicgstab", "monte_carlo", "hybrid", "direct" or "auto".
+        "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor",
+        "block_gauss_seidel", "southwell", "cg", "gmres", "bicgstab", "monte_carlo",
+        "hybrid", "direct" or "auto".
     rtol, atol : float
         Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column.
     maxiter : int, optional
@@ -173,16 +176,25 @@ def _method(name: str, options: dict[str, Any]) -> Any:
 
 
 def _automatic(S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
-    """The first method of the plan that converges, or the last one tried; products of all are counted."""
-    methods, reason = auto.plan(S, rule.rtol)
+    """The first method of the plan that converges, else the best iterate; all products are counted."""
     attempts: list[Solution] = []
-    for name in methods:
-        attempts.append(_run(_method(name, {}), S, b, guess, rule))
+    reasons, products = [], 0
+    for choice in auto.plan(S, _wanted(b, rule), 1 if b.ndim == 1 else b.shape[1]):
+        reasons.append(choice.why)
+        attempts.append(_run(choice.method, S, b, guess, rule))
+        products += choice.products + attempts[-1].products
         if attempts[-1].converged:
             break
-        reason += f"; {name} ended {attempts[-1].status.name.lower()}"
-    products = sum(attempt.products for attempt in attempts)
-    return dataclasses.replace(attempts[-1], products=products, reason=reason)
+        reasons.append(f"{attempts[-1].method} ended {attempts[-1].status.name.lower()}")
+    best = attempts[-1] if attempts[-1].converged else min(attempts, key=lambda one: one.residual)
+    return dataclasses.replace(best, products=products, reason="; ".join(filter(None, reasons)))
+
+
+def _wanted(b: np.ndarray, rule: Rule) -> float:
+    """The relative residual that all columns have to reach."""
+    norms = np.linalg.norm(b.astype(np.float64), axis=0)
+    wanted = np.maximum(rule.rtol, rule.atol / np.where(norms > 0.0, norms, np.inf))
+    return min(float(np.min(np.where(norms > 0.0, wanted, 0.5))), 0.5)
 
 
 def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
@@ -194,19 +206,20 @@ def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule
     x, r = _start(system, None if guess is None else guess / unit)
     if isinstance(method, MonteCarlo | Hybrid):
         found = method.estimate(system, x.get().astype(np.float64), r, rule, unit)
-        return sampled.solution(method, system, found, rule, unit)
+        return sampled.solution(method, system, found, rule, functools.partial(_in_units, unit=unit))
     monitor = Monitor(system, rule)
     method.iterate(system, x, r, monitor)
     best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
     assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
     return Solution(
-        (best.get() * unit).astype(np.float32),
+        _in_units(best.get(), unit),
         monitor.status,
         monitor.iterations,
         system.products,
         tuple(monitor.residuals),
         0.0,
         method.name,
+        lowest=monitor.lowest,
     )
 
 
@@ -214,6 +227,12 @@ def _unit(b: np.ndarray) -> np.ndarray:
     """A power of two for each column, near its largest value: in such units norms stay inside float32."""
     largest = np.max(np.abs(b, dtype=np.float64), axis=0)
     return np.exp2(np.floor(np.log2(np.where(largest > 0.0, largest, 1.0))))
+
+
+def _in_units(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """x times its unit in float32, or in float64 where it is beyond float32."""
+    wide = x * unit
+    return wide if np.any(np.abs(wide) > np.finfo(np.float32).max) else wide.astype(np.float32)
 
 
 def _start(system: System, guess: np.ndarray | None) -> tuple[Array, Array]:

@@ -35,5 +35,5 @@ class SOR:
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
         if not monitor.done(x, r):
-            chosen = relaxation(system.S, self.name, self.block)
-            sweeps(system, x, r, monitor, chosen, float(self.omega))
+            chosen = relaxation(system.S, self.name, self.block, float(self.omega))
+            sweeps(system, x, r, monitor, chosen)

@@ -37,7 +37,7 @@ def load(
     ----------
     path
         A .npz file (SciPy's sparse layouts, or arrays: `T` (M, N) or (3, M, N), and perhaps `grid`,
-        `camera_grid`, `first_bounce`), a .npy or a .mtx file.
+        `camera_grid`, `first_bounce`, `mixing`), a .npy or a .mtx file.
     grid, camera_grid
         (h, w) of projector and camera; needed where the file does not tell, and preferred to what it tells.
     first_bounce
@@ -76,7 +76,7 @@ def load(
             wanted = camera_grid or _unknown("camera_grid", rows, "camera")
             camera_grid = checks.grid("camera_grid", wanted, rows)
         if first_bounce is None:
-            # On another camera grid T only relights, and the file's first bounce means nothing.
+            # On another camera grid there is no S, and the file's first bounce means nothing.
             stored = record.first_bounce if camera_grid in (None, grid) else None
             first_bounce = "diagonal" if stored is None else stored
         return Transport(
@@ -85,6 +85,7 @@ def load(
             camera_grid=camera_grid,
             first_bounce=first_bounce,
             on_dark=on_dark,
+            mixing=record.mixing,
             device=device,
         )
 
@@ -104,7 +105,7 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     FileError
         An unknown extension, a format that cannot hold this transport, or the file cannot be written.
     InputTypeError
-        T is no Transport, or made of operators whose entries are not at hand.
+        T is no Transport, of 3 x 3 blocks, or made of operators whose entries are not at hand.
 
     Notes
     -----
@@ -120,9 +121,11 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     """
     if not isinstance(T, Transport):
         raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport")
+    if T.blocks is not None:
+        raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
     matrices = tuple(_entries(matrix) for matrix in T.matrices)
     bounce = T.first_bounce if T.is_square else None
-    formats.write(as_path(path), Record(matrices, T.grid, T.camera_grid, bounce))
+    formats.write(as_path(path), Record(matrices, T.grid, T.camera_grid, bounce, T.mixing))
 
 
 def _entries(matrix: Any) -> Matrix:

@@ -61,6 +61,8 @@ def write(path: str | Path, record: Record) -> None:
     """
     path = as_path(path)
     module = find(path)
+    if record.mixing is not None and module is not npz:
+        raise FileError(f"{path}: {path.suffix} does not keep how the projector's colours mix; .npz does")
     if not module.KEEPS_FIRST_BOUNCE and not _is_diagonal(record):
         logger.warning("%s: %s does not keep the first bounce; .npz does", path, path.suffix)
     with replace_file(path) as temporary, about(path):

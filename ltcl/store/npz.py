@@ -8,9 +8,10 @@ What is read:
 - three sparse channels: `format` = "ltcl-rgb-csr-1", `shape`; with one pattern for all, `indptr`, `indices`
   and `data` (3, nnz); else `indptr_0`, `indices_0`, `data_0` and so on to 2.
 
-Each may have beside it `grid` (2,), `camera_grid` (2,) and `first_bounce` (N,) or (3, N). What is written is
-the first layout (csr, readable by `scipy.sparse.load_npz`), the second or the third. Values are not
-compressed: measured light hardly shrinks, and stored arrays move at the speed of the disk.
+Each may have beside it `grid` (2,), `camera_grid` (2,), `first_bounce` (N,) or (3, N), and `mixing` (3, 3) of
+the projector's colours where there are three channels. What is written is the first layout (csr, readable by
+`scipy.sparse.load_npz`), the second or the third. Values are not compressed: measured light hardly shrinks,
+and stored arrays move at the speed of the disk.
 """
 
 from __future__ import annotations
@@ -32,17 +33,18 @@ from ltcl.store.record import Matrix, Record
 KEEPS_FIRST_BOUNCE = True
 RGB_LAYOUT = "ltcl-rgb-csr-1"
 _SPARSE_PARTS = {"format", "indptr", "indices", "offsets"}
-_EXTRAS = ("grid", "camera_grid", "first_bounce")
+_EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
 
 
 def read(path: Path) -> Record:
     """Read a transport from an archive; messages come without the file's name."""
     with Archive(path) as archive:
         matrices = _dense(archive) if _SPARSE_PARTS.isdisjoint(archive.names) else _sparse(archive)
-        bounce = None
-        if "first_bounce" in archive.names:
-            bounce = arrays.as_floats("first_bounce", archive.numbers("first_bounce"))
-        return Record(matrices, _grid(archive, "grid"), _grid(archive, "camera_grid"), bounce)
+        bounce, mixing = (
+            arrays.as_floats(name, archive.numbers(name)) if name in archive.names else None
+            for name in ("first_bounce", "mixing")
+        )
+        return Record(matrices, _grid(archive, "grid"), _grid(archive, "camera_grid"), bounce, mixing)
 
 
 def write(path: Path, record: Record) -> None:

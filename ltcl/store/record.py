@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from ltcl import checks
+from ltcl import channels, checks
 from ltcl.errors import InputError, InputTypeError
 
 Matrix = np.ndarray | scipy.sparse.csr_array
@@ -29,6 +29,8 @@ class Record:
         (h, w) of the camera; None where it is not told, or the camera is on the projector's grid.
     first_bounce
         Direct light per pixel, (N,) or (3, N), or None.
+    mixing
+        Of the projector's colours, (3, 3), for three matrices, or None.
 
     Raises
     ------
@@ -45,6 +47,7 @@ class Record:
     grid: tuple[int, int] | None = None
     camera_grid: tuple[int, int] | None = None
     first_bounce: np.ndarray | None = None
+    mixing: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if len(self.matrices) not in (1, 3):
@@ -62,6 +65,8 @@ class Record:
         if self.first_bounce is not None:
             columns = self.shape[1]
             checks.shape("first_bounce", self.first_bounce, (columns,), (3, columns))
+        if self.mixing is not None:
+            channels.mixing(self.mixing, len(self.matrices), None)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -13,7 +13,9 @@ from ltcl import checks
 from ltcl.operators import Operator
 from ltcl.theory.spectrum import POWER_ITERATION, SpectralRadius
 
-FREE_BOUNDS, SWEEPS, NOTHING = "free bounds", "power iteration of sweeps", "none"
+FREE_BOUNDS, SWEEPS, RITZ = "free bounds", "power iteration of sweeps", "ritz values"
+NOTHING, BEYOND = "none", "none: float32 cannot confirm this rtol"
+_FLOAT32 = 2.0**-23  # relative residual that is rounding
 _LARGEST_SWEEP = 4096  # pixels: a sweep on the host takes hundredths of a second
 _SETTLING, _SWEEPS = 10, 30  # sweeps before growth is measured, and in all
 
@@ -28,7 +30,8 @@ class Forecast:
         Infinite where the method diverges, NaN where nothing is known.
     certificate : str
         That of rho(R), "collatz-wielandt" or "power iteration"; "free bounds" on the spectrum of S, which
-        are those of Lambertian scenes; "power iteration of sweeps", an estimate; or "none".
+        are those of Lambertian scenes; "power iteration of sweeps" and "ritz values", estimates; or "none",
+        with a reason where there is more to say.
     """
 
     products: float
@@ -36,28 +39,61 @@ class Forecast:
 
 
 def forecasts(
-    S: Operator, rho: SpectralRadius, bounds: tuple[float, float], rtol: float
+    S: Operator,
+    rho: SpectralRadius,
+    bounds: tuple[float, float],
+    rtol: float,
+    spectrum: tuple[float, float] | None = None,
+    self_adjoint: bool = True,
 ) -> dict[str, Forecast]:
-    """What each iterative method will need for S x = b to a relative residual of `rtol`.
+    """What each iterative method will need for S x = b to a relative residual of `rtol`, its options default.
 
     Where 1 lies between certified bounds on rho(R), they do not tell whether the series converges: its
-    forecast then rests on the power iteration alone.
+    forecast then rests on the power iteration alone. Krylov methods are foretold by the Chebyshev polynomial
+    on `spectrum`, an estimate of the positive interval that holds the eigenvalues of S, where there is one;
+    they may well need less. Nothing foretells Southwell's method.
 
     >>> from ltcl.operators import IdentityPlus, as_operator
     >>> S = IdentityPlus(as_operator([[0.0, 0.5], [0.5, 0.0]]))
     >>> rho = SpectralRadius(0.5, 0.0, 2)
-    >>> {name: f.products for name, f in forecasts(S, rho, (0.5, 1.5), 1e-2).items()}
-    {'jacobi': 7, 'neumann': 7, 'richardson': 7, 'chebyshev': 5, 'gauss_seidel': 4}
+    >>> for name, f in forecasts(S, rho, (0.5, 1.5), 1e-2, (0.5, 1.5)).items():
+    ...     print(name, f.products, f.certificate)
+    jacobi 7 power iteration
+    neumann 7 power iteration
+    richardson 7 free bounds
+    chebyshev 5 free bounds
+    gauss_seidel 4 power iteration of sweeps
+    sor 4 power iteration of sweeps
+    southwell nan none
+    cg 6 ritz values
+    gmres 6 ritz values
+    bicgstab 7 ritz values
     """
     decided = not rho.lower < 1.0 <= rho.upper
     series = Forecast(series_products(rho.value, rtol), rho.certificate if decided else POWER_ITERATION)
-    return {
+    sweeps = gauss_seidel_forecast(S, rtol)
+    degree = chebyshev_products(*spectrum, rtol) if spectrum else math.nan
+    krylov = {
+        "cg": degree + 1 if self_adjoint else math.nan,  # one to confirm the end, as of the others
+        "gmres": degree + 1,
+        "bicgstab": 2 * math.ceil(degree / 2) + 1 if spectrum else math.nan,  # two products, two degrees
+    }
+    found = {
         "jacobi": series,
         "neumann": series,
         "richardson": Forecast(richardson_products(*bounds, rtol), FREE_BOUNDS),
         "chebyshev": Forecast(chebyshev_products(*bounds, rtol), FREE_BOUNDS),
-        "gauss_seidel": gauss_seidel_forecast(S, rtol),
+        "gauss_seidel": sweeps,
+        "sor": sweeps,  # omega = 1
+        "southwell": Forecast(math.nan, NOTHING),
+        **{name: Forecast(n, NOTHING if math.isnan(n) else RITZ) for name, n in krylov.items()},
     }
+    return found if rtol >= _FLOAT32 else {name: _beyond(one) for name, one in found.items()}
+
+
+def _beyond(forecast: Forecast) -> Forecast:
+    """What diverges does so at any tolerance; of the rest nothing can be said."""
+    return forecast if math.isinf(forecast.products) else Forecast(math.nan, BEYOND)
 
 
 def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:

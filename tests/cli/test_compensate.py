@@ -169,6 +169,9 @@ def test_earlier_results_give_way_to_new_ones(
         (["{transport}", "{picture}", "--device", "nonsense"], ["device is 'nonsense'"]),
         (["{transport}", "{picture}", "--grid", "7x7"], ["h * w must be 50"]),
         (["{transport}", "{picture}", "--gain", "0"], ["gain is 0.0", "above 0"]),
+        (["{transport}", "{picture}", "--loss", "0.1"], ["loss is 0.1, but gain is 1.0"]),
+        (["{transport}", "{picture}", "--gain", "auto", "--loss", "2"], ["loss is 2.0", "below 1"]),
+        (["{transport}", "{picture}", "--weights", "{large}"], ["20 x 30", "--resize"]),
         (["{transport}", "{picture}", "--low", "1", "--high", "0"], ["--high is 0.0", "above 1"]),
         (["{transport}", "{picture}", "--rtol", "nan"], ["rtol is nan"]),
         (["{transport}", "{picture}", "--rtol", "0"], ["--rtol is 0; it must be above 0"]),
@@ -190,10 +193,63 @@ def test_refusals_leave_no_folder(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_rectangular_transport_is_refused(program: Program, picture: Path, tmp_path: Path) -> None:
-    path = tmp_path / "T.npz"
-    np.savez(path, T=np.ones((6, 50)), grid=(5, 10), camera_grid=(2, 3))
-    program("compensate", path, picture, "--out", tmp_path / "out").refused("2 x 3", "can only relight")
+def test_rectangular_transport(program: Program, tmp_path: Path) -> None:
+    T = np.random.default_rng(3).uniform(0, 1, (24, 10))
+    np.save(tmp_path / "T.npy", T)
+    desired = (T @ np.linspace(0.2, 0.8, 10)).reshape(4, 6)
+    images.write(tmp_path / "p.exr", desired.astype(np.float32))
+    arguments = [
+        tmp_path / "T.npy",
+        tmp_path / "p.exr",
+        "--out",
+        tmp_path / "out",
+        "--rtol",
+        "1e-4",
+        "--json",
+    ]
+    program("compensate", *arguments).refused("does not tell how the 10 projector pixels lie")
+    outcome = program("compensate", *arguments, "--grid", "2x5", "--camera-grid", "4x6")
+    (entry,) = outcome.json["pictures"]
+    pattern = images.read(tmp_path / "out" / entry["pattern"]["exr"])
+    np.testing.assert_allclose(pattern.ravel(), np.linspace(0.2, 0.8, 10), atol=2e-3)
+    assert entry["limited"] == entry["channels"]
+    assert program("compensate", *arguments[:-1], "--grid", "2x5", "--camera-grid", "4x6").code == 0
+
+
+def test_the_largest_gain(program: Program, transport: Path, picture: Path, tmp_path: Path) -> None:
+    common = ["compensate", transport, picture, "--out", tmp_path / "out", "--gain", "auto", "--json"]
+    (exact,) = program(*common).json["pictures"]
+    assert exact["clipped"] == 0
+    assert exact["limited"] == []
+    assert images.read(tmp_path / "out" / "sky_pattern.exr").max() == pytest.approx(1.0, rel=1e-4)
+    outcome = program(*common, "--loss", "0.05")
+    (more,) = outcome.json["pictures"]
+    assert outcome.json["options"]["gain"] == "auto"
+    assert outcome.json["options"]["loss"] == 0.05
+    assert more["gain"] > exact["gain"]
+    assert more["error"] == pytest.approx(0.05, rel=0.05)
+    assert more["clipped"] > 0
+    assert program(*common[:-1]).out.split("\n")[1].split()[3] == f"{exact['gain']:.4g}"
+
+
+def test_what_is_out_of_reach_is_drawn(
+    program: Program, transport: Path, picture: Path, tmp_path: Path
+) -> None:
+    desired = np.full((5, 10), 0.3, np.float32)
+    desired[2, 3] = 5.0
+    images.write(tmp_path / "spot.exr", desired)
+    weights = np.ones((5, 10), np.float32)
+    arguments = ["compensate", transport, tmp_path / "spot.exr", "--out", tmp_path / "out", "--json"]
+    (entry,) = program(*arguments).json["pictures"]
+    missing = images.read(tmp_path / "out" / "spot_out_of_reach.exr")
+    assert missing[2, 3] > 1.0
+    assert images.read(tmp_path / "out" / entry["out_of_reach"]["png"])[2, 3].min() > 0.9
+    assert entry["clipped"] > 0
+    assert 0 < entry["gap"] <= 0.01
+    weights[2, 3] = 0.0
+    images.write(tmp_path / "weights.exr", weights)
+    (told,) = program(*arguments, "--weights", tmp_path / "weights.exr").json["pictures"]
+    assert told["error"] < 0.5 * entry["error"]
 
 
 def test_out_that_is_a_file_is_refused(

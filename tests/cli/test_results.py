@@ -118,8 +118,8 @@ def test_reports_tell_every_option(program: Program, transport: Path, picture: P
     assert told["separate"]["bounces"] == 4
 
 
-@pytest.mark.parametrize("command", ["compensate", "separate", "analyze"])
-def test_rectangular_transport_is_only_for_relight(
+@pytest.mark.parametrize("command", ["separate", "analyze"])
+def test_rectangular_transport_is_refused_where_S_is_needed(
     program: Program, picture: Path, tmp_path: Path, command: str
 ) -> None:
     path = tmp_path / "T.npy"
@@ -127,7 +127,7 @@ def test_rectangular_transport_is_only_for_relight(
     arguments = [path] if command == "analyze" else [path, picture, "--out", tmp_path / "out"]
     for grid in ([], ["--grid", "4x8"]):
         outcome = program(command, *arguments, *grid)
-        outcome.refused("T is 40 x 32; only relight can use it")
+        outcome.refused("T is 40 x 32; only compensate and relight can use it")
         assert "--camera-grid" not in outcome.err
 
 

@@ -53,3 +53,19 @@ def test_numbers_beyond_float32_are_refused_instead_of_made_infinite(device, val
 def test_infinite_and_tiny_numbers_pass(device):
     values = np.array([np.inf, -np.inf, np.nan, 1e-45, 3.4e38])
     np.testing.assert_array_equal(device.upload(values).get(), values.astype(np.float32))
+
+
+@pytest.mark.parametrize("tail", [(), (3,)])
+def test_rows_are_copied_out_and_in(device, tail):
+    values = np.arange(7 * (3 if tail else 1), dtype=np.float32).reshape(7, *tail)
+    x = device.upload(values)
+    part = x.rows(2, 3)
+    np.testing.assert_array_equal(part.get(), values[2:5])
+    assert x.set_rows(4, part) is x
+    values[4:7] = values[2:5].copy()
+    np.testing.assert_array_equal(x.get(), values)
+    assert x.rows(7, 0).shape == (0, *tail)
+    with pytest.raises(InputError, match="rows 5 to 8 are not among 7"):
+        x.rows(5, 3)
+    with pytest.raises(InputError, match="rows 5 on of an array of shape"):
+        x.set_rows(5, part)

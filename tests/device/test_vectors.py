@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ltcl.device import vectors
+from ltcl.device import Array, vectors
 from ltcl.errors import InputError
 from tests import gallery, reference
 from tests.operators.helpers import close, same_bits
@@ -37,6 +37,7 @@ def test_elementwise_kernels_meet_their_twins(device, shape):
     close(vectors.axpy(a, X, Y.copy()).get(), reference.vector_axpby(a, x, 1, y), error)
     d = gallery.vectors(shape[0], None, 3)
     close(vectors.scale_rows(device.upload(d), X, out).get(), reference.vector_scale_rows(d, x), error)
+    close(vectors.multiply(X, Y, out).get(), np.float64(x) * y, reference.gamma(1) * np.abs(x * y))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -107,6 +108,36 @@ def test_a_long_sum_of_equal_numbers_does_not_lose_its_tail(device):
     assert vectors.dot(ones, ones).tolist() == [
         25.0 * n
     ]  # exact: all partial sums are small integers times 25
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_many_dots_wait_once(device, shape, monkeypatch):
+    x, y, X, Y = operands(device, shape)
+    reads = []
+    read = Array.get
+    monkeypatch.setattr(Array, "get", lambda self: reads.append(self) or read(self))
+    found = vectors.dots([X, Y, X], Y)
+    assert len(reads) == 1
+    assert found.shape == (3, X.columns)
+    for one, other in zip(found, (x, y, x), strict=True):
+        close(one, reference.vector_dot(other, y), reference.dot_error(other, y))
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (5000, 3)])
+@pytest.mark.parametrize("last", [0.7, np.nan, np.inf])
+def test_the_best_iterate_is_kept_without_the_host(device, shape, last):
+    """Rows are residuals of iterates in turn; NaN and infinity are never the best, nor what follows them."""
+    x, y, X, Y = operands(device, shape)
+    k = X.columns
+    weights = gallery.vectors(k, None, 4) ** 2 + 0.1
+    rows = np.array([4.0, 2.0, 2.0, 3.0, 1.0, last, 0.5])[:, None] * np.ones(k)
+    rows[5, 1:] = 1.0  # one column is enough
+    squares = device.upload(rows)
+    for slot in range(len(rows)):
+        for lowest in (np.inf, 3.0 * np.max(weights), 0.0):
+            best = vectors.keep(device.upload(weights), squares, slot, lowest, X, Y.copy())
+            kept = reference.vector_keep(weights, rows, slot, lowest, x, y)
+            same_bits(best.get(), np.asarray(kept, np.float32))
 
 
 def test_nan_and_infinity_come_through(device):

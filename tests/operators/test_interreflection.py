@@ -71,3 +71,15 @@ def test_channels_of_another_pattern_keep_their_own(device):
     sparse = [scipy.sparse.csr_array(transport(0, density)) for density in (0.2, 0.4)]
     red, green = (csr(S) for S in interreflections(sparse, F[:2], device))
     assert red.pattern is not green.pattern
+
+
+def test_it_brings_the_weights_that_make_it_self_adjoint(device):
+    """Of a symmetric T: <S x, y> = <x, S y> with weights 1 / F; of a masked one nothing is known."""
+    T = [transport(c) + transport(c).T for c in range(3)]
+    for S, f, t in zip(interreflections(T, F, device), F, T, strict=True):
+        assert S.weights is not None
+        np.testing.assert_allclose(S.weights, 1.0 / f)
+        weighted = np.diag(1.0 / f) @ t @ np.diag(1.0 / f)
+        np.testing.assert_allclose(S.weights[:, None] * S.to_dense(), weighted, rtol=1e-5)
+        np.testing.assert_allclose(weighted, weighted.T, rtol=1e-12)
+    assert all(S.weights is None for S in interreflections(T, DARK, device))

@@ -114,7 +114,7 @@ def test_arrays_are_read_only_and_shared(corner: Scene) -> None:
         ({"grid": (5, 14)}, "walls are 3; they must divide the 14 columns"),
         ({"grid": (5, 0)}, "grid is "),
         ({"grid": (4, 15)}, r"form_factors has shape \(75, 75\); it must be \(60, 60\)"),
-        ({"walls": ()}, "walls are 0"),
+        ({"walls": ()}, "walls are 0; a scene needs at least one"),
         ({"albedo": np.zeros((2, 75))}, r"albedo has shape \(2, 75\); it must be \(1, 75\) or \(3, 75\)"),
         ({"albedo": np.ones((1, 75))}, r"albedo has 75 value\(s\) outside \[0, 1\)"),
         ({"albedo": np.full((1, 75), np.nan)}, "albedo has 75 NaN"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ltcl.errors import InputError
+from ltcl.scenes import trihedral
 from ltcl.scenes.viewer import Viewer, draw, frame, read
 from ltcl.scenes.walls import Wall
 
@@ -96,3 +97,55 @@ def test_viewer_must_see_a_wall_in_front(viewer: Viewer) -> None:
 def test_viewer_must_look_sideways() -> None:
     with pytest.raises(InputError, match="straight up or down"):
         Viewer(eye=(1, 1, 3), target=(1, 1, 0))
+
+
+# Half as high and wide as it, in front of the middle of the screen: they look twice as large from the eye.
+CARD = Wall("card", corner=(0.375, 0.5, 0.625), right=(0.25, 0, 0), down=(0, 0, -0.25))
+
+
+@pytest.mark.parametrize("order", [(SCREEN, CARD), (CARD, SCREEN)])
+def test_the_nearest_wall_shows(order: tuple[Wall, Wall]) -> None:
+    """Whatever the order of the walls: the card covers half of the screen's width."""
+    values = {SCREEN: 1.0, CARD: 5.0}
+    picture = np.concatenate([np.full((4, 4), values[wall]) for wall in order], axis=1)
+    image = draw(EYE, order, picture, size=106, supersample=2)
+    assert image[53, 53] == 5
+    assert (image == 5).sum() == pytest.approx(50**2, rel=0.05)
+    assert (image == 1).sum() == pytest.approx(100**2 - 50**2, rel=0.05)
+
+
+def test_screens_show_black_and_hide() -> None:
+    image = draw(EYE, [SCREEN], np.ones((4, 4)), size=106, supersample=1, screens=[CARD])
+    assert (image[30:76, 30:76] == 0).all()
+    assert image[10, 10] == 1
+
+
+@pytest.mark.parametrize("screen", [True, False])
+def test_hidden_patches_read_nothing_and_partly_hidden_ones_what_shows(screen: bool) -> None:
+    image = np.zeros((106, 106), np.float32)
+    image[:, 53:] = 1
+    walls, screens = ([SCREEN], [CARD]) if screen else ([SCREEN, CARD], [])
+    picture = read(EYE, walls, image, (8, 8 * len(walls)), screens)
+    wall = picture[:, :8]
+    assert not wall[2:6, 2:6].any()  # behind the card
+    assert wall[:2, 4:] == pytest.approx(1, abs=0.01)
+    assert wall[2:6, 6:] == pytest.approx(1)
+    if not screen:
+        assert picture[:, 12:] == pytest.approx(1, abs=0.01)
+    coarse = read(EYE, [SCREEN], image, (2, 2), [CARD])  # a quarter of each patch is hidden
+    assert coarse == pytest.approx(np.array([[0, 1], [0, 1]]), abs=0.03)
+
+
+def test_colours_are_hidden_as_well() -> None:
+    picture = read(EYE, [SCREEN], np.ones((50, 50, 3), np.float32), (4, 4), [CARD])
+    assert picture.shape == (4, 4, 3)
+    assert not picture[1:3, 1:3].any()
+    assert picture[0] == pytest.approx(1)
+
+
+def test_seams_of_slanted_walls_show_no_cracks() -> None:
+    """Points on a seam belong to one of its walls, whatever rounding says."""
+    scene = trihedral(2, angle=60)
+    image = scene.view(np.ones(scene.grid), size=300)
+    inside = image[60:240, 100:200]
+    assert inside.min() == 1

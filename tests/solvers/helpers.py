@@ -12,6 +12,7 @@ METHODS = tuple(method for method in ALL if method not in _SAMPLED)  # those tha
 READS_ROWS = (
     "gauss_seidel",
     "sor",
+    "block_gauss_seidel",
     "southwell",
 )  # methods that refuse operators whose entries cannot be read
 

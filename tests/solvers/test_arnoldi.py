@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ltcl.device import Array
 from ltcl.operators import as_operator
 from ltcl.solvers import arnoldi
 
@@ -32,3 +33,13 @@ def test_a_complete_space_and_a_resting_column_get_no_direction(device):
     h = arnoldi.extend(basis, S.apply(basis[0]), np.array([True, False, True]))
     np.testing.assert_allclose(h, [[2.0, 0.0], [0.0, 0.0], [1.36, 0.48]], rtol=1e-5)
     np.testing.assert_allclose(basis[1].get(), [[0, 0, 0.8], [0, 0, -0.6], [0, 0, 0]], atol=1e-5)
+
+
+def test_a_step_waits_for_the_device_twice(device, monkeypatch):
+    S = as_operator(np.eye(N) + random.normal(size=(N, N)) / 10, device)
+    reads, read = [], Array.get
+    monkeypatch.setattr(Array, "get", lambda array: reads.append(array) or read(array))
+    basis = [device.upload(np.eye(N)[:, :2])]
+    for _ in range(5):
+        arnoldi.extend(basis, S.apply(basis[-1]), np.ones(2, bool))
+    assert len(reads) == 10

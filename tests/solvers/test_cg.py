@@ -142,3 +142,19 @@ def test_normal_equations_of_a_singular_system_break_down(device):
 def test_unusable_options_are_refused(options, error, says):
     with pytest.raises(error, match=says):
         ltcl.solve(np.eye(3), np.ones(3), "cg", **options)
+
+
+def test_a_transport_brings_its_weights(device):
+    """A box of walls from dark to white: self-adjoint with 1 / F, and far from it without."""
+    scene = ltcl.scenes.box(6, sides=5, albedo=(0.1, 0.9, 0.3, 0.95, 0.6))
+    T = scene.transport(device=device)
+    (S,) = T.systems
+    dense = S.to_dense()
+    assert S.weights is not None
+    np.testing.assert_allclose(S.weights, 1.0 / T.first_bounce)
+    b = dense @ random.uniform(size=T.shape[1])
+    s = ltcl.solve(S, b, "cg", rtol=1e-4)
+    assert residual(dense, s.x, b) <= 1e-4 * (1 + 1e-2)
+    np.testing.assert_array_equal(ltcl.solve(S, b, "cg", rtol=1e-4, weights=1.0 / T.first_bounce).x, s.x)
+    plain = ltcl.solve(S, b, "cg", rtol=1e-4, weights=np.ones(T.shape[1]), throw=False)
+    assert not plain.converged or plain.products > s.products

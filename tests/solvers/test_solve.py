@@ -75,6 +75,14 @@ def test_units_of_light_do_not_matter(device, method, scale):
     assert residual(SCENE.S, s.x.astype(np.float64) / scale, b / scale) <= 1e-4 * (1 + 1e-3)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_solution_beyond_float32_is_not_lost(device, method):
+    b = np.array([3e38, 2e38])
+    s = ltcl.solve(as_operator(np.diag([0.25, 0.5]), device), b, method, rtol=1e-4)
+    assert s.x.dtype == np.float64
+    np.testing.assert_allclose(s.x, b * (4.0, 2.0), rtol=1e-3)
+
+
 @pytest.mark.parametrize("scale", [1e-20, 1.0, 1e20])
 @pytest.mark.parametrize("method", METHODS)
 def test_atol_is_absolute(device, method, scale):

@@ -9,7 +9,7 @@ import pytest
 import ltcl
 from ltcl.errors import ConvergenceError, LtclError
 from ltcl.operators import Dense, IdentityPlus, as_operator
-from ltcl.solvers import Status
+from ltcl.solvers import Solution, Status
 from tests.problems import enclosure, lambertian, residual
 from tests.solvers.helpers import ITERATIVE
 
@@ -81,3 +81,32 @@ def test_an_error_in_the_callback_reaches_the_user(device, method):
 
     with pytest.raises(KeyboardInterrupt):
         ltcl.solve(np.eye(4) + 0.1, np.ones(4), method, callback=stop)
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_overflow_midway_leaves_the_best_iterate(device, method):
+    """The second step multiplies the first by 3.3e38: the residual falls to a half, then leaves float32."""
+    S = np.eye(8)
+    S[1, 2], S[0, 1], S[4, 5] = 0.9, 3.3e38, 0.2
+    b = 1.9 * np.eye(8)[2] + 1.5 * np.eye(8)[5]
+    with pytest.raises(ConvergenceError) as caught:
+        ltcl.solve(as_operator(S, device), b, method)
+    s = caught.value.solution
+    assert s.status in (Status.DIVERGED, Status.STAGNATED)  # damped by 1e-38, nothing moves at all
+    assert s.status is Status.DIVERGED or method == "richardson"
+    assert np.isfinite(s.x).all()
+    assert residual(S, s.x, b) == pytest.approx(s.residual, rel=1e-5)
+    if method in ("jacobi", "neumann", "gauss_seidel", "sor"):
+        assert s.residual < 0.9
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("status", [status for status in Status if status is not Status.CONVERGED])
+def test_every_failure_says_what_to_try(status):
+    s = Solution(np.zeros(3), status, 3, 4, (1.0, 0.5, 0.7), 0.0, "jacobi")
+    text = str(s)
+    assert text.startswith(
+        f"jacobi: {status.name.lower()} after 3 iterations, 4 products, relative residual 0.5"
+    )
+    assert any(word in text for word in ("try ", "check ", "loosen "))
+    assert "\n" not in text

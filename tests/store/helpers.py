@@ -37,6 +37,9 @@ def same(a: Record, b: Record) -> None:
     assert (a.first_bounce is None) == (b.first_bounce is None)
     if a.first_bounce is not None:
         np.testing.assert_array_equal(a.first_bounce, b.first_bounce)
+    assert (a.mixing is None) == (b.mixing is None)
+    if a.mixing is not None:
+        np.testing.assert_array_equal(a.mixing, b.mixing)
 
 
 def same_matrix(x: Matrix, y: Matrix) -> None:

@@ -35,6 +35,46 @@ def test_npz_keeps_everything(tmp_path, matrix, bounce):
         same_matrix(a, b)
 
 
+MIXING = np.array([[1.0, 0.2, 0.0], [0.1, 0.9, 0.0], [0.0, -0.1, 0.8]])
+
+
+@pytest.mark.parametrize("matrix", [COLOUR, [sparse(seed=seed) for seed in range(3)]])
+def test_npz_keeps_how_colours_mix(tmp_path, matrix, device):
+    T = Transport(matrix, grid=(3, 4), mixing=MIXING, device=device)
+    store.save(tmp_path / "T.npz", T)
+    result = store.load(tmp_path / "T.npz", device=device)
+    np.testing.assert_array_equal(result.mixing, MIXING)
+    pattern = np.random.default_rng(1).random((3, 4, 3))
+    np.testing.assert_array_equal(result @ pattern, T @ pattern)
+    for suffix in (".npy", ".mtx"):
+        with pytest.raises(FileError, match=f"T{suffix}: {suffix} does not keep how the projector's colours"):
+            store.save(tmp_path / f"T{suffix}", T)
+        assert not (tmp_path / f"T{suffix}").exists()
+
+
+@pytest.mark.parametrize(
+    ("mixing", "T", "says"),
+    [
+        (np.eye(2), COLOUR, r"mixing has shape \(2, 2\)"),
+        (np.ones((3, 3)), COLOUR, "mixing has the condition number"),
+        (np.full((3, 3), np.nan), COLOUR, "mixing has 9 NaN"),
+        (MIXING, dense(), "mixing is given, but T has one channel"),
+        (np.full((3, 3), "a"), COLOUR, "array 'mixing' holds <U1"),
+    ],
+)
+def test_a_bad_mixing_in_a_file_is_refused(tmp_path, mixing, T, says):
+    np.savez(tmp_path / "T.npz", T=np.array(T), grid=(3, 4), mixing=mixing)
+    with pytest.raises(FileError, match=says) as caught:
+        store.load(tmp_path / "T.npz")
+    assert str(caught.value).startswith(f"{tmp_path / 'T.npz'}: ")
+
+
+def test_blocks_between_colours_are_not_saved(tmp_path):
+    T = Transport([[dense(seed=3 * c + d) for d in range(3)] for c in range(3)], grid=(3, 4))
+    with pytest.raises(InputTypeError, match="T has 3 x 3 blocks between colours; only one matrix or three"):
+        store.save(tmp_path / "T.npz", T)
+
+
 def test_rectangular_transports_keep_both_grids(tmp_path):
     T = Transport(dense(20, 12), grid=(3, 4), camera_grid=(4, 5))
     store.save(tmp_path / "T.npz", T)

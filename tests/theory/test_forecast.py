@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.polynomial.chebyshev import Chebyshev
 
+import ltcl
 from ltcl import theory
 from ltcl.operators import Dense, IdentityPlus
 from ltcl.theory import SpectralRadius
@@ -90,3 +91,41 @@ def test_richardson_takes_the_first_power_below_the_tolerance(lower, upper, rtol
     assert factor**k <= rtol * (1 + 1e-9)
     assert k == 1 or factor ** (k - 1) > rtol * (1 - 1e-9)
     assert theory.chebyshev_products(lower, upper, rtol) <= k
+
+
+@pytest.mark.parametrize("rtol", [1e-2, 1e-4])
+@pytest.mark.parametrize("rho", [0.8, 4.0, 9.0])
+@pytest.mark.parametrize("method", ["cg", "gmres", "bicgstab"])
+def test_krylov_methods_take_no_more_than_foreseen(device, method, rho, rtol):
+    """With the true spectrum of a symmetric S the bound is strict; least energy is not least residual."""
+    scene = enclosure(60, rho / (1 + rho))
+    S = IdentityPlus(Dense(device, scene.R))
+    eigenvalues = np.linalg.eigvalsh(scene.S)
+    radius = theory.spectral_radius(S.R, norms=S.R.norms())
+    spectrum = float(eigenvalues[0]), float(eigenvalues[-1])
+    found = theory.forecasts(S, radius, theory.free_bounds(S), rtol, spectrum)[method]
+    assert found.certificate == "ritz values"
+    s = ltcl.solve(S, np.random.default_rng(4).normal(size=60), method, rtol=rtol)
+    assert s.products <= found.products + (method == "cg")
+
+
+def test_what_nothing_foretells_is_said(device):
+    S = IdentityPlus(Dense(device, enclosure(40, 0.6).R))
+    radius = theory.spectral_radius(S.R)
+    found = theory.forecasts(S, radius, theory.free_bounds(S), 1e-2, spectrum=None)
+    for name in ("southwell", "cg", "gmres", "bicgstab"):
+        assert math.isnan(found[name].products)
+        assert found[name].certificate == "none"
+    lopsided = theory.forecasts(S, radius, theory.free_bounds(S), 1e-2, (0.5, 3.0), self_adjoint=False)
+    assert math.isnan(lopsided["cg"].products)
+    assert math.isfinite(lopsided["gmres"].products)
+    assert found["sor"] == found["gauss_seidel"]  # omega is 1
+
+
+def test_float32_confirms_no_tolerance_below_its_rounding(device):
+    S = IdentityPlus(Dense(device, enclosure(40, 0.6).R))
+    found = theory.forecasts(S, theory.spectral_radius(S.R), theory.free_bounds(S), 1e-8, (0.5, 3.0))
+    assert math.isinf(found["jacobi"].products)  # rho is 1.5
+    for name in set(found) - {"jacobi", "neumann", "southwell"}:
+        assert math.isnan(found[name].products)
+        assert found[name].certificate == "none: float32 cannot confirm this rtol"

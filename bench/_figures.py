@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the benches of the paper's figures share: claims that are checked, and the page they are drawn on.
+
+A claim of the paper is measured on every run, and one that fails ends the bench with exit status 1. Where
+exact transport disagrees with the paper the claim says why in `differs`; it must then not hold, so that
+the remark cannot outlive its reason.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from _harness import Options, record, write_json
+from ltcl import plots
+from ltcl.images import from_srgb, to_srgb
+from ltcl.plots.page import FAINT, GRID, PAPER, axes_at, figure_of, heading, label_at
+from ltcl.scenes import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Box = tuple[float, float, float, float]
+"""Left, top, width and height in pixels, from the top left corner of the page."""
+
+WIDTH, MARGIN = 1000, 30
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One sentence about a figure, what was measured, and what it had to be.
+
+    `differs` is for a claim of the paper that exact measurement does not bear out: why it does not.
+    """
+
+    text: str
+    measured: str
+    wanted: str
+    holds: bool
+    differs: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "holds", bool(self.holds))  # comparisons of arrays give NumPy's own
+
+    @property
+    def passed(self) -> bool:
+        """Whether the measurement is as expected: the claim holds, or is known to differ and does."""
+        return self.holds != bool(self.differs)
+
+    @property
+    def verdict(self) -> str:
+        """What the table says."""
+        if self.differs:
+            return f"DIFFERS: {self.differs}" if self.passed else "FAILS: holds, though it is said to differ"
+        return "holds" if self.passed else "FAILS"
+
+
+def conclude(
+    given: Options,
+    title: str,
+    claims: Sequence[Claim],
+    facts: dict[str, Any],
+    draw: Callable[[], Figure],
+) -> None:
+    """Print the claims, write what the command line asked for, and exit with 1 if one failed.
+
+    Raises
+    ------
+    SystemExit
+        A claim is not as expected; JSON and picture are written all the same.
+    """
+    console = Console(width=150)
+    console.print(f"[bold]{title}[/]\n{given.device.name}, {given.device.driver}")
+    for name, value in facts.items():
+        console.print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
+    table = Table("claim", "measured", "wanted", "verdict", show_lines=True)
+    for claim in claims:
+        table.add_row(claim.text, claim.measured, claim.wanted, claim.verdict)
+    console.print(table)
+    if given.json is not None:
+        listed = [{**dataclasses.asdict(claim), "verdict": claim.verdict} for claim in claims]
+        write_json(given.json, record(given, title, facts) | {"claims": listed})
+    if given.plot is not None:
+        given.plot.parent.mkdir(parents=True, exist_ok=True)
+        plots.save(draw(), given.plot)
+    if not all(claim.passed for claim in claims):
+        raise SystemExit(1)
+
+
+def page(height: int, title: str, *subtitle: str) -> Figure:
+    """A page with a title and a few lines below it; 80 pixels, and 22 more for each further line."""
+    figure = figure_of(WIDTH, height)
+    heading(figure, MARGIN, 20, title, 17)
+    for place, line in enumerate(subtitle):
+        label_at(figure, MARGIN, 52 + 22 * place, line, size=11, color=FAINT)
+    return figure
+
+
+def columns(count: int, gap: int = 14) -> tuple[list[float], float]:
+    """Left edges and common width of so many pictures side by side."""
+    width = (WIDTH - 2 * MARGIN - (count - 1) * gap) / count
+    return [MARGIN + place * (width + gap) for place in range(count)], width
+
+
+def picture(
+    figure: Figure, place: tuple[float, float, float], image: np.ndarray, label: str, note: str = ""
+) -> float:
+    """Draw an image (h, w, 3), sRGB in [0, 1], with a label above and a note below; return its height.
+
+    `place` is left, top and width in pixels; the label takes 20 pixels above the top.
+    """
+    left, top, width = place
+    height = width * image.shape[0] / image.shape[1]
+    label_at(figure, left, top - 6, label, size=10.5, fontweight="bold", va="bottom")
+    axes = axes_at(figure, (left, top, width, height))
+    axes.imshow(image, interpolation="antialiased", aspect="auto")
+    axes.axis("off")
+    label_at(figure, left, top + height + 5, note, size=9.5, color=FAINT, linespacing=1.35)
+    return height
+
+
+def graph(figure: Figure, box: Box, title: str, xlabel: str, ylabel: str, scale: str = "log") -> Axes:
+    """Axes for curves, in the colours of the page; the title stands 26 pixels above the box."""
+    axes = axes_at(figure, box)
+    axes.set_yscale(scale)
+    label_at(figure, box[0], box[1] - 8, title, size=11, fontweight="bold", va="bottom")
+    axes.set_facecolor(PAPER)
+    axes.grid(color=GRID, lw=1)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=FAINT, labelsize=9.5, length=0)
+    axes.minorticks_off()
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
+    axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
+    return axes
+
+
+def light(scene: Scene, values: np.ndarray, gain: float = 1.0, size: int = 400) -> np.ndarray:
+    """Linear light on the walls as the viewer sees it, sRGB on the page's colour; negative light is black."""
+    return _on_page(scene, to_srgb(np.clip(gain * _coloured(scene.view(values, size)), 0, 1)), size)
+
+
+def signed(scene: Scene, values: np.ndarray, gain: float = 1.0, size: int = 400) -> np.ndarray:
+    """Positive and negative light around neutral grey, which is 0: each colour for itself."""
+    return _on_page(scene, np.clip(0.5 + 0.5 * gain * _coloured(scene.view(values, size)), 0, 1), size)
+
+
+def _coloured(image: np.ndarray) -> np.ndarray:
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=-1)
+
+
+def _on_page(scene: Scene, image: np.ndarray, size: int) -> np.ndarray:
+    coverage = scene.view(np.ones(scene.grid), size)[..., None]
+    paper = from_srgb(np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)]))
+    return np.clip(to_srgb(from_srgb(image) * coverage + paper * (1 - coverage)), 0, 1)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One bounce of light between 131424 patches of a closed box, form factors computed on the way, beside NumPy.
+
+NumPy computes the same sums in float32, a few rows at a time: centre to centre, the close pairs again at
+eight pairs of points, near pairs by SciPy from the same sparse corrections. It takes minutes for all rows,
+so it does a sample of them, is checked against ours there, and pairs a second are compared. Every row of F
+sums to 1 in a closed box: that is how far off the products are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from _harness import Options, Row, options, report, seconds
+from ltcl.scenes import FormFactor, Patches, box, cut
+from ltcl.scenes.geometry import Frame
+from ltcl.scenes.near import squared_size
+
+TARGETS = {"numpy": 20.0, "side": 2.0}
+ACCURACY = 1e-4
+FAR = 64.0  # sizes of a pair, as ltcl.scenes.form_factor takes it
+
+
+class Peer:
+    """The same sums in NumPy, for some rows."""
+
+    def __init__(self, patches: Patches, rows: np.ndarray) -> None:
+        placed = Frame.of(patches).patches(patches)
+        parts = (placed.centre, placed.normal, placed.right, placed.down)
+        self.centre, self.normal, self.right, self.down = (part.astype(np.float32) for part in parts)
+        self.area, self.reach = placed.area.astype(np.float32), FAR**2 * squared_size(placed)
+        self.rows = rows
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Rows of F x, (rows,), without the corrections of near pairs."""
+        return np.array([self._row(i) @ (self.area * x) for i in self.rows])
+
+    def _row(self, i: int) -> np.ndarray:
+        d = self.centre - self.centre[i]
+        values = self._exchange(d, self.normal[i], self.normal)
+        close = np.flatnonzero(np.einsum("nc,nc->n", d, d) < self.reach + self.reach[i])
+        close = close[np.abs(self.normal[close] - self.normal[i]).max(axis=1) > 0]  # not of this wall
+        angle, total = np.arange(8) * np.pi / 4, np.zeros(len(close), np.float32)
+        place = (np.sqrt(1 / 6) * np.stack([np.cos(angle), np.sin(angle)], axis=1)).astype(np.float32)
+        for k in range(8):
+            (a, b), (u, v) = place[k], place[3 * k % 8]
+            end = self.centre[close] + u * self.right[close] + v * self.down[close]
+            start = self.centre[i] + a * self.right[i] + b * self.down[i]
+            total += self._exchange(end - start, self.normal[i], self.normal[close])
+        values[close] = total / 8
+        return values
+
+    def _exchange(self, d: np.ndarray, normal: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        here, there = d @ normal, -np.einsum("nc,nc->n", d, normals)
+        r2 = np.einsum("nc,nc->n", d, d)
+        return np.where((here > 1e-6) & (there > 1e-6), here * there, 0) / (np.float32(np.pi) * r2**2 + 1e-30)
+
+
+def actions(
+    given: Options, A: FormFactor, patches: Patches, rows: np.ndarray
+) -> dict[str, Callable[[], object]]:
+    """Ours with 1 and 3 right-hand sides, and NumPy on a sample of the rows, checked against each other."""
+    peer, rng = Peer(patches, rows), np.random.default_rng(1)
+    x = rng.random((len(patches), 3), dtype=np.float32)
+    one, three = (given.device.upload(np.ascontiguousarray(part)) for part in (x[:, 0], x))
+    outs = [A.apply(one), A.apply(three)]
+    correction = given.device.empty(len(patches))
+    A._near._product(one, correction, 1.0, None, False)
+    if not np.allclose(outs[0].get()[rows], peer(x[:, 0]) + correction.get()[rows], rtol=1e-4):
+        raise SystemExit("the product and NumPy's are not the same")
+
+    def ours(x, out) -> None:
+        A.apply(x, out)
+        given.device.finish()
+
+    return {
+        "ours 1": lambda: ours(one, outs[0]),
+        "ours 3": lambda: ours(three, outs[1]),
+        "numpy": lambda: peer(x[:, 0]),
+    }
+
+
+def main() -> None:
+    """Run the bench."""
+    given = options(__doc__ or "")
+    n = 12 if given.smoke else 148
+    patches = cut(box(1).walls, n)
+    count = len(patches)
+    rows = np.random.default_rng(0).choice(count, 16 if given.smoke else 64, replace=False)
+    A = FormFactor(patches, device=given.device)
+    times = seconds(actions(given, A, patches, rows), repeats=3 if given.smoke else 1)
+    rate, alone, three = (
+        pairs / times[name] / 1e9
+        for name, pairs in (("numpy", len(rows) * count), ("ours 1", count**2), ("ours 3", 3 * count**2))
+    )
+    off = float(np.abs(A.row_sums() - 1).max())
+    table = [
+        Row("product, k = 1", "NumPy", rate, alone, "Gpairs/s", alone / rate, TARGETS["numpy"]),
+        Row("product, k = 3", "k = 1", alone, three, "Gpairs/s", three / alone, TARGETS["side"]),
+        Row("row sums off 1", "what is promised", ACCURACY, off, "", ACCURACY / off, 1.0),
+    ]
+    facts = {
+        "patches": count,
+        "seconds of one product": times["ours 1"],
+        "MB stored": A.nbytes / 1e6,
+        "MB of a float32 matrix": 4 * count**2 / 1e6,
+    }
+    report(given, "Form factors computed on the way", table, facts)
+
+
+if __name__ == "__main__":
+    main()

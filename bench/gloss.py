@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How good the single-view approximation is: bounces of glossy scenes as one camera and one projector tell.
+
+T = P S F Q (eq. 28) is taken for S' F', with F' = P F Q diagonal and S' = T F'^-1, and bounce k of a picture
+for (I - S'^-1)^k F' l_in, where the light field has P A^k F Q l_in (eq. 29). Those are computed, and what
+`ltcl.separate` finds is compared with them, for a dihedral of which the left wall is lit, both walls or the
+other one alone being glossy. Bounces are found with a direct solver, so that nothing else is measured.
+Also: what T itself says about it (reciprocity, and negative light, which no bounce has), how fast the plain
+series l <- l_out - R l settles (the paper: about 20 iterations with gloss), and compensation, which is exact.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import _figures as figures
+import ltcl
+from _figures import Claim
+from _harness import Options, options
+from ltcl.plots.page import COLOURS, FAINT, INK
+from ltcl.scenes import GlossyScene, dihedral, glossy
+from ltcl.separation import LAMBERTIAN
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ALBEDO, PROJECTOR = 0.5, (2.4, 1.2, 1.2)
+ROOMS = {"both walls": (1.0, 1.0), "unlit wall": (0.0, 1.0)}  # share of the gloss on each wall
+BOUNCES, STEPS = 3, 100
+MODERATE = 0.2  # share of gloss up to which the paper's word is taken to be meant
+SHADES: dict[float, str] = {5: COLOURS["direct"], 20: COLOURS["chebyshev"], 60: COLOURS["jacobi"]}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One scene, and what was found; lists are for the direct light and the bounces after it."""
+
+    room: str
+    exponent: float
+    gloss: float
+    off: list[float]  # relative to the true bounce, F = P F Q
+    off_picture: list[float]  # the same errors relative to the picture
+    off_diagonal: list[float]  # relative to the true bounce, F = diag(T)
+    negative: list[float]  # share of negative light
+    defect: float  # of reciprocity
+    warned: bool
+    radius: float  # spectral radius of R
+    iterations: int | None  # of the plain series to 1 % of the direct light; None: does not settle
+    compensation: float  # ||T p - desired|| / ||desired||
+    clipped: float
+
+    @property
+    def name(self) -> str:
+        """For the report."""
+        return f"{self.room}, exponent {self.exponent:g}, gloss {self.gloss:g}"
+
+
+def norms(light: np.ndarray) -> np.ndarray:
+    """Of pictures (k, h, w)."""
+    return np.linalg.norm(light.reshape(len(light), -1), axis=1)
+
+
+def separated(T: ltcl.Transport, picture: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Direct light and bounces, (BOUNCES + 1, h, w), and whether section 8.4 was warned of."""
+    found = ltcl.separate(T, picture, BOUNCES, method="direct")
+    return np.concatenate([found.direct[None], found.bounces]), bool(found.warning)
+
+
+def settles(T: np.ndarray, F: np.ndarray, l_in: np.ndarray) -> tuple[float, int | None]:
+    """Spectral radius of R, and iterations of eq. 20 until the direct light is right to 1 %."""
+    R, l_out, l_d = T / F - np.eye(len(F)), T @ l_in, F * l_in
+    l = np.zeros_like(l_d)
+    iterations = None
+    for step in range(1, STEPS + 1):
+        l = l_out - R @ l
+        if np.linalg.norm(l - l_d) <= 0.01 * np.linalg.norm(l_d):
+            iterations = step
+            break
+    return float(np.abs(np.linalg.eigvals(R)).max()), iterations
+
+
+def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device: ltcl.Device) -> Case:
+    """Everything about one scene."""
+    n, F = scene.grid[0], scene.first_bounce
+    pattern = np.zeros(scene.grid)
+    pattern[:, :n] = 1.0
+    truth = scene.bounces(pattern, BOUNCES)
+    (matrix,) = scene.matrices()
+    T = ltcl.Transport(matrix, scene.grid, F, device=device)
+    picture = T @ pattern
+    found, warned = separated(T, picture)
+    by_diagonal, _ = separated(ltcl.Transport(matrix, scene.grid, device=device), picture)
+    desired = T @ np.random.default_rng(0).uniform(0.2, 0.8, scene.grid)
+    compensation = ltcl.compensate(T, desired, method="direct")
+    radius, iterations = settles(matrix, F, pattern.ravel())
+    return Case(
+        room=room,
+        exponent=exponent,
+        gloss=gloss,
+        off=_digits(norms(found - truth) / norms(truth)),
+        off_picture=_digits(norms(found - truth) / np.linalg.norm(picture)),
+        off_diagonal=_digits(norms(by_diagonal - truth) / norms(truth)),
+        negative=_digits(-np.minimum(found, 0).sum(axis=(1, 2)) / np.abs(found).sum(axis=(1, 2))),
+        defect=_digits(T.reciprocity_defect),
+        warned=warned,
+        radius=_digits(radius),
+        iterations=iterations,
+        compensation=_digits(compensation.error),
+        clipped=compensation.clipped,
+    )
+
+
+def _digits(values: Any) -> Any:
+    """Four digits of a number, or of each in an array, as JSON shows them."""
+    return [_digits(value) for value in values] if np.ndim(values) else float(f"{values:.4g}")
+
+
+def cases(given: Options) -> list[Case]:
+    """All scenes."""
+    n, directions = (4, 16) if given.smoke else (10, 64)
+    shares = (0.0, 0.1, 0.2, 0.4) if given.smoke else (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
+    found = []
+    for room, walls in ROOMS.items():
+        for exponent in (5, 20) if given.smoke else tuple(SHADES):
+            for gloss in shares:
+                scene = glossy(
+                    dihedral(1),
+                    n,
+                    ALBEDO,
+                    [gloss * share for share in walls],
+                    exponent,
+                    projector=PROJECTOR,
+                    directions=directions,
+                )
+                found.append(measure(scene, room, exponent, gloss, given.device))
+    return found
+
+
+def claims(found: Sequence[Case]) -> list[Claim]:
+    """What must hold, and what the paper says."""
+    matte = [case for case in found if case.gloss == 0]
+    shiny = [case for case in found if 0 < case.gloss <= MODERATE]
+    mild = [case for case in shiny if case.exponent <= 20]
+    later = sum(case.off[2] > case.off[1] for case in shiny)
+    wrong = [case for case in found if case.off[1] > 0.1]
+    told = sum(case.warned for case in wrong)
+    ratio = [case.negative[1] / case.off[1] for case in shiny]
+    return [
+        _below("without gloss all bounces are exact", max(max(case.off) for case in matte), 1e-4),
+        _below("the direct light is exact of any gloss, F = PFQ given", max(c.off[0] for c in found), 1e-3),
+        _below("compensation is exact of any gloss", max(case.compensation for case in found), 1e-4),
+        _below("none of it is clipped", max(case.clipped for case in found), 0.0),
+        _below(f"bounce 1 is about right at gloss {MODERATE:g}", max(c.off[1] for c in shiny), 0.3),
+        Claim(
+            "later bounces are no worse: specular effects decay (section 8.4)",
+            f"bounce 2 is worse in {later} of {len(shiny)} scenes of gloss up to {MODERATE:g}",
+            "none",
+            later == 0,
+            differs="(PAFQ)(PFQ)^-1, what the camera sees of a bounce, is squared; PA^2FQ is something else",
+        ),
+        Claim(
+            "the plain series needs about 20 iterations with gloss",
+            f"{min(_steps(mild))} to {max(_steps(mild))} at gloss up to {MODERATE:g}",
+            "at most 20",
+            max(_steps(mild)) <= 20,
+        ),
+        Claim(
+            f"a reciprocity defect above {LAMBERTIAN:g} warns where bounce 1 is off by more than 10%",
+            f"in {told} of {len(wrong)} scenes",
+            "all",
+            told == len(wrong),
+            differs="gloss is reciprocal itself; T as one camera sees it stays nearly so",
+        ),
+        Claim(
+            "negative light in bounce 1 tells how far it is off",
+            f"it is {min(ratio):.2f} to {max(ratio):.2f} times the error, at gloss up to {MODERATE:g}",
+            "0.5 to 1.5",
+            min(ratio) > 0.5 and max(ratio) < 1.5,
+        ),
+    ]
+
+
+def _below(text: str, value: float, most: float) -> Claim:
+    return Claim(text, f"{value:.2g}", f"at most {most:g}", value <= most)
+
+
+def _steps(some: Sequence[Case]) -> list[int]:
+    return [STEPS + 1 if case.iterations is None else case.iterations for case in some]
+
+
+def draw(found: Sequence[Case]) -> Figure:
+    """Errors of bounces 1 and 2 above; what T tells, and the plain series, below."""
+    figure = figures.page(
+        810,
+        "Glossy scenes: what one camera and one projector can tell",
+        "A dihedral of albedo 0.5, left wall lit. Solid: both walls glossy; dashed: only the unlit one.",
+        "Errors are those of separated bounces against $P A^k F Q$ of the full light field (eq. 29).",
+    )
+    size, (left, right), (above, below) = (410, 240), (80, 560), (150, 490)
+    for k, place in ((1, left), (2, right)):
+        axes = _graph(figure, (place, above, *size), f"Bounce {k} of the separation", "relative error")
+        _curves(axes, found, lambda case, k=k: case.off[k])
+        axes.set_ylim(3e-3, 30)
+        axes.axhline(1, color=FAINT, lw=1, ls=":")
+        axes.legend(frameon=False, labelcolor="linecolor", fontsize=9, loc="lower right")
+    title = "Reciprocity defect \u25cf, negative light of bounce 1 \u25bc"
+    axes = _graph(figure, (left, below, *size), title, "share", "linear")
+    axes.set_ylim(0, 0.4)
+    _curves(axes, found, lambda case: case.defect)
+    _curves(axes, found, lambda case: case.negative[1], marker="v", lw=1, alpha=0.7)
+    axes.axhline(LAMBERTIAN, color=INK, lw=1, ls=":")
+    axes.text(0.79, LAMBERTIAN, "warning", color=INK, fontsize=9, ha="right", va="bottom")
+    title = "Plain series: iterations to 1 % of the direct light"
+    axes = _graph(figure, (right, below, *size), title, "iterations", "linear")
+    _curves(axes, found, lambda case: np.nan if case.iterations is None else case.iterations)
+    axes.set_ylim(0, 30)
+    axes.axhline(20, color=INK, lw=1, ls=":")
+    axes.text(0.02, 20.4, "the paper's glossy scene", color=INK, fontsize=9)
+    axes.text(0.02, 28, "curves end where it diverges", color=FAINT, fontsize=9)
+    return figure
+
+
+def _graph(figure: Figure, box: figures.Box, title: str, ylabel: str, scale: str = "log") -> Axes:
+    axes = figures.graph(figure, box, title, "share of gloss", ylabel, scale)
+    axes.set_xlim(0, 0.8)
+    return axes
+
+
+def _curves(axes: Axes, found: Sequence[Case], value: Callable[[Case], float], **style: Any) -> None:
+    for room, line in zip(ROOMS, ("-", "--"), strict=True):
+        for exponent in sorted({case.exponent for case in found}):
+            some = [case for case in found if (case.room, case.exponent) == (room, exponent)]
+            label = f"exponent {exponent:g}" if line == "-" else None
+            look = {"marker": "o", "lw": 2, "ms": 4, "color": SHADES[exponent], "ls": line} | style
+            axes.plot([case.gloss for case in some], [value(case) for case in some], label=label, **look)
+
+
+def main() -> None:
+    """Run the bench."""
+    given = options(__doc__ or "")
+    logging.getLogger("ltcl").setLevel(logging.ERROR)  # the warning is among what is measured
+    found = cases(given)
+    facts = {case.name: asdict(case) for case in found}
+    title = "The single-view approximation (eq. 28, 29)"
+    figures.conclude(given, title, claims(found), facts, lambda: draw(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A solve to 1 %: products and time, beside the Neumann series and GMRES of NumPy and SciPy.
+
+A closed box of 4056 pixels (dense) and a sparse R of 131072 pixels, 256 nonzeros a row in runs of 16, both of
+rho(R) = 0.8, where the paper's series still converges; a box with rho(R) = 4, where it does not; and 3 and 8
+right-hand sides at once. Ours is `ltcl.solve` as it is called, `auto`, transfers included; operators lie on
+the device and were surveyed by an earlier solve, whose products are printed. Competitors get float32, and the
+Neumann loop all right-hand sides in one product. Every solution is checked in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+from scipy.sparse.linalg import gmres
+
+import ltcl
+from _harness import Options, Row, options, report, seconds
+from csr import matrix
+from ltcl.operators import CSR, IdentityPlus
+from ltcl.solvers import Solution
+
+RTOL = 1e-2
+PRODUCTS_TARGET = 4.0  # times fewer than Neumann
+NEUMANN_TARGET, GMRES_TARGET = 10.0, 5.0  # times faster
+DIVERGENT_TARGET = 8  # products at rho(R) = 4
+REPEATS = 3
+
+
+@dataclass(frozen=True)
+class Problem:
+    """S x = b for `b` (N,) or (N, k), with R (float32) on the host and S = I + R on the device."""
+
+    name: str
+    R: Any
+    S: IdentityPlus
+    b: np.ndarray
+
+    def check(self, who: str, x: np.ndarray) -> None:
+        """Stop where a solution is not within the tolerance, in float64."""
+        b, x = self.b.astype(np.float64), np.asarray(x, np.float64)
+        left = np.linalg.norm(b - x - self.R.astype(np.float64) @ x, axis=0) / np.linalg.norm(b, axis=0)
+        if np.max(left) > RTOL * (1 + 1e-3):
+            raise SystemExit(f"{who} misses the tolerance of {self.name}: {np.max(left):.3g}")
+
+
+def box(given: Options, rho: float) -> Problem:
+    """A closed box of one albedo m, rho(R) = m / (1 - m), with its true first bounce."""
+    scene = ltcl.scenes.box(10 if given.smoke else 26, sides=6, albedo=rho / (1 + rho))
+    T = scene.transport(first_bounce=scene.first_bounce, device=given.device)
+    R = (T.matrices[0] / T.first_bounce - np.eye(T.shape[0])).astype(np.float32)
+    return problem(f"box of {len(R)}, rho {rho:g}", R, T.systems[0])
+
+
+def sparse(given: Options, rho: float) -> Problem:
+    """Nonnegative with equal row sums, which then are rho(R)."""
+    R = matrix(2048, 32, 16) if given.smoke else matrix(131072, 256, 16)
+    R.data *= np.repeat(rho / R.sum(axis=1), np.diff(R.indptr)).astype(np.float32)
+    return problem(f"sparse {R.shape[0]}, rho {rho:g}", R, IdentityPlus(CSR(given.device, R)))
+
+
+def problem(name: str, R: Any, S: IdentityPlus, columns: int | None = None) -> Problem:
+    """The picture S l_d of random light l_d; `columns` of them."""
+    n = R.shape[0]
+    l_d = np.random.default_rng(1).random(n if columns is None else (n, columns), dtype=np.float32)
+    return Problem(name if columns is None else f"{name}, k = {columns}", R, S, l_d + R @ l_d)
+
+
+def neumann(problem: Problem) -> tuple[np.ndarray, int]:
+    """I - R + R^2 - ... until the next term, which is the residual, is small in every column."""
+    x, term, products = np.zeros_like(problem.b), problem.b, 0
+    target = RTOL * np.linalg.norm(problem.b, axis=0)
+    while np.any(np.linalg.norm(term, axis=0) > target):
+        x += term
+        term = problem.R @ term
+        np.negative(term, out=term)
+        products += 1
+    return x, products
+
+
+def scipy_gmres(problem: Problem, full: Any) -> tuple[np.ndarray, int]:
+    """One right-hand side after the other; the products are those inside its iteration."""
+    calls: list[float] = []
+    sides = problem.b.reshape(len(problem.b), -1).T
+    found = [
+        gmres(full, side, rtol=RTOL, restart=20, callback=calls.append, callback_type="pr_norm")[0]
+        for side in sides
+    ]
+    return np.stack(found, axis=-1).reshape(problem.b.shape), len(calls)
+
+
+def _with_identity(R: Any) -> Any:
+    """S = I + R in float32, sparse or dense as R is."""
+    if scipy.sparse.issparse(R):
+        return scipy.sparse.csr_array(scipy.sparse.eye_array(R.shape[0]) + R).astype(np.float32)
+    return R + np.eye(len(R), dtype=np.float32)
+
+
+def compare(given: Options, problem: Problem, facts: dict[str, Any]) -> list[Row]:
+    """Products and times of one problem."""
+    R = problem.R
+    full = _with_identity(R)
+    first, ours = (ltcl.solve(problem.S, problem.b, rtol=RTOL) for _ in range(2))
+    series, products = neumann(problem)
+    krylov, steps = scipy_gmres(problem, full)
+    for who, x in (("ours", ours.x), ("neumann", series), ("gmres", krylov)):
+        problem.check(who, x)
+    facts[f"{problem.name}: chosen"] = describe(first, ours)
+    facts[f"{problem.name}: products of SciPy's GMRES"] = steps
+    actions: dict[str, Callable[[], object]] = {
+        "ours": lambda: ltcl.solve(problem.S, problem.b, rtol=RTOL),
+        "neumann": lambda: neumann(problem),
+        "gmres": lambda: scipy_gmres(problem, full),
+    }
+    times = {name: 1e3 * spent for name, spent in seconds(actions, repeats=REPEATS).items()}
+    one = problem.b.ndim == 1
+    library = "scipy.sparse" if scipy.sparse.issparse(R) else "numpy"
+    rows = [
+        Row(
+            problem.name,
+            "Neumann's products",
+            products,
+            ours.products,
+            "products",
+            products / ours.products,
+            PRODUCTS_TARGET,
+        )
+    ]
+    for name, who, target in (
+        ("neumann", f"{library} Neumann loop", NEUMANN_TARGET),
+        ("gmres", "scipy GMRES", GMRES_TARGET),
+    ):
+        ratio = times[name] / times["ours"]
+        rows.append(Row(problem.name, who, times[name], times["ours"], "ms", ratio, target if one else None))
+    return rows
+
+
+def describe(first: Solution, ours: Solution) -> str:
+    """The method, and the products of the solve that surveyed the operator."""
+    return f"{ours.method}, {ours.products} products ({first.products} at the first solve): {ours.reason}"
+
+
+def divergent(given: Options, facts: dict[str, Any]) -> Row:
+    """Products where the paper's series diverges."""
+    problem = box(given, 4.0)
+    paper = ltcl.solve(problem.S, problem.b, "neumann", rtol=RTOL, throw=False)
+    facts[f"{problem.name}: Neumann"] = paper.status.name.lower()
+    first, ours = (ltcl.solve(problem.S, problem.b, rtol=RTOL) for _ in range(2))
+    problem.check("ours", ours.x)
+    facts[f"{problem.name}: chosen"] = describe(first, ours)
+    allowed = float(DIVERGENT_TARGET)
+    return Row(
+        problem.name, "products allowed", allowed, ours.products, "products", allowed / ours.products, 1.0
+    )
+
+
+def main() -> None:
+    """Run the bench."""
+    given, facts = options(__doc__ or ""), {}
+    dense, large = box(given, 0.8), sparse(given, 0.8)
+    rows = compare(given, dense, facts) + compare(given, large, facts)
+    for k in (3, 8):
+        rows += compare(given, problem(large.name, large.R, large.S, k), facts)
+    rows.append(divergent(given, facts))
+    report(given, "Solve to 1 %", rows, facts)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// LANES neighbouring values that one work-item handles together: 8 on CPUs, 1 on GPUs, where neighbours are
+// the business of neighbouring items.
+
+#ifndef LTCL_STRETCH_H
+#define LTCL_STRETCH_H
+
+#include "common/real.h"
+
+#ifndef LANES
+#error "stretch.h needs -DLANES=<neighbouring values of one work-item: 1 or 8>"
+#endif
+
+// flags: what comparing two stretches gives. FIRST: the value of the first lane. TOTAL: their sum.
+#if LANES == 8
+typedef real8 stretch;
+typedef int8 flags;
+#define LOAD_STRETCH(a) LOAD8(a)
+#define ANY(flags) any(flags)
+#define FIRST(v) ((v).s0)
+#define TOTAL(v) sum8(v)
+#else
+typedef real stretch;
+typedef int flags;
+#define LOAD_STRETCH(a) (*(a))
+#define ANY(flags) (flags)
+#define FIRST(v) (v)
+#define TOTAL(v) (v)
+#endif
+
+typedef union {
+    stretch vector;
+    real item[LANES];
+} stretch_items;
+
+// What works on stretches must be inlined: a call passes each of them through memory.
+#ifdef __clang__
+#define INLINE inline __attribute__((always_inline))
+#else
+#define INLINE inline
+#endif
+
+// PoCL compiles fabs() of eight lanes to a call.
+INLINE stretch magnitude(stretch v)
+{
+    return v < 0 ? -v : v;
+}
+
+#endif

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`compensate`: the projector pattern that makes the scene look as desired (section 8.2).
+
+    l_in = F^-1 S^-1 (gain * desired - background)
+
+by products with S only. Where that asks for light beyond the projector's bounds, clamping it is not the best:
+min ||W (T l_in + background - gain * desired)|| over the patterns within the bounds is solved from there on.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ltcl import layout
+from ltcl.compensation import inputs
+from ltcl.compensation.problem import Limits, Problem, systems
+from ltcl.compensation.result import Compensation
+from ltcl.compensation.start import Inverse, Start, at_gain, at_largest_gain
+from ltcl.errors import ConvergenceError
+from ltcl.solvers import Bounded, Status
+from ltcl.transport import Transport, require
+
+Columns = list[np.ndarray]  # one (N, k) a channel of the transport
+
+
+def compensate(
+    T: Transport,
+    desired: Any,
+    *,
+    bounds: tuple[float, float] = (0.0, 1.0),
+    background: Any = None,
+    gain: float | str = 1.0,
+    loss: float | None = None,
+    weights: Any = None,
+    method: str = "auto",
+    rtol: float = 1e-2,
+    **options: Any,
+) -> Compensation:
+    """Find the projector pattern under which the scene looks most like `desired`.
+
+    Parameters
+    ----------
+    T : Transport
+        With more or fewer camera than projector pixels, or blocks between colours, it works too, in the
+        least-squares sense and without `method`.
+    desired : (h, w), (h, w, 3), or frames of these
+        Wanted radiance at each camera pixel, in the units of T.
+    bounds : (low, high)
+        What the projector can emit per pixel, in linear light.
+    background : like `desired` or one frame of it, optional
+        Light the projector cannot take away: ambient and its own black. T pattern + background is matched.
+    gain : float or "auto"
+        Scale of the target; "auto" finds the largest one, for all frames and colours, that the bounds reach.
+    loss : float, optional
+        Of gain="auto": relative error, weights included, that the gain may cost. When not given, none where
+        some gain is within reach exactly and there are no `weights`; else `rtol`, or 0.001 if that is less,
+        above what a picture half as bright would cost.
+    weights : like `desired` or one frame of it, optional
+        How much the error at each camera pixel counts, at least 0. When not given 1, and 0 where T.masked.
+    method, rtol, **options
+        Of `ltcl.solve`. Within the bounds the error is the least there is up to `rtol`, relative to
+        gain * desired - background.
+
+    Returns
+    -------
+    Compensation
+        Never worse than the light without bounds, clamped; at a `loss` found for gain="auto", by no more than
+        0.5 % of that.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, bounds in the wrong order, a gain that is not positive, weights below 0, or
+        no gain that keeps the picture within `loss`.
+    ConvergenceError
+        A solve did not reach `rtol` in `maxiter` steps, or not at all. Within the bounds, where float32 is
+        too coarse to prove it, the best that was found comes back, and `gap` tells what is proved.
+
+    Notes
+    -----
+    F = diag(T) is a valid choice here for any opaque scene: compensation does not depend on it.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
+    >>> ltcl.compensate(T, numpy.array([[0.3, 0.3]])).pattern.round(2).tolist()
+    [[0.5, 0.5]]
+    >>> c = ltcl.compensate(T, numpy.array([[1.0, 1.0]]), gain="auto")
+    >>> round(c.gain, 2), c.pattern.round(2).tolist()
+    (0.6, [[1.0, 1.0]])
+    """
+    require(T, square=False)
+    limits = Limits(*inputs.bounds(bounds), T.join([T.masked] * T.channels)[0])
+    sought = inputs.gain(gain, loss)
+    wanted, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
+    dark = inputs.background(background, T, shape, wanted)
+    counts = inputs.weights(weights, T, shape, wanted)
+    rules = inputs.rules(T, method, rtol, options)
+    wanted, dark = T.join(wanted), T.join(dark)
+    problem = Problem(systems(T), wanted, dark, None if counts is None else T.join(counts), limits, rules)
+    inverse = Inverse(T, method, {"rtol": rtol, **options})
+    if sought is not None:
+        start = at_gain(inverse, problem, sought)
+    else:
+        start = at_largest_gain(inverse, problem, loss, exactly=weights is None)
+    light, limited = _within(problem, start, options.get("throw", True))
+    return _result(T, problem, shape, start, light, limited)
+
+
+def _within(problem: Problem, start: Start, throw: bool) -> tuple[Columns, list[Bounded | None]]:
+    """Light within the limits, and the solve that it took of each system, None where it took none."""
+    light: Columns = []
+    limited: list[Bounded | None] = []
+    for which, free in enumerate(start.light):
+        nearest, found = problem.limits.clip(free), None
+        if not start.meets or problem.limits.exceeded(free).any():
+            nearest, found = problem.nearest(which, start.gain, nearest)
+            if throw and found.status is Status.MAXITER:
+                raise ConvergenceError(str(found), found)
+        light.append(nearest)
+        limited.append(found)
+    return light, limited
+
+
+def _result(
+    T: Transport,
+    problem: Problem,
+    shape: layout.Layout,
+    start: Start,
+    light: Columns,
+    limited: list[Bounded | None],
+) -> Compensation:
+    target = [start.gain * wanted for wanted in problem.desired]
+    seen = [np.asarray(A @ p) + dark for A, p, dark in zip(T.operators, light, problem.dark, strict=True)]
+    missing = [wanted - found for wanted, found in zip(target, seen, strict=True)]
+    solved = tuple(found for found in limited if found is not None)
+    solutions = start.solutions or solved
+    gaps = [found.gap for found in solved] + [
+        s.residual for s in start.solutions if len(solved) < len(limited)
+    ]
+
+    def picture(columns: Columns, grid: tuple[int, int]) -> np.ndarray:
+        return shape.pack(T.split(columns), grid).astype(np.float32)
+
+    return Compensation(
+        pattern=picture(light, T.grid),
+        appearance=picture(seen, T.camera_grid),
+        gain=start.gain,
+        clipped=_clipped(limited, problem.limits.masked),
+        target=picture(target, T.camera_grid),
+        out_of_reach=picture(_beyond(missing, target, problem.rules["rtol"]), T.camera_grid),
+        error=problem.norm(missing) / (problem.norm(target) or 1.0),
+        gap=max(gaps),
+        solution=solutions[0] if len(solutions) == 1 else solutions,
+        limited=solved,
+    )
+
+
+def _clipped(limited: list[Bounded | None], masked: np.ndarray) -> float:
+    """The share of values that the bounds hold, of pixels that are lit."""
+    return float(np.mean([0.0 if found is None else found.held[~masked].mean() for found in limited]))
+
+
+def _beyond(missing: Columns, target: Columns, rtol: float) -> Columns:
+    """What is missing, without what the tolerance of a solve explains."""
+    small = rtol * max(float(np.max(np.abs(part))) for part in target)
+    return [np.where(np.abs(part) > small, part, 0.0) for part in missing]

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which part of a patch another one sees past opaque boxes: V (N, N), symmetric, 1 where nothing is between.
+
+V_ij is the share of s^2 rays between patches i and j that meet no box. Each patch has s x s points, one at
+random in each cell of a regular division, and ray k joins point k of one patch with point partner(k) of the
+other, where partner is a fixed random exchange: both directions have the same rays, so V = V^T to the bit.
+
+Known limit: V counts rays, it is not weighted by the cosines along them; the standard error of an entry in
+a penumbra is at most 1 / (2 s), less as the points are spread evenly.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.device import Device, open_device
+from ltcl.errors import InputError
+from ltcl.scenes import geometry
+from ltcl.scenes.geometry import Frame
+from ltcl.scenes.patches import Patches
+
+_LAUNCH = 1 << 30  # tests of a ray and a box in one launch: a fraction of a second, also for slow devices
+_MOST_SAMPLES = 64
+
+
+class Rays:
+    """The rays between patches, on a device; what `visibility` is made of.
+
+    Parameters
+    ----------
+    patches : Patches
+    blocks : (B, 2, 3)
+        Checked, see `geometry.check_blocks`.
+    device : Device
+    samples : int
+        s.
+    """
+
+    def __init__(self, patches: Patches, blocks: np.ndarray, device: Device, samples: int) -> None:
+        self.device, self.count, self.rays, self.boxes = device, len(patches), samples**2, len(blocks)
+        frame = Frame.of(patches)
+        points = _points(frame.patches(patches), samples)
+        nbytes = 2 * points.size * 4
+        device.require(nbytes, f"{samples}^2 points on each of {self.count} patches")
+        self._starts = geometry.padded(device, points.reshape(-1, self.count))
+        self._ends = geometry.padded(device, points[_partner(self.rays)].reshape(-1, self.count))
+        self._blocks = geometry.upload_blocks(device, frame, blocks)
+        self._defines = {"LANES": geometry.lanes(device), "BLOCKS": self.boxes}
+
+    def rows(self, first: int, rows: int) -> np.ndarray:
+        """V of patches first .. first + rows - 1 and all others, (rows, N) float32."""
+        kernel = self.device.kernel("visibility", "visibility_rows", **self._defines)
+        out = self.device.empty((rows, self.count))
+        pitch, lanes = self._starts.shape[1], geometry.lanes(self.device)
+        given = (rows, first, self.count, pitch, self.rays, self._starts, self._ends, self._blocks, out)
+        kernel((-(-self.count // lanes), rows), None, *given)
+        return out.get()
+
+    def pairs(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """V of listed pairs, (P,) float32."""
+        kernel = self.device.kernel("visibility", "visibility_pairs", **self._defines)
+        most = max(1, _LAUNCH // (self.rays * self.boxes * geometry.lanes(self.device)))
+        parts = [np.zeros(0, np.float32)]
+        for start in range(0, len(i), most):
+            ends = [self.device.upload(end[start : start + most], np.int32) for end in (i, j)]
+            out = self.device.empty(ends[0].shape)
+            pitch = self._starts.shape[1]
+            given = (pitch, self.rays, *ends, self._starts, self._ends, self._blocks, out)
+            kernel(out.size, 64, out.size, *given)
+            parts.append(out.get())
+        return np.concatenate(parts)
+
+    def most_rows(self) -> int:
+        """Rows that one launch should take, and whose result one buffer holds."""
+        pairs = min(_LAUNCH // (self.rays * self.boxes), (self.device.max_allocation - 64) // 4)
+        return max(1, pairs // self.count)
+
+
+def visibility(
+    patches: Patches, blocks: Any, device: Device | str | None = None, *, samples: int = 4
+) -> np.ndarray:
+    """Shares of the rays between all patches that meet no box, (N, N) float32 on the host.
+
+    Parameters
+    ----------
+    patches : Patches
+        N parallelograms, as `ltcl.scenes.patches.cut` makes them. Those on the faces of a box belong to it:
+        light leaves them outwards and the box does not stop it.
+    blocks : array_like, (B, 2, 3)
+        Low and high corner of each opaque box, along the axes.
+    device : Device or str, optional
+        The best one if omitted.
+    samples : int
+        s, 1 to 64: s^2 rays for each pair.
+
+    Returns
+    -------
+    ndarray, (N, N), float32
+        Symmetric to the bit.
+
+    Raises
+    ------
+    InputError
+        If a box has no volume, a patch no area, or a value is not finite.
+    MemoryLimitError
+        If the matrix does not fit in the memory of the host; nothing is allocated then.
+
+    Examples
+    --------
+    >>> from ltcl.scenes.box import WALLS
+    >>> from ltcl.scenes.patches import cut
+    >>> screen = [[(0.4, -1, -1), (0.6, 2, 2)]]  # between the walls at x = 0 and x = 1
+    >>> visibility(cut((WALLS[1], WALLS[5]), 1), screen).tolist()
+    [[1.0, 0.0], [0.0, 1.0]]
+    """
+    patches, blocks = geometry.check_patches(patches), geometry.check_blocks(blocks)
+    if checks.count("samples", samples) > _MOST_SAMPLES:
+        raise InputError(f"samples is {samples}; it must be at most {_MOST_SAMPLES}")
+    count = len(patches)
+    checks.fits_host(f"the visibility of {count} x {count} patches", 4 * count**2)
+    seen = np.ones((count, count), np.float32)
+    if len(blocks):
+        chosen = device if isinstance(device, Device) else open_device(device)
+        rays = Rays(patches, blocks, chosen, samples)
+        for first in range(0, count, rays.most_rows()):
+            rows = min(rays.most_rows(), count - first)
+            seen[first : first + rows] = rays.rows(first, rows)
+    return seen
+
+
+def _points(patches: Patches, samples: int) -> np.ndarray:
+    """The points of every ray on every patch, (s^2, 3, N)."""
+    cell = np.stack(np.meshgrid(*[np.arange(samples)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    place = (cell + np.random.default_rng(1).random(cell.shape)) / samples - 0.5  # (s^2, 2) in edges
+    edges = np.stack([patches.right, patches.down])  # (2, N, 3)
+    return (patches.centre + np.tensordot(place, edges, 1)).transpose(0, 2, 1)
+
+
+def _partner(rays: int) -> np.ndarray:
+    """A random exchange of `rays` points: partner[partner] is the identity."""
+    order = np.random.default_rng(2).permutation(rays)
+    half = rays // 2
+    partner = np.arange(rays)
+    partner[order[:half]], partner[order[half : 2 * half]] = order[half : 2 * half], order[:half]
+    return partner

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""gain="auto" finds the largest gain, against closed forms and brute force in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+import ltcl
+from ltcl.errors import InputError
+from tests.problems import lambertian
+
+GRID = (3, 5)
+N = 15
+SCENE = lambertian(N, 1.0, seed=80)
+random = np.random.default_rng(81)
+
+
+@pytest.fixture(scope="module")
+def T(device):
+    return ltcl.Transport(SCENE.T, GRID, device=device)
+
+
+def within_reach(frames: int = 1) -> np.ndarray:
+    """Pictures of patterns without black or white, (frames, h, w)."""
+    return (random.uniform(0.3, 0.9, (frames, N)) @ SCENE.T.T).reshape(-1, *GRID)
+
+
+def loss(gain: float, desired: np.ndarray, background: np.ndarray, bounds: tuple[float, float]) -> float:
+    """Least relative error at this gain over all frames (k, N), by brute force."""
+    left = 0.0
+    for wanted, dark in zip(desired, np.broadcast_to(background, desired.shape), strict=True):
+        left += 2 * lsq_linear(SCENE.T, gain * wanted - dark, bounds, tol=1e-14).cost
+    return float(np.sqrt(left) / (gain * np.linalg.norm(desired)))
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 1.0), (0.1, 0.7), (-0.5, 3.0)])
+@pytest.mark.parametrize("ambient", [0.0, 0.05])
+@pytest.mark.parametrize("frames", [1, 3])
+def test_the_largest_gain_within_reach_exactly(T, bounds, ambient, frames):
+    desired = within_reach(frames)
+    background = ambient * random.uniform(0, 1, GRID)
+    c = ltcl.compensate(
+        T, desired, bounds=bounds, background=background, gain="auto", method="direct", rtol=1e-4
+    )
+    flat = desired.reshape(frames, N)
+    u, v = np.linalg.solve(SCENE.T, flat.T), np.linalg.solve(SCENE.T, background.ravel())[:, None]
+    assert (u > 0).all()
+    wanted = np.min((bounds[1] + v) / u)
+    assert c.gain == pytest.approx(wanted, rel=1e-4)
+    assert c.clipped == 0.0
+    assert c.error < 1e-3
+    assert c.pattern.max() == pytest.approx(bounds[1], rel=1e-4)
+    assert c.limited == ()
+    assert not c.out_of_reach.any()
+    np.testing.assert_allclose(c.target, c.gain * desired, rtol=1e-5)
+    assert isinstance(c.solution, ltcl.Solution)
+    np.testing.assert_allclose(c.solution.x, np.diag(SCENE.T)[:, None] * (c.gain * u - v), rtol=1e-3)
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 1.0), (0.05, 0.7)])
+@pytest.mark.parametrize("ambient", [0.0, 0.1])
+@pytest.mark.parametrize("allowed", [0.01, 0.05, 0.2])
+def test_the_largest_gain_at_a_loss(T, bounds, ambient, allowed):
+    desired = within_reach(2)
+    background = ambient * random.uniform(0, 1, GRID)
+    c = ltcl.compensate(
+        T, desired, bounds=bounds, background=background, gain="auto", loss=allowed, rtol=1e-3
+    )
+    arguments = desired.reshape(2, N), background.ravel(), bounds
+    assert c.error <= allowed * (1 + 1e-4)
+    assert loss(c.gain, *arguments) <= allowed * (1 + 1e-4)
+    assert loss(1.03 * c.gain, *arguments) > allowed
+    for more in (1.5, 3.0, 10.0):  # nor is there a larger one further up
+        assert loss(more * c.gain, *arguments) > allowed
+    assert c.clipped > 0.0
+    assert c.limited[0].products > 2 * c.limited[0].iterations + 4  # the search is counted
+
+
+def test_a_picture_out_of_reach_at_any_gain(T):
+    """Black beside white: what bounces into the black cannot be taken away, however dim the white."""
+    desired = np.zeros(GRID)
+    desired[0] = 1.0
+    dim = loss(1e-3, desired.reshape(1, N), np.zeros(N), (0.0, 1.0))
+    c = ltcl.compensate(T, desired, gain="auto", rtol=1e-2)
+    assert dim <= c.error <= dim + 0.02
+    assert loss(1.2 * c.gain, desired.reshape(1, N), np.zeros(N), (0.0, 1.0)) > c.error
+    with pytest.raises(InputError, match=r"no gain brings .* within a loss of 0.05; the least is about 0"):
+        ltcl.compensate(T, desired, gain="auto", loss=0.05)
+
+
+def test_a_room_brighter_than_every_picture(T):
+    """A flat background has no place in a picture of stripes: too dim is as wrong as too bright."""
+    desired, background = np.tile([1.0, 0.0, 1.0, 0.0, 1.0], (3, 1)), np.full(GRID, 5.0)
+    with pytest.raises(InputError, match=r"no gain brings the picture within a loss of 0.1"):
+        ltcl.compensate(T, desired, background=background, gain="auto", loss=0.1)
+
+
+def test_weights_allow_a_larger_gain(T):
+    """Where one bright pixel does not matter, it does not hold the others back."""
+    desired = within_reach(1)[0]
+    desired[1, 1] *= 1.5
+    weights = np.ones(GRID)
+    weights[1, 1] = 0.0
+    held, free = (ltcl.compensate(T, desired, gain="auto", loss=0.02, weights=w) for w in (None, weights))
+    assert free.gain > 1.2 * held.gain
+    assert free.error <= 0.02 * (1 + 1e-4)
+
+
+def test_a_rectangular_T(device):
+    matrix = random.uniform(0, 1, (28, N))
+    T = ltcl.Transport(matrix, GRID, camera_grid=(4, 7), device=device)
+    pattern = random.uniform(0.2, 0.5, N)
+    c = ltcl.compensate(T, (matrix @ pattern).reshape(4, 7), gain="auto", loss=0.01)
+    errors = [
+        np.sqrt(2 * lsq_linear(matrix, g * matrix @ pattern, (0, 1), tol=1e-14).cost)
+        / np.linalg.norm(g * matrix @ pattern)
+        for g in (c.gain, 1.03 * c.gain)
+    ]
+    assert errors[0] <= 0.01 < errors[1]
+    assert c.gain > 1.0 / pattern.max()
+
+
+@pytest.mark.parametrize("desired", [np.zeros(GRID), -np.ones(GRID)])
+def test_nothing_to_be_seen_has_no_largest_gain(T, desired):
+    with pytest.raises(InputError, match="gain is 'auto', but"):
+        ltcl.compensate(T, desired, gain="auto")
+
+
+def test_masked_pixels_and_colours_of_their_own(device):
+    """One gain for all colours; a masked pixel, which shines at none, does not limit it."""
+    scenes = [lambertian(N, rho, seed=82) for rho in (0.3, 1.0, 2.0)]
+    matrices = [scene.T for scene in scenes]
+    for matrix in matrices:
+        matrix[4, 4] = 0.0
+    T = ltcl.Transport(matrices, GRID, device=device, on_dark="mask")
+    lit = np.delete(np.arange(N), 4)
+    pattern = random.uniform(0.3, 0.8, (N, 3))
+    pattern[4] = 0.0
+    desired = np.stack([matrix @ pattern[:, c] for c, matrix in enumerate(matrices)], axis=-1)
+    desired[4] = 9.0  # does not count
+    c = ltcl.compensate(T, desired.reshape(*GRID, 3), gain="auto", method="direct")
+    assert c.gain == pytest.approx(1.0 / pattern.max(), rel=1e-3)
+    np.testing.assert_allclose(c.pattern.reshape(N, 3), c.gain * pattern, atol=1e-3)
+    assert np.abs(c.out_of_reach.reshape(N, 3)[lit]).max() == 0.0
+    assert c.out_of_reach.reshape(N, 3)[4].min() > 0.0
+    assert c.error < 1e-3
