@@ -31,8 +31,17 @@
 
 #pragma OPENCL FP_CONTRACT OFF
 
-#if !defined(CHUNK) || !defined(WALKS) || !defined(K) || !defined(ESTIMATOR)
-#error "walk.cl needs -DCHUNK=<samples> -DWALKS=<at a time> -DK=<right-hand sides> -DESTIMATOR=<0 or 1>"
+#ifndef CHUNK
+#error "walk.cl needs -DCHUNK=<samples that are summed on the device>"
+#endif
+#ifndef WALKS
+#error "walk.cl needs -DWALKS=<walks of an item at a time>"
+#endif
+#ifndef K
+#error "walk.cl needs -DK=<right-hand sides of one launch>"
+#endif
+#ifndef ESTIMATOR
+#error "walk.cl needs -DESTIMATOR=<0 end-point, 1 collision>"
 #endif
 #define ENDPOINT 0
 #define COLLISION 1

@@ -296,6 +296,50 @@ def walk(
     return scores, row, step
 
 
+def walk_rows(
+    tables: tuple[np.ndarray, np.ndarray, str],
+    steps: np.ndarray,
+    b: np.ndarray,
+    pixels: np.ndarray,
+    samples: np.ndarray,
+    seed: int,
+    stream: int,
+    collision: bool,
+    chunk: int,
+) -> np.ndarray:
+    """Sum, its rounding, sum of squares and its rounding of each chunk, (P, chunks, k, 4) float32."""
+    count = len(samples)
+    which = np.repeat(pixels, count), np.tile(samples, len(pixels))
+    scores, _, _ = walk(tables, steps, b, *which, seed, stream, collision)
+    scores = scores.reshape(len(pixels), count, -1).swapaxes(0, 1)
+    chunks = [scores[start : start + chunk] for start in range(0, count, chunk)]
+    return np.stack([np.stack([*two_sums(c), *two_sums(c**2)], axis=-1) for c in chunks], axis=1)
+
+
+def walk_columns(
+    tables: tuple[np.ndarray, np.ndarray, str],
+    steps: np.ndarray,
+    source: int,
+    samples: np.ndarray,
+    seed: int,
+    stream: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where samples from row `source` end, and what they bring there, float32."""
+    start = np.full(len(samples), source)
+    scores, ends, _ = walk(tables, steps, None, start, samples, seed, stream, collision=False)
+    return ends, scores[:, 0]
+
+
+def random_loads(items: int, chains: int, steps: int, words: np.ndarray) -> np.ndarray:
+    """Sums over the chains of each item after so many loads, (items,) uint64."""
+    with np.errstate(over="ignore"):
+        state = np.arange(1, items * chains + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        for _ in range(steps):
+            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+            state ^= words[(state >> np.uint64(32)) * np.uint64(len(words)) >> np.uint64(32)]
+        return state.reshape(items, chains).sum(axis=1)
+
+
 def _draw(
     records: np.ndarray, entries: np.ndarray, word: np.ndarray, sampler: str
 ) -> tuple[np.ndarray, np.ndarray]:

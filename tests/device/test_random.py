@@ -40,3 +40,14 @@ def test_the_device_and_its_twin_agree(device, count):
     words = np.random.default_rng(count).integers(0, ONES, (count, 4), np.uint32, endpoint=True)
     seed = 0x0123456789ABCDEF
     np.testing.assert_array_equal(blocks(device, words, seed), reference.random_philox(words, seed))
+
+
+@pytest.mark.parametrize(
+    ("items", "chains", "steps", "size"), [(1, 1, 1, 1), (7, 8, 5, 53), (65, 3, 20, 1000)]
+)
+def test_chains_of_loads_are_those_of_the_twin(device, items, chains, steps, size):
+    words = np.random.default_rng(size).integers(0, 1 << 64, size, np.uint64)
+    out = device.empty((items,), np.uint64)
+    kernel = device.kernel("random", "random_loads", CHAINS=chains)
+    kernel(items, 1, items, steps, size, device.upload(words, np.uint64), out)
+    np.testing.assert_array_equal(out.get(), reference.random_loads(items, chains, steps, words))

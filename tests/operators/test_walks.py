@@ -53,19 +53,16 @@ def twin_sums(
     at: range,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums and sums of squares, (P, k) float64, chunk by chunk as the device makes them."""
-    samples = len(at)
-    which = np.repeat(pixels, samples), np.tile(at, len(pixels))
     steps = lengths.steps(estimator)
-    scores, _, _ = reference.walk(raw(made), steps, b, *which, SEED, 3, estimator == "collision")
-    scores = scores.reshape(len(pixels), samples, -1).swapaxes(0, 1)
-    totals = []
-    for values in (scores, scores**2):
-        total = np.zeros(values.shape[1:])
-        for start in range(0, samples, CHUNK):
-            sums, low = reference.two_sums(values[start : start + CHUNK])
-            total = total + (sums.astype(np.float64) + low)
-        totals.append(total)
-    return totals[0], totals[1]
+    found = reference.walk_rows(
+        raw(made), steps, b, pixels, np.array(at), SEED, 3, estimator == "collision", CHUNK
+    )
+    found = found.astype(np.float64)
+    total, squares = np.zeros((len(pixels), b.shape[1])), np.zeros((len(pixels), b.shape[1]))
+    for chunk in found.swapaxes(0, 1):
+        total = total + (chunk[..., 0] + chunk[..., 1])
+        squares = squares + (chunk[..., 2] + chunk[..., 3])
+    return total, squares
 
 
 def same(found: Sums, total: np.ndarray, squares: np.ndarray) -> None:
@@ -115,9 +112,8 @@ def test_walks_from_b_are_those_of_the_twin(device, form, launching):
     made.append(device.upload(b))
     found = Walker(made, lengths, "endpoint", SEED, launching).columns(7, 1000)
     steps = lengths.after_start().steps("endpoint")
-    start, samples = np.full(1000, 53), np.arange(7, 1007)
-    scores, ends, _ = reference.walk(raw(made), steps, None, start, samples, SEED, 0, False)
-    scores, ends = scores[:, 0].astype(np.float64), np.where(scores[:, 0] == 0, 0, ends)
+    ends, scores = reference.walk_columns(raw(made), steps, 53, np.arange(7, 1007), SEED)
+    scores, ends = scores.astype(np.float64), np.where(scores == 0, 0, ends)
     same(found, np.bincount(ends, scores, 53), np.bincount(ends, scores**2, 53))
 
 
