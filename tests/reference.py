@@ -111,7 +111,7 @@ def relax_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *ar
     )
 
 
-def relax_finish(
+def relax_substitute(
     S: np.ndarray, omega: float | None, before: int, start: int, stop: int, s: np.ndarray, delta: np.ndarray
 ) -> np.ndarray:
     """The delta of P_AA delta_A = s_A - S_AO delta_O: of relax_substitute, where O is empty, and the others.

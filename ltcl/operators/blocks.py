@@ -142,7 +142,8 @@ def by_inverse(rows: Rows, blocks: list[Block], omega: float | None, method: str
                 f"method={method!r} inverts blocks of S, and block {number}, rows {block.start} to "
                 f"{block.stop - 1}, is singular; choose another block= or use method='direct'"
             )
-        weights = np.hstack([-inverse @ part[:, :known], inverse])
+        with np.errstate(over="ignore", invalid="ignore"):  # a sweep with Inf ends as divergence, and says so
+            weights = np.hstack([-inverse @ part[:, :known], inverse]).astype(np.float32)
         yield Finish(block, -1, (M.device.upload(weights),))
 
 

@@ -68,7 +68,8 @@ class Bounded(Solution):
         advice = "" if self.converged else f": {self.status.value}"
         return (
             f"bounded: {self.status.name.lower()} after {self.iterations} iterations, "
-            f"{self.products} products, relative error {self.residuals[-1]:.2g}, at most {self.gap:.2g} above the least{advice}"
+            f"{self.products} products, relative error {self.residuals[-1]:.2g}, "
+            f"at most {self.gap:.2g} above the least{advice}"
         )
 
 

@@ -75,7 +75,7 @@ def test_product_and_finish_meet_their_twins(device, monkeypatch, form, kind, na
         wanted.append([values[start:stop] for values in found])
         s = np.concatenate([values[0] for values in wanted])
         chosen = None if kind == "all" else omega
-        delta[start:stop] = reference.relax_finish(S, chosen, before, start, stop, s, delta)
+        delta[start:stop] = reference.relax_substitute(S, chosen, before, start, stop, s, delta)
         y[start:stop] = x[start:stop] + delta[start:stop]
     right, r, carry = (np.concatenate(values) for values in zip(*wanted, strict=True))
     found = [(state.r, r), (state.carry, carry), (state.x, y), (state.before, x)]

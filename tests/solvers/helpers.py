@@ -16,4 +16,10 @@ READS_ROWS = (
     "southwell",
 )  # methods that refuse operators whose entries cannot be read
 
-__all__ = ["ALL", "ITERATIVE", "METHODS", "READS_ROWS"]
+
+def small_blocks(method: str, block: int = 4) -> dict[str, int]:
+    """Options with which a method takes steps even where N is small: one block of all rows solves at once."""
+    return {"block": block} if method == "block_gauss_seidel" else {}
+
+
+__all__ = ["ALL", "ITERATIVE", "METHODS", "READS_ROWS", "small_blocks"]
