@@ -67,7 +67,7 @@ def prepare(n: int, device: ltcl.Device) -> Inversion:
 def slope(errors: np.ndarray) -> tuple[float, float]:
     """Of log variance over log samples, and half its 99 % confidence interval."""
     samples = np.repeat(np.log(COUNTS), SEEDS)
-    fit = scipy.stats.linregress(samples, 2 * np.log(errors.ravel()))
+    fit: Any = scipy.stats.linregress(samples, 2 * np.log(errors.ravel()))
     return float(fit.slope), float(fit.stderr * scipy.stats.t.ppf(0.995, len(samples) - 2))
 
 
@@ -128,6 +128,8 @@ def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
     axes = figures.graph(figure, (85, 360, 860, 210), "Variance", "samples a pixel", "squared error")
     for (kind, values), colour in zip(errors.items(), ("#5cc8ff", "#ffb347", "#7fd77f"), strict=True):
         axes.loglog(COUNTS, (values**2).mean(axis=1), color=colour, lw=2, label=kind)
+    axes.set_xticks(COUNTS, [str(count) for count in COUNTS])
+    axes.minorticks_off()
     axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
     return figure
 

@@ -118,7 +118,7 @@ def test_variance_falls_as_one_over_the_samples(device):
         np.mean([(ltcl.solve(S, b, "monte_carlo", samples=int(n), seed=s).x - exact) ** 2 for s in range(12)])
         for n in counts
     ]
-    fit = scipy.stats.linregress(np.log(counts), np.log(errors))
+    fit: Any = scipy.stats.linregress(np.log(counts), np.log(errors))
     assert abs(fit.slope + 1.0) <= scipy.stats.t.ppf(0.995, len(counts) - 2) * fit.stderr
     assert fit.stderr < 0.1
 
