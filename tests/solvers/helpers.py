@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
 from ltcl.solvers.solve import METHODS as ALL
 from ltcl.solvers.solve import SAMPLED as _SAMPLED
@@ -17,7 +19,7 @@ READS_ROWS = (
 )  # methods that refuse operators whose entries cannot be read
 
 
-def small_blocks(method: str, block: int = 4) -> dict[str, int]:
+def small_blocks(method: str, block: int = 4) -> dict[str, Any]:
     """Options with which a method takes steps even where N is small: one block of all rows solves at once."""
     return {"block": block} if method == "block_gauss_seidel" else {}
 
