@@ -24,7 +24,7 @@ import numpy as np
 
 from ltcl import checks, layout
 from ltcl.operators import Operator
-from ltcl.solvers import Solution, solve
+from ltcl.solvers import Solution, sampled, solve
 from ltcl.transport import Transport, require
 
 logger = logging.getLogger(__name__)
@@ -107,6 +107,7 @@ def separate(
     """
     require(T)
     checks.count("bounces", bounces, least=0)
+    sampled.check_whole(options)
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     chains = [
         _chain(S, l_out, bounces, method, rtol, options) for S, l_out in zip(T.systems, columns, strict=True)

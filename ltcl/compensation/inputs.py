@@ -9,6 +9,7 @@ import numpy as np
 
 from ltcl import checks, layout
 from ltcl.errors import InputError, InputTypeError
+from ltcl.solvers import sampled
 from ltcl.transport import Transport
 
 Columns = list[np.ndarray]
@@ -60,6 +61,7 @@ def weights(value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Co
 
 def rules(T: Transport, method: str, rtol: Any, options: dict[str, Any]) -> dict[str, Any]:
     """Options of a solve within the bounds; of a T without S, those are all that there are."""
+    sampled.check_whole(options)
     if not T.is_square:
         if method != "auto":
             raise InputError(f"method is {method!r}, but this T has no S for it to solve; it must be 'auto'")

@@ -10,7 +10,7 @@ same and gets the same estimate whether others are asked for or not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,6 +130,8 @@ class Walker:
     seed : int
         Below 2^64.
     launching : Launching, optional
+    watch : callable, optional
+        Called after each launch.
     """
 
     tables: Tables
@@ -137,6 +139,7 @@ class Walker:
     estimator: str
     seed: int
     launching: Launching | None = None
+    watch: Callable[[], object] = lambda: None
 
     def rows(self, b: Array, pixels: np.ndarray, first: int, samples: int, stream: int = 0) -> Sums:
         """Samples first .. first + samples of each pixel.
@@ -163,6 +166,7 @@ class Walker:
                     here = (some, slice(offset, offset + width))
                     total[here] = _added(total[here], found[..., 0], found[..., 1])
                     squares[here] = _added(squares[here], found[..., 2], found[..., 3])
+                    self.watch()
         shape = (len(pixels), *b.shape[1:])
         return Sums(samples, total.reshape(shape), squares.reshape(shape))
 
@@ -204,6 +208,7 @@ class Walker:
             where = np.where(score == 0.0, 0, ends.get())  # a walk that died may stand in the row of b
             total += np.bincount(where, score, n)
             squares += np.bincount(where, score**2, n)
+            self.watch()
         return Sums(samples, total, squares)
 
     def _launch(self, name: str, estimator: str, width: int, units: int, *arguments: object) -> None:

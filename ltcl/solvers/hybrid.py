@@ -47,7 +47,8 @@ class Hybrid:
     """
 
     name: ClassVar[str] = "hybrid"
-    samples: int = 32
+    usual: ClassVar[int] = 32
+    samples: int = usual
     seed: int = 0
     iterations: int | None = None
     sampler: str = "alias"
@@ -66,10 +67,11 @@ class Hybrid:
         count = self._iterations(R, rule)
         walker = Walker(tables(R, self.sampler), whole(np.array([-sign])), "endpoint", self.seed)
         pixels, start = np.arange(len(x)), r.get().astype(np.float64)
-        l = start
+        l, watch = start, sampled.watch(rule)
         for k in range(count):
             product = walker.rows(system.S.device.upload(l), pixels, 0, self.samples, stream=k)
             l = start + product.mean
+            watch()
         x = x + l
         return Estimate(sampled.gathered(system, x) if self.gather else x, iterations=count)
 

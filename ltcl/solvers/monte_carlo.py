@@ -33,7 +33,6 @@ from ltcl.solvers.sampled import Estimate
 from ltcl.solvers.stopping import Rule, System
 from ltcl.theory.walks import chance_to_go_on, second_moment_radius
 
-_SAMPLES = 256
 _MOST = 1 << 20  # samples of a pixel with a target error
 _PILOT = 256  # samples that tell how many are needed
 _PILOT_STREAM = 1
@@ -70,6 +69,7 @@ class MonteCarlo:
     """
 
     name: ClassVar[str] = "monte_carlo"
+    usual: ClassVar[int] = 256
     samples: int | None = None
     seed: int = 0
     pixels: Any = None
@@ -111,7 +111,7 @@ class MonteCarlo:
         R, sign = rows_of_R(system.S, self.name)
         first, lengths, reason = self._lengths(system, R, sign, rule)
         pixels = np.arange(len(x)) if self.pixels is None else _pixels(self.pixels, len(x))
-        rest, error = self._walk(R, lengths, r, pixels, unit)
+        rest, error = self._walk(R, lengths, r, pixels, unit, rule)
         x = _within_float32(x[pixels] + first * r.get()[pixels].astype(np.float64) + rest)
         found = Estimate(x, error, whole=self.pixels is None, reason=reason)
         return _gather(system, R, found) if self.gather else found
@@ -130,23 +130,26 @@ class MonteCarlo:
         return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}"
 
     def _walk(
-        self, R: CSR | Dense, lengths: Lengths, r: Array, pixels: np.ndarray, unit: np.ndarray
+        self, R: CSR | Dense, lengths: Lengths, r: Array, pixels: np.ndarray, unit: np.ndarray, rule: Rule
     ) -> Measured:
         """Estimates of the terms k >= 1, and their standard errors."""
         if self.adjoint:
-            return self._from_light(R, lengths, r)
-        walker = Walker(tables(R, self.sampler), lengths, self.estimator or "collision", self.seed)
+            return self._from_light(R, lengths, r, rule)
+        watch = sampled.watch(rule)
+        made, estimator = tables(R, self.sampler), self.estimator or "collision"
+        walker = Walker(made, lengths, estimator, self.seed, watch=watch)
         if self.error is None:
-            return _measured(walker.rows(r, pixels, 0, self.samples or _SAMPLES))
+            return _measured(walker.rows(r, pixels, 0, self.samples or self.usual))
         pilot = walker.rows(r, pixels, 0, _PILOT, _PILOT_STREAM)
         # Samples of the pilot do not count: chosen by their own spread, they would be biased.
         wanted = _PILOT * (pilot.standard_error * unit / self.error) ** 2
         counts = _rounded_up(wanted.reshape(len(pixels), -1).max(axis=1), self.samples or _MOST)
         return _each(walker, r, pixels, counts)
 
-    def _from_light(self, R: CSR | Dense, lengths: Lengths, r: Array) -> Measured:
+    def _from_light(self, R: CSR | Dense, lengths: Lengths, r: Array, rule: Rule) -> Measured:
         made, host = tables_of_columns(R), r.get()
-        walker, count = Walker(made, lengths, "endpoint", self.seed), self._count(len(host))
+        walker = Walker(made, lengths, "endpoint", self.seed, watch=sampled.watch(rule))
+        count = self._count(len(host))
         mean, error = np.zeros((2, len(host), r.columns))
         for c, column in enumerate(host.reshape(len(host), -1).T):
             made.append(r.device.upload(column))
@@ -154,7 +157,7 @@ class MonteCarlo:
         return mean.reshape(host.shape), error.reshape(host.shape)
 
     def _count(self, n: int) -> int:
-        return n * (self.samples or _SAMPLES)
+        return n * (self.samples or self.usual)
 
     def _refuse_together(self) -> None:
         """Options that exclude each other."""

@@ -7,6 +7,7 @@ true residual of what they found is measured with one product; it decides betwee
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import vectors
-from ltcl.errors import InputError
+from ltcl.errors import InputError, InputTypeError
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.stopping import Rule, System
 
@@ -43,7 +44,6 @@ def solution(
     if found.whole:
         relative, met = _residual(system, gathered(system, found.x, add=False), rule)
     if rule.callback is not None and found.whole:
-        rule.callback(0, 1.0)
         rule.callback(found.iterations, relative)
     error = found.standard_error
     return Solution(
@@ -59,6 +59,15 @@ def solution(
     )
 
 
+def watch(rule: Rule) -> Callable[[], object]:
+    """Tell the callback of a rule that sampling begins; what comes back tells it of each step, as NaN."""
+    callback, steps = rule.callback, itertools.count(1)
+    if callback is None:
+        return lambda: None
+    callback(0, 1.0)
+    return lambda: callback(next(steps), np.nan)
+
+
 def gathered(system: System, x: np.ndarray, *, add: bool = True) -> np.ndarray:
     """Final gather, x + (b - S x) = b - R x, one exact product; or b - S x alone. float64."""
     on_device = system.S.device.upload(x)
@@ -70,6 +79,12 @@ def _residual(system: System, r: np.ndarray, rule: Rule) -> tuple[float, bool]:
     norms, left = vectors.norm(system.b), np.linalg.norm(r, axis=0)
     relative = float(np.max(left / np.where(norms > 0, norms, 1.0)))
     return relative, bool(np.all(left <= np.maximum(rule.rtol * norms, rule.atol)))
+
+
+def check_whole(options: dict[str, Any]) -> None:
+    """Refuse, where a task needs whole pictures, to estimate some pixels only."""
+    if "pixels" in options:
+        raise InputTypeError("pixels= gives some pixels alone; a picture needs all: leave it out")
 
 
 def check_seed(seed: Any) -> None:

@@ -86,7 +86,8 @@ def solve(
     x0 : like b, optional
         Start; zero when not given.
     callback : callable(iteration, relative residual), optional
-        Called with every entry of `residuals`, as it is found.
+        Called with every entry of `residuals`, as it is found; of methods that sample also at each step
+        of theirs, whose residual is unknown, NaN.
     throw : bool
         Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that sample,
         whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.

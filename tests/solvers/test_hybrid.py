@@ -92,6 +92,12 @@ def test_iterations_are_those_of_jacobi_and_never_above_maxiter(device):
     assert ltcl.solve(SCENE.S, b, "hybrid", iterations=5).iterations == 5
 
 
+def test_iterations_tell_the_callback(device):
+    seen: list[tuple[int, float]] = []
+    found = ltcl.solve(SCENE.S, np.ones(43), "hybrid", iterations=2, callback=lambda *step: seen.append(step))
+    np.testing.assert_array_equal(seen, [(0, 1.0), (1, np.nan), (2, np.nan), (2, found.residual)])
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

@@ -223,6 +223,16 @@ def test_no_light_gives_none(device):
         assert not found.x.any()
 
 
+def test_launches_tell_the_callback(device, monkeypatch):
+    """While it draws there is no residual to tell: NaN, between that of the start and the one found."""
+    monkeypatch.setattr("ltcl.operators.walks._UNITS", 43)  # 14 pixels of 3 chunks a launch
+    S, _ = system(device, "a scene")
+    seen: list[tuple[int, float]] = []
+    found = ltcl.solve(S, np.ones(43), "monte_carlo", samples=192, callback=lambda *step: seen.append(step))
+    assert [step for step, _ in seen] == [0, 1, 2, 3, 4, 1]
+    np.testing.assert_array_equal([value for _, value in seen], [1.0, *[np.nan] * 4, found.residual])
+
+
 BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "no samples": ({"samples": 0}, InputError, "samples is 0; it must be a whole number of at least 1"),
     "half a sample": ({"samples": 0.5}, InputError, "samples is 0.5"),
