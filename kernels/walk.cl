@@ -49,6 +49,10 @@
 #define GO_ON_BITS 22
 #define SLOT_BITS 42  // the rest of 64
 
+// Walks that set off together: what they load comes while those of the next group are at work.
+#define GROUP (WALKS % 8 ? WALKS : 8)
+#define LANES (WALKS % 4 ? 1 : 4)  // whose random numbers are made side by side
+
 // Where an item has several walks, what one will load is asked for while the others are at work: a fifth to a
 // quarter less time a step. The language's own prefetch() does nothing in PoCL.
 #if defined(__clang__) && WALKS > 1
@@ -120,6 +124,10 @@ typedef struct {
     uint row[WALKS], step[WALKS];
     int alive[WALKS];
     real weight[WALKS];
+    ulong word[WALKS];  // of the step to come, with the record of its row, where it leads and by what factor
+    uint4 record[WALKS];
+    uint target[WALKS];
+    real factor[WALKS];
 } walks;
 
 inline void set_out(walks *walk, int units, int chunks, uint first, uint end, global const uint *pixels)
@@ -137,51 +145,66 @@ inline void set_out(walks *walk, int units, int chunks, uint first, uint end, gl
     }
 }
 
-// Start the next samples where walks have ended; 0 when there are none, and none under way.
-inline int start_ended(walks *walk)
+// The words of the next step of walks w .. w + LANES.
+inline void draw_words(walks *walk, int w, ulong seed, uint stream)
+{
+#if LANES == 4
+    const ulong4 step = convert_ulong4(vload4(0, walk->step + w));
+    ulong4 x = convert_ulong4(vload4(0, walk->pixel + w)), y = convert_ulong4(vload4(0, walk->next + w) - 1);
+    ulong4 z = step / 2, other = stream;
+    philox4(&x, &y, &z, &other, (uint)seed, (uint)(seed >> 32));
+    vstore4(select(y << 32 | x, other << 32 | z, step << 63), 0, walk->word + w);
+#else
+    uint x = walk->pixel[w], y = walk->next[w] - 1, z = walk->step[w] / 2, other = stream;
+    philox(&x, &y, &z, &other, (uint)seed, (uint)(seed >> 32));
+    walk->word[w] = walk->step[w] & 1 ? (ulong)other << 32 | z : (ulong)y << 32 | x;
+#endif
+}
+
+// Prepare one step of the walks begin .. begin + GROUP: start the next samples where walks have ended, draw the words of
+// the step and ask for the table entries that it will take. Returns whether any walk is under way. Walks that
+// have ended take the step too, from their start, and nobody looks.
+inline int set_off(
+    walks *walk, int begin, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries)
 {
     int busy = 0;
-    for (int w = 0; w < WALKS; ++w) {
-        if (!walk->alive[w] && walk->next[w] < walk->stop[w]) {
-            ++walk->next[w];
-            walk->row[w] = walk->pixel[w];
-            walk->step[w] = 0;
-            walk->weight[w] = 1;
-            walk->alive[w] = 1;
-        }
+    for (int w = begin; w < begin + GROUP; ++w) {
+        const int starts = !walk->alive[w] && walk->next[w] < walk->stop[w];
+        walk->next[w] += starts;
+        walk->alive[w] |= starts;
+        walk->step[w] = starts ? 0 : walk->step[w];
+        walk->weight[w] = starts ? 1 : walk->weight[w];
         busy |= walk->alive[w];
+    }
+    for (int w = begin; w < begin + GROUP; w += LANES)
+        draw_words(walk, w, seed, stream);
+    for (int w = begin; w < begin + GROUP; ++w) {
+        walk->record[w] = rows[walk->row[w]];
+        FETCH(entries + first_entry(walk->record[w]) + slot(walk->record[w], walk->word[w]));
     }
     return busy;
 }
 
-// The two words of 64 bits that the next two steps of each walk take.
-inline void draw_words(const walks *walk, ulong seed, uint stream, ulong words[2][WALKS])
+inline int set_off_all(
+    walks *walk, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries)
 {
-    for (int i = 0; i < WALKS; ++i) {
-        uint x = walk->pixel[i], y = walk->next[i] - 1, z = walk->step[i] / 2, w = stream;
-        philox(&x, &y, &z, &w, (uint)seed, (uint)(seed >> 32));
-        words[0][i] = (ulong)y << 32 | x;
-        words[1][i] = (ulong)w << 32 | z;
-    }
+    int busy = 0;
+    for (int begin = 0; begin < WALKS; begin += GROUP)
+        busy |= set_off(walk, begin, seed, stream, rows, entries);
+    return busy;
 }
 
-// One step of every walk: `target` gets columns and signs, `factor` what weights are multiplied by, 0 where
-// the row is empty. Walks that have ended take it too, from their start, and nobody looks. `b` may be 0.
+// The columns and signs that the walks step to, and what weights are multiplied by, 0 where the row is empty.
+// `b` may be 0.
 inline void draw_targets(
-    walks *walk, const ulong *words, global const uint4 *rows, global const ulong *entries, global const real *b,
-    int stride, uint *target, real *factor)
+    walks *walk, global const uint4 *rows, global const ulong *entries, global const real *b, int stride)
 {
-    uint4 record[WALKS];
     for (int w = 0; w < WALKS; ++w) {
-        record[w] = rows[walk->row[w]];
-        FETCH(entries + first_entry(record[w]) + slot(record[w], words[w]));
-    }
-    for (int w = 0; w < WALKS; ++w) {
-        target[w] = draw(record[w], entries, words[w], factor + w);
-        FETCH(rows + (target[w] >> 1));
+        walk->target[w] = draw(walk->record[w], entries, walk->word[w], walk->factor + w);
+        FETCH(rows + (walk->target[w] >> 1));
         if (b)
-            FETCH(b + (int)(target[w] >> 1) * stride);
-        factor[w] = record[w].z ? factor[w] : 0;
+            FETCH(b + (int)(walk->target[w] >> 1) * stride);
+        walk->factor[w] = walk->record[w].z ? walk->factor[w] : 0;
     }
 }
 
@@ -191,14 +214,17 @@ inline void end_walk(walks *walk, int w)
     walk->row[w] = walk->pixel[w];
 }
 
-// Move walk w; returns whether it goes on after its score, and in `worth` what a score is multiplied by.
-inline int move(walks *walk, int w, ulong word, uint target, real factor, global const uint2 *steps, real *worth)
+// Move walk w; returns whether it goes on after its score, and in `worth` what a score is multiplied by: left as
+// it is, 0, where the row is empty.
+inline int move(walks *walk, int w, global const uint2 *steps, real *worth)
 {
+    if (walk->factor[w] == 0)
+        return 0;
     const uint2 step = steps[walk->step[w]++];
-    walk->row[w] = target >> 1;
-    walk->weight[w] *= target & 1 ? -factor : factor;
+    walk->row[w] = walk->target[w] >> 1;
+    walk->weight[w] *= walk->target[w] & 1 ? -walk->factor[w] : walk->factor[w];
     *worth = walk->weight[w] * as_float(step.x);
-    return ((uint)word & ((1u << GO_ON_BITS) - 1)) < step.y;
+    return ((uint)walk->word[w] & ((1u << GO_ON_BITS) - 1)) < step.y;
 }
 
 kernel void walk_rows(
@@ -208,28 +234,23 @@ kernel void walk_rows(
 {
     walks walk;
     real score[WALKS][K], sum[WALKS][K], low[WALKS][K], square[WALKS][K], square_low[WALKS][K];
-    ulong words[2][WALKS];
-    uint target[WALKS];
-    real factor[WALKS];
     set_out(&walk, units, chunks, first, end, pixels);
     for (int w = 0; w < WALKS; ++w)
         for (int c = 0; c < K; ++c)
             score[w][c] = sum[w][c] = low[w][c] = square[w][c] = square_low[w][c] = 0;
-    while (start_ended(&walk)) {
-        draw_words(&walk, seed, stream, words);
-        for (int part = 0; part < 2; ++part) {
-            draw_targets(&walk, words[part], rows, entries, b, stride, target, factor);
-            for (int w = 0; w < WALKS; ++w) {
+    int busy = set_off_all(&walk, seed, stream, rows, entries);
+    while (busy) {
+        draw_targets(&walk, rows, entries, b, stride);
+        busy = 0;
+        for (int begin = 0; begin < WALKS; begin += GROUP) {
+            for (int w = begin; w < begin + GROUP; ++w) {
                 if (!walk.alive[w])
                     continue;
-                int goes_on = 0;
-                if (factor[w] != 0) {
-                    real worth;
-                    goes_on = move(&walk, w, words[part][w], target[w], factor[w], steps, &worth);
-                    if (ESTIMATOR == COLLISION || !goes_on)
-                        for (int c = 0; c < K; ++c)
-                            score[w][c] += worth * b[(int)walk.row[w] * stride + offset + c];
-                }
+                real worth = 0;
+                const int goes_on = move(&walk, w, steps, &worth);
+                if (ESTIMATOR == COLLISION || !goes_on)
+                    for (int c = 0; c < K; ++c)
+                        score[w][c] += worth * b[(int)walk.row[w] * stride + offset + c];
                 if (goes_on)
                     continue;
                 end_walk(&walk, w);
@@ -239,6 +260,7 @@ kernel void walk_rows(
                     score[w][c] = 0;
                 }
             }
+            busy |= set_off(&walk, begin, seed, stream, rows, entries);
         }
     }
     for (int w = 0; w < WALKS; ++w) {
@@ -255,27 +277,18 @@ kernel void walk_columns(
     global const ulong *entries, global const uint2 *steps, global uint *ends, global real *scores)
 {
     walks walk;
-    ulong words[2][WALKS];
-    uint target[WALKS];
-    real factor[WALKS];
     set_out(&walk, units, units, first, end, pixel);
-    while (start_ended(&walk)) {
-        draw_words(&walk, seed, stream, words);
-        for (int part = 0; part < 2; ++part) {
-            draw_targets(&walk, words[part], rows, entries, 0, 0, target, factor);
-            for (int w = 0; w < WALKS; ++w) {
-                if (!walk.alive[w])
-                    continue;
-                int goes_on = 0;
-                real worth = 0;
-                if (factor[w] != 0)
-                    goes_on = move(&walk, w, words[part][w], target[w], factor[w], steps, &worth);
-                if (goes_on)
-                    continue;
-                ends[walk.next[w] - 1 - first] = walk.row[w];
-                scores[walk.next[w] - 1 - first] = worth;
-                end_walk(&walk, w);
-            }
+    while (set_off_all(&walk, seed, stream, rows, entries)) {
+        draw_targets(&walk, rows, entries, 0, 0);
+        for (int w = 0; w < WALKS; ++w) {
+            if (!walk.alive[w])
+                continue;
+            real worth = 0;
+            if (move(&walk, w, steps, &worth))
+                continue;
+            ends[walk.next[w] - 1 - first] = walk.row[w];
+            scores[walk.next[w] - 1 - first] = worth;
+            end_walk(&walk, w);
         }
     }
 }
