@@ -15,12 +15,12 @@ import numpy as np
 
 from _harness import Options, Row, options, report, seconds
 from ltcl.scenes import FormFactor, Patches, box, cut
-from ltcl.scenes.geometry import Frame
-from ltcl.scenes.near import squared_size
+from ltcl.scenes.exchange.geometry import Frame
+from ltcl.scenes.exchange.near import squared_size
 
 TARGETS = {"numpy": 20.0, "side": 2.0}
 ACCURACY = 1e-4
-FAR = 64.0  # sizes of a pair, as ltcl.scenes.form_factor takes it
+FAR = 64.0  # sizes of a pair, as `kernels/form_factor.cl` takes it
 
 
 class Peer:

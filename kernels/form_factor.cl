@@ -17,7 +17,7 @@
 // patches. Pairs of points whose way is blocked by a box add nothing.
 //
 // Required defines: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8; LANES: 1 or 8; BLOCKS, see
-// common/blocks.h; OUTER, INNER. Optional: PACKED, see common/lanes.h.
+// common/blocks.h. Optional: PACKED, see common/lanes.h.
 // Layout: geometry is 13 rows of `pitch` reals, a multiple of LANES, one column a patch: centre, right edge,
 // down edge, normal (three rows each) and squared size, (right^2 + down^2) / 4; that of a pair is the sum.
 // Lengths are parts of the scene's size. Columns beyond the last patch hold patches without a normal. z has a
@@ -27,12 +27,10 @@
 #include "common/lanes.h"
 #include "common/spots.h"
 
-#if !defined(OUTER) || !defined(INNER)
-#error "form_factor.cl needs -DOUTER=<sizes of a pair beyond which centres do> and -DINNER=<and eight points>"
-#endif
-
 enum { CENTRE, RIGHT, DOWN, NORMAL, SIZE };
 
+#define OUTER 64.0f
+#define INNER 12.0f
 #define PI 3.14159265f  // M_PI_F may be a double
 // Radius of the circle that carries the eight points, in edges: sqrt(2/3) / 2. Stroud, Approximate
 // Calculation of Multiple Integrals, 1971, C_n 3-1 for n = 4.

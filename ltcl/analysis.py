@@ -14,6 +14,7 @@ from ltcl import checks, energy, reciprocity, theory
 from ltcl.energy import Energy
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
+from ltcl.single_view import negative_bounces
 from ltcl.solvers.survey import survey
 from ltcl.transport import Transport, require
 
@@ -49,6 +50,9 @@ class ChannelAnalysis:
     first_bounce : (smallest, median, largest)
     reciprocity_defect : float
         0 of a Lambertian scene without noise; see `ltcl.reciprocity`.
+    negative_bounce : float
+        Light that one bounce takes away: 0 of a Lambertian scene, above 0.005 of glossy ones; see
+        `ltcl.single_view`.
     energy : Energy
     """
 
@@ -66,6 +70,7 @@ class ChannelAnalysis:
     series: tuple[theory.Terms, ...]
     first_bounce: tuple[float, float, float]
     reciprocity_defect: float
+    negative_bounce: float
     energy: Energy
 
 
@@ -129,12 +134,13 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
         nbytes=T.nbytes,
         masked=int(T.masked.sum()),
         channels=tuple(
-            _channel(matrix, f, S, rtol) for matrix, f, S in zip(T.matrices, F, T.systems, strict=True)
+            _channel(matrix, f, S, negative, rtol)
+            for matrix, f, S, negative in zip(T.matrices, F, T.systems, negative_bounces(T), strict=True)
         ),
     )
 
 
-def _channel(T: Any, F: np.ndarray, S: IdentityPlus, rtol: float) -> ChannelAnalysis:
+def _channel(T: Any, F: np.ndarray, S: IdentityPlus, negative: float, rtol: float) -> ChannelAnalysis:
     try:
         norms = S.R.norms()
     except InputError:
@@ -160,6 +166,7 @@ def _channel(T: Any, F: np.ndarray, S: IdentityPlus, rtol: float) -> ChannelAnal
         series=theory.after_terms(_albedo(rho)),
         first_bounce=(float(lit.min()), float(np.median(lit)), float(lit.max())),
         reciprocity_defect=reciprocity.defect(T, F),
+        negative_bounce=negative,
         energy=energy.check(T, F, S),
     )
 

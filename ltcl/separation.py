@@ -10,8 +10,8 @@ Equal to the paper's chain b_k = b_(k-1) - X b_(k-1) in exact arithmetic; in thi
 rest add up to the picture whatever the tolerance of the solves. Nothing is clipped on the way.
 
 One projector and one camera see T = P S F Q (eq. 28), and bounces are exact of Lambertian scenes only
-(eq. 29, section 8.4): elsewhere P A^k F Q is no power of anything that T tells. A T that is far from
-reciprocal gives such a scene away, and the result then carries a warning.
+(eq. 29, section 8.4): elsewhere P A^k F Q is no power of anything that T tells. A T whose I - S^-1 takes
+light away, or that is far from reciprocal, gives such a scene away: the result then carries a warning.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ import numpy as np
 
 from ltcl import checks, layout
 from ltcl.operators import Operator
+from ltcl.single_view import negative_bounces
 from ltcl.solvers import Solution, sampled, solve
 from ltcl.transport import Transport, require
 
 logger = logging.getLogger(__name__)
 
-LAMBERTIAN = (
-    0.1  # largest reciprocity defect of a scene taken for Lambertian; path tracing noise alone gives 0.05
-)
+# Of a scene taken for Lambertian: noise of path tracing alone gives a defect of 0.05 and takes 0.0004.
+LARGEST_DEFECT = 0.1
+LARGEST_NEGATIVE = 0.005
 
 
 @dataclass(frozen=True, repr=False)
@@ -52,8 +53,12 @@ class Separation:
         Solves in the order direct, first bounce, ...; per entry one Solution, or 3 in colour.
     reciprocity_defect : float
         Of T, see `ltcl.reciprocity`: 0 of a Lambertian scene measured without noise; NaN where unknown.
+    negative_bounce : float
+        Share of light that a bounce as T has it would take away, see `ltcl.single_view`: 0 of a Lambertian
+        scene. The first bounce of a glossy scene is off by a few times as much, later ones by more.
     warning : str
-        Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 or unknown.
+        Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 and the
+        negative light at most 0.005, or unknown.
     """
 
     direct: np.ndarray
@@ -62,6 +67,7 @@ class Separation:
     rest: np.ndarray
     solutions: tuple[Solution | tuple[Solution, ...], ...]
     reciprocity_defect: float = float("nan")
+    negative_bounce: float = float("nan")
     warning: str = ""
 
     def __repr__(self) -> str:
@@ -117,7 +123,8 @@ def separate(
         return shape.pack(parts, T.grid).astype(np.float32)
 
     direct, *indirect = [picture([chain.bounces[k] for chain in chains]) for k in range(bounces + 1)]
-    warning = _warning(T.reciprocity_defect)
+    negative = max(negative_bounces(T))
+    warning = _warning(T.reciprocity_defect, negative)
     if warning:
         logger.warning(warning)
     per_bounce = [tuple(chain.solutions[k] for chain in chains) for k in range(bounces + 1)]
@@ -128,17 +135,23 @@ def separate(
         rest=picture([chain.rest for chain in chains]),
         solutions=tuple(found[0] if T.channels == 1 else found for found in per_bounce),
         reciprocity_defect=T.reciprocity_defect,
+        negative_bounce=negative,
         warning=warning,
     )
 
 
-def _warning(defect: float) -> str:
-    if not defect > LAMBERTIAN:  # nor where it is unknown
+def _warning(defect: float, negative: float) -> str:
+    """What is wrong with T for a separation; nothing where both are small, or unknown."""
+    found = []
+    if defect > LARGEST_DEFECT:
+        found.append(f"T is not reciprocal (defect {defect:.2g}, above {LARGEST_DEFECT:g})")
+    if negative > LARGEST_NEGATIVE:
+        found.append(f"a bounce takes away {negative:.2g} of its light (above {LARGEST_NEGATIVE:g})")
+    if not found:
         return ""
     return (
-        f"T is not reciprocal (defect {defect:.2g}, above {LAMBERTIAN:g}): surfaces reflect differently to "
-        "different sides, or T is noisy; with one camera the bounces of such a scene are approximate "
-        "(section 8.4, eq. 28 and 29)"
+        f"{' and '.join(found)}: surfaces reflect differently to different sides, or T is noisy; with one "
+        "camera the bounces of such a scene are approximate (section 8.4, eq. 28 and 29)"
     )
 
 

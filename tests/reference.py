@@ -390,7 +390,14 @@ def form_factor_pair(
     return np.divide(here * there, np.pi * r2**2, out=np.zeros_like(r2), where=faces)
 
 
-def form_factor_entries(geometry: np.ndarray, blocks: np.ndarray, outer: float, inner: float) -> np.ndarray:
+def form_factor_pairs(G: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """G_ij of listed pairs, (P,)."""
+    return G[i, j]
+
+
+def form_factor_entries(
+    geometry: np.ndarray, blocks: np.ndarray, outer: float = 64, inner: float = 12
+) -> np.ndarray:
     """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6); see `kernels/form_factor.cl`."""
     centre, right, down, normal = (geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4))
     angle = np.arange(8) * np.pi / 4
@@ -455,10 +462,23 @@ def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     return result
 
 
-def visibility_rows(starts: np.ndarray, ends: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """Share of the rays from starts (rays, 3, M) to ends (rays, 3, N) that meet no box, (M, N)."""
-    rays = zip(starts, ends, strict=True)
-    return np.mean([~blocked(a.T[:, None], b.T[None], blocks) for a, b in rays], axis=0)
+def visibility_rows(
+    starts: np.ndarray, ends: np.ndarray, normals: np.ndarray, blocks: np.ndarray
+) -> np.ndarray:
+    """Of the rays from starts to ends (rays, 3, N) before both normals (3, N), the share that meet no box."""
+    faced, count = np.zeros((2, starts.shape[2], ends.shape[2]))
+    for a, b in zip(starts.astype(np.float64), ends.astype(np.float64), strict=True):
+        d = b.T[None] - a.T[:, None]
+        facing = (np.einsum("mnc,cm->mn", d, normals) > 1e-6) & (np.einsum("mnc,cn->mn", d, normals) < -1e-6)
+        faced += facing
+        count += facing & ~blocked(a.T[:, None], b.T[None], blocks)
+    return np.divide(count, faced, out=np.ones_like(count), where=faced > 0)
+
+
+def visibility_pairs(i: np.ndarray, j: np.ndarray, *rays: np.ndarray) -> np.ndarray:
+    """The same of listed pairs, (P,)."""
+    starts, ends, normals, blocks = rays
+    return visibility_rows(starts, ends, normals, blocks)[i, j]
 
 
 def gamma(roundings: float) -> float:

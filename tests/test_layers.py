@@ -32,6 +32,7 @@ LAYERS: list[set[str]] = [
     {"solvers"},
     {
         "compensation",
+        "single_view",
         "separation",
         "relighting",
         "analysis",
@@ -52,6 +53,8 @@ SIDEWAYS = {
     ("transport", "inverse_diagonal"),
     ("inverse_diagonal", "theory"),
     ("analysis", "energy"),
+    ("separation", "single_view"),
+    ("analysis", "single_view"),
 }  # the imports allowed within one layer
 NEVER = {(a, b) for a in ("acquisition", "images", "store") for b in ("device", "operators")}
 OPENCL = ("device", "pyopencl")  # the one unit that imports it

@@ -174,6 +174,7 @@ def test_a_diffuse_scene_carries_no_warning(device, caplog):
     T = transport(device)
     b = ltcl.separate(T, T @ np.ones(GRID), bounces=1)
     assert b.reciprocity_defect < 1e-5
+    assert b.negative_bounce < 1e-5
     assert b.warning == ""
     assert not caplog.records
 

@@ -80,6 +80,7 @@ def _show(found: list[dict[str, Any]], rtol: float) -> None:
     typer.echo("\nChecks of the measurement")
     columns = (
         "reciprocity defect",
+        "one bounce takes",
         "one bounce keeps",
         "albedo by columns",
         "negative entries",
@@ -130,6 +131,7 @@ def _checks(channel: dict[str, Any]) -> tuple:
     energy = channel["energy"]
     return (
         channel["reciprocity_defect"],
+        _percent(channel["negative_bounce"]),
         _between(energy["bounce_lowest"], energy["bounce_highest"]),
         energy["albedo_from_columns"],
         _percent(energy["negative_entries"]),

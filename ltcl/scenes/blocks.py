@@ -70,23 +70,6 @@ class Block:
         """Which of some points (..., 3) lie inside it, (...) bool."""
         return np.all((points > self.low) & (points < self.high), axis=-1)
 
-    def blocks(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Whether the straight ways from points `start` to `end`, both (..., 3), pass through it, (...) bool.
-
-        A way along a face, or one that ends there, passes.
-        """
-        centre = (self.low + self.high) / 2
-        # A rounding error smaller, so that its own faces see past their edges.
-        half = (self.high - self.low) / 2 * (1 - 1e-9)
-        way, middle = (end - start) / 2, (end + start) / 2 - centre
-        reach = np.abs(way)
-        apart = np.any(np.abs(middle) > reach + half, axis=-1)
-        # Separating axes across the way and an edge (Ericson, Real-Time Collision Detection, 5.3.3).
-        for i, j in ((1, 2), (2, 0), (0, 1)):
-            moment = np.abs(middle[..., i] * way[..., j] - middle[..., j] * way[..., i])
-            apart |= moment > half[i] * reach[..., j] + half[j] * reach[..., i]
-        return ~apart
-
     def _face(self, name: str, axis: int, sign: int) -> Wall:
         normal = np.zeros(3)
         normal[axis] = sign

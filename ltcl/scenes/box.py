@@ -15,8 +15,8 @@ from typing import Any
 from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.scenes.assembly import assemble
 from ltcl.scenes.blocks import Block
+from ltcl.scenes.exchange.assembly import assemble
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall
@@ -77,8 +77,8 @@ def box(
 
     Notes
     -----
-    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.cube_tables`; past an occluder they are
-    sampled, see `ltcl.scenes.occlusion`.
+    Figures 4 and 5 of the paper. Exact form factors, see `ltcl.scenes.exchange.cube_tables`; past an
+    occluder they are sampled, see `ltcl.scenes.exchange.occlusion`.
 
     Examples
     --------

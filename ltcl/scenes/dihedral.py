@@ -10,9 +10,9 @@ import math
 from typing import Any
 
 from ltcl import checks
-from ltcl.scenes import oblique
-from ltcl.scenes.assembly import assemble
 from ltcl.scenes.box import WALLS
+from ltcl.scenes.exchange import oblique
+from ltcl.scenes.exchange.assembly import assemble
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall
@@ -45,8 +45,8 @@ def dihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
 
     Notes
     -----
-    Figure 9 of the paper. Exact form factors, see `ltcl.scenes.cube_tables` for the right angle and
-    `ltcl.scenes.oblique` for others.
+    Figure 9 of the paper. Exact form factors, see `ltcl.scenes.exchange.cube_tables` for the right angle and
+    `ltcl.scenes.exchange.oblique` for others.
 
     Examples
     --------

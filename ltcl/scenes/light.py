@@ -15,6 +15,7 @@ import numpy as np
 
 from ltcl.errors import InputError
 from ltcl.scenes.blocks import Block, point
+from ltcl.scenes.rays import clear
 from ltcl.scenes.walls import Vector, Wall
 
 _POINTS = 8
@@ -72,18 +73,6 @@ def _on_wall(
     points = np.asarray(wall.corner) + u * np.asarray(wall.right) + v * np.asarray(wall.down)
     ways = light - points
     arrives = np.maximum(ways @ wall.normal, 0) / np.linalg.norm(ways, axis=-1) ** 3
-    for block in blocks:
-        arrives[block.blocks(points, light)] = 0
-    for other in (*walls[:number], *walls[number + 1 :]):
-        arrives[_through(other, points, light)] = 0
+    boxes = np.array([(block.low, block.high) for block in blocks]).reshape(-1, 2, 3)
+    arrives *= clear(walls, points.reshape(-1, 3), light, boxes).reshape(arrives.shape)
     return arrives.reshape(h, _POINTS, w, _POINTS).mean(axis=(1, 3))
-
-
-def _through(wall: Wall, points: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """Which ways from points (..., 3) to the light pass through a wall, (...) bool."""
-    height, above = (points - wall.corner) @ wall.normal, float((light - wall.corner) @ wall.normal)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        meets = points + (height / (height - above))[..., None] * (light - points)
-    place = (meets - wall.corner) @ np.linalg.pinv(np.stack([wall.right, wall.down]).astype(np.float64))
-    inside = np.all((place > 0) & (place < 1), axis=-1)
-    return inside & (height * above < 0)

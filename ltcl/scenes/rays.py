@@ -17,6 +17,8 @@ from ltcl.scenes.walls import Wall
 
 _EDGE = 1e-9  # of a wall's side: rays that aim at a seam must not slip through it
 _START = 1e-9  # of a ray's length: a ray does not meet the surface it starts from
+_HAIR = 1e-9  # of a block's side: what runs along a face is not stopped by it
+_END = 1e-9  # of a ray's length: the place that it aims at may lie on a surface
 _FACE = 1e-9  # of a ray's length: walls are in front of the face of a block that they lie on
 
 
@@ -54,8 +56,8 @@ def cast(
     origins, directions : ndarray, (R, 3)
         Directions need not be unit vectors.
     blocks : ndarray, (B, 2, 3)
-        Opaque boxes along the axes, lowest and highest corner, as `ltcl.scenes.geometry.check_blocks` returns
-        them. Walls on their faces reflect.
+        Opaque boxes along the axes, lowest and highest corner, as
+        `ltcl.scenes.exchange.geometry.check_blocks` returns them. Walls on their faces reflect.
 
     Examples
     --------
@@ -75,6 +77,25 @@ def cast(
     for low, high in blocks:
         _meet_block(found, low, high, origins, directions)
     return found
+
+
+def clear(
+    walls: Sequence[Wall],
+    origins: np.ndarray,
+    place: np.ndarray,
+    blocks: Sequence[np.ndarray] | np.ndarray = (),
+) -> np.ndarray:
+    """Whether nothing stands between points (R, 3) and a place (3,), or a place (R, 3) each; (R,) bool.
+
+    Walls, from either side, and blocks are as in `cast`. The points and the place may lie on them.
+
+    Examples
+    --------
+    >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
+    >>> clear([floor], np.array([[0.5, 0.5, 0], [0.5, 0.5, -1]]), np.array([0.5, 0.5, 1])).tolist()
+    [True, False]
+    """
+    return cast(walls, origins, place - origins, blocks).distance >= 1 - _END
 
 
 def _meet_wall(found: Hits, number: int, wall: Wall, origins: np.ndarray, directions: np.ndarray) -> None:
@@ -99,6 +120,8 @@ def _meet_block(
     found: Hits, low: np.ndarray, high: np.ndarray, origins: np.ndarray, directions: np.ndarray
 ) -> None:
     """Enter the rays that meet this block first: the method of slabs."""
+    hair = _HAIR * (high - low)
+    low, high = low + hair, high - hair
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.stack([(low - origins) / directions, (high - origins) / directions])
     enter, leave = np.min(ends, axis=0).max(axis=1), np.max(ends, axis=0).min(axis=1)

@@ -16,18 +16,17 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes import crossing, exchange
 from ltcl.scenes import light as lighting
 from ltcl.scenes import viewer as viewing
 from ltcl.scenes.blocks import Block
+from ltcl.scenes.exchange import crossing
+from ltcl.scenes.exchange import transport as exchange
 from ltcl.scenes.viewer import Viewer
-from ltcl.scenes.walls import Wall, check_albedo
+from ltcl.scenes.walls import Wall
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
     from ltcl.device import Device
-
-_LONGEST = 32766  # pixels along an image that OpenCV can still address
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,19 +83,8 @@ class Scene:
             raise InputError("walls are 0; a scene needs at least one")
         if w % len(self.walls):
             raise InputError(f"walls are {len(self.walls)}; they must divide the {w} columns of the grid")
-        for name, shapes in {
-            "form_factors": [(h * w, h * w)],
-            "albedo": [(1, h * w), (3, h * w)],
-            "area": [(h * w,)],
-        }.items():
-            value = checks.real(name, getattr(self, name)).astype(np.float64, copy=False)
-            checks.finite(name, checks.shape(name, value, *shapes))
-            # A view, so that the caller's own array stays writeable.
-            value = value.view()
-            value.flags.writeable = False
+        for name, value in exchange.checked(self.form_factors, self.albedo, self.area, h * w).items():
             object.__setattr__(self, name, value)
-        check_albedo(self.albedo)
-        exchange.check(self.form_factors, self.area)
         crossing.refuse((*self.walls, *self._screens))
         viewing.frame(self.viewer, self.walls)
 
@@ -112,7 +100,10 @@ class Scene:
 
     @property
     def A(self) -> np.ndarray | tuple[np.ndarray, ...]:
-        """One physical bounce, diag(albedo) @ form_factors (eq. 4): (N, N), or a tuple of three."""
+        """One physical bounce, diag(albedo) @ form_factors (eq. 4): (N, N), or a tuple of three.
+
+        `ltcl.scenes.FormFactor.of` gives it as operators that store no matrix.
+        """
         self._fits(self.channels)
         bounces = tuple(albedo[:, None] * self.form_factors for albedo in self.albedo)
         return bounces[0] if self.channels == 1 else bounces
@@ -134,7 +125,7 @@ class Scene:
 
         Notes
         -----
-        Eq. 4 of the paper, solved by Cholesky, see `ltcl.scenes.exchange`.
+        Eq. 4 of the paper, solved by Cholesky, see `ltcl.scenes.exchange.transport`.
 
         Examples
         --------
@@ -232,10 +223,8 @@ class Scene:
         >>> max(image.shape), float(image.max())
         (64, 1.0)
         """
-        picture = checks.finite("picture", checks.real("picture", picture))
-        checks.shape("picture", picture, self.grid, (*self.grid, 3))
-        size, supersample = checks.count("size", size), checks.count("supersample", supersample)
-        _addressable("size", size)
+        picture, size = viewing.check_picture(picture, self.grid), viewing.check_size(size)
+        supersample = checks.count("supersample", supersample)
         return viewing.draw(self.viewer, self.walls, picture, size, supersample, self._screens)
 
     def sample(self, image: Any) -> np.ndarray:
@@ -265,11 +254,7 @@ class Scene:
         >>> dihedral(8).sample(landscape(60, 80)).shape
         (8, 16, 3)
         """
-        image = checks.finite("image", checks.real("image", image))
-        if image.ndim not in (2, 3) or image.size == 0 or image.shape[2:] not in ((), (3,)):
-            raise InputError(f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty")
-        _addressable("image", max(image.shape))
-        return viewing.read(self.viewer, self.walls, image, self.grid, self._screens)
+        return viewing.read(self.viewer, self.walls, viewing.check_image(image), self.grid, self._screens)
 
     def irradiance(self, light: Any) -> np.ndarray:
         """Light that falls on each patch straight from a point, shadows included, largest value 1.
@@ -312,8 +297,3 @@ class Scene:
         pixels = len(self.area)
         what = f"{matrices} matrix(es) of {pixels} x {pixels} for the scene {self.name}"
         checks.fits_host(what, matrices * 8 * pixels**2)
-
-
-def _addressable(name: str, longest: int) -> None:
-    if longest > _LONGEST:
-        raise InputError(f"{name} has {longest} pixels along a side; it must have at most {_LONGEST}")

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.scenes import oblique
-from ltcl.scenes.assembly import assemble
+from ltcl.scenes.exchange import oblique
+from ltcl.scenes.exchange.assembly import assemble
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall, vector
@@ -46,7 +46,7 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
 
     Notes
     -----
-    Exact form factors, see `ltcl.scenes.oblique`.
+    Exact form factors, see `ltcl.scenes.exchange.oblique`.
 
     Examples
     --------

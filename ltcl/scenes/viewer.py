@@ -15,18 +15,44 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 
+from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes import crossing
+from ltcl.scenes.exchange import crossing
 from ltcl.scenes.walls import Vector, Wall
 
+_LONGEST = 32766  # pixels along an image that OpenCV can still address
 _MARGIN = 0.03  # of the larger side, left free around the walls
 _BAND = 32  # output rows drawn at a time, so that supersampling stays small in memory
 _EDGE = 1e-9  # of a wall: points so far beside it count as on it, lest seams show as cracks
 _MOST_POINTS = 16  # along a patch: 256 points give a mean good to a fraction of a percent
+
+
+def check_picture(picture: Any, grid: tuple[int, int]) -> np.ndarray:
+    """Return `picture` if it is on the grid, (h, w) or (h, w, 3), and finite."""
+    picture = checks.finite("picture", checks.real("picture", picture))
+    return checks.shape("picture", picture, grid, (*grid, 3))
+
+
+def check_image(image: Any) -> np.ndarray:
+    """Return `image` if it is one, (H, W) or (H, W, 3), finite and not too large."""
+    image = checks.finite("image", checks.real("image", image))
+    if image.ndim not in (2, 3) or image.size == 0 or image.shape[2:] not in ((), (3,)):
+        raise InputError(f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty")
+    check_size(max(image.shape), "image")
+    return image
+
+
+def check_size(longest: Any, name: str = "size") -> int:
+    """Return the pixels along the longer side of an image if they can be addressed."""
+    longest = checks.count(name, longest)
+    if longest > _LONGEST:
+        raise InputError(f"{name} has {longest} pixels along a side; it must have at most {_LONGEST}")
+    return longest
 
 
 @dataclass(frozen=True)
@@ -164,7 +190,8 @@ def read(
 
 def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(..., 2) from homogeneous (..., 3)."""
-    mapped = points @ homography.T
+    # Not by matmul: of finite numbers some BLAS report a division by zero (numpy issue 29820).
+    mapped = np.einsum("...j,ij->...i", points, homography)
     return mapped[..., :2] / mapped[..., 2:]
 
 

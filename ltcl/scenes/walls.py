@@ -16,7 +16,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes.cube_tables import parallel, perpendicular
+from ltcl.scenes.exchange.cube_tables import parallel, perpendicular
 
 Vector = tuple[float, float, float]
 

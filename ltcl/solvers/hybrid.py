@@ -64,8 +64,9 @@ class Hybrid:
     def estimate(self, system: System, x: np.ndarray, r: Array, rule: Rule, unit: np.ndarray) -> Estimate:
         """`x` plus what the iterations make of its residual r, started from zero."""
         R, sign = rows_of_R(system.S, self.name)
+        made = tables(R, self.sampler)  # rows that overflow have no spectral radius either
         count = self._iterations(R, rule)
-        walker = Walker(tables(R, self.sampler), whole(np.array([-sign])), "endpoint", self.seed)
+        walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed)
         pixels, start = np.arange(len(x)), r.get().astype(np.float64)
         l, watch = start, sampled.watch(rule)
         for k in range(count):

@@ -5,7 +5,9 @@
 
 A walk samples one path, its entries in proportion to |R_ij| (eq. 25), its length by eq. 24. The forward dual
 (eq. 22) is the same on I - A. A pixel costs the same whether others are asked for or not: it is for a few
-pixels and for previews, not for a whole picture to 1 %, where any iteration is faster.
+pixels and for previews, not for a whole picture to 1 %, where any iteration is faster. All right-hand
+sides share their walks: frames and colours of one S cost one walk a sample. The three S of a transport in
+colour have tables and walks of their own.
 
 The series needs rho(|R|) < 1, and a finite variance some more (`ltcl.theory.walks`); elsewhere it is refused.
 ``series="chebyshev"`` samples a polynomial of finite degree instead, which converges for every albedo; its

@@ -100,8 +100,8 @@ def chance_to_go_on(radius: float, albedo: float | None) -> float:
     m = checks.number("albedo", albedo, above=0.0)
     if m >= 0.5 or m / (1.0 - m) > _LONGEST:
         raise InputError(
-            f"albedo is {m:g}; the lengths of walks (eq. 24) need m below 1/2: "
-            "above, use series='chebyshev' or method='chebyshev'"
+            f"albedo is {m:g}; walks go on with chance m / (1 - m) (eq. 24), so they need m below 1/2: "
+            "from there on use series='chebyshev' or method='chebyshev'"
         )
     q = m / (1.0 - m)
     if not radius < q:

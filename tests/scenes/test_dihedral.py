@@ -10,7 +10,7 @@ import pytest
 
 from ltcl.errors import InputError, MemoryLimitError
 from ltcl.scenes import dihedral
-from ltcl.scenes.cube_tables import perpendicular
+from ltcl.scenes.exchange.cube_tables import perpendicular
 
 N = 6
 

@@ -8,7 +8,7 @@ import pytest
 
 from ltcl.scenes.blocks import Block
 from ltcl.scenes.box import WALLS
-from ltcl.scenes.rays import cast
+from ltcl.scenes.rays import cast, clear
 from ltcl.scenes.walls import Wall
 
 FLOOR = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
@@ -84,3 +84,16 @@ def test_wall_on_the_face_of_a_block_is_in_front_of_it() -> None:
     assert hits.distance == pytest.approx(alone.distance)
     away = cast(block.faces(), origins + hits.distance[:, None] * (aims - origins), origins - aims, corners)
     assert np.isinf(away.distance).all()
+
+
+def test_places_on_surfaces_are_reached_from_their_front() -> None:
+    """A lamp that touches a ceiling, and one on top of a block: rounding must not hide them."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.random((500, 2)), np.zeros((500, 1))], axis=1)
+    ceiling = Wall("ceiling", corner=(0, 0, 0.7), right=(1, 0, 0), down=(0, 1, 0))  # faces down
+    assert clear([ceiling], points, np.array([0.3, 0.4, 0.7])).all()
+    assert not clear([ceiling], points, np.array([0.3, 0.4, 0.9])).any()
+    block = np.array([[(0.2, 0.2, 0.1), (0.4, 0.4, 0.1 + 0.2)]])
+    top, above = np.array([0.3, 0.3, 0.1 + 0.2]), points + np.array([0, 0, 1])
+    assert clear((), above, top, block).all()
+    assert not clear((), points, top, block).any()

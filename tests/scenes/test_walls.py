@@ -11,7 +11,7 @@ import pytest
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.scenes.box import WALLS
-from ltcl.scenes.cube_tables import parallel, perpendicular
+from ltcl.scenes.exchange.cube_tables import parallel, perpendicular
 from ltcl.scenes.walls import Wall, form_factors, spread_albedo
 
 

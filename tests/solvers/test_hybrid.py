@@ -114,6 +114,14 @@ def test_bad_options_are_refused_in_one_line(device, options, says):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("value", [3e38, 1e38])
+def test_rows_that_overflow_are_refused(device, value):
+    R = np.zeros((4, 4))
+    R[2] = value
+    with pytest.raises(InputError, match=r"1 row\(s\) of R, first of row 2, sum to more than float32 holds"):
+        ltcl.solve(IdentityPlus(Dense(device, R)), np.ones(4), "hybrid")
+
+
 def test_where_jacobi_diverges_it_is_refused(device):
     S = IdentityPlus(Dense(device, lambertian(30, 1.2).R))
     with pytest.raises(InputError, match=r"spectral radius of R is 1.2; method='hybrid' .*chebyshev"):

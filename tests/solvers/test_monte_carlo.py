@@ -12,6 +12,7 @@ import scipy.sparse
 import ltcl
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.operators import CSR, Dense, Host, IdentityPlus
+from ltcl.operators.walks import Walker
 from ltcl.solvers import Solution, Status
 from tests import gallery
 from tests.problems import enclosure, lambertian, residual
@@ -152,6 +153,31 @@ def test_pixels_cost_and_get_the_same_alone(device):
     assert some.status is Status.SAMPLED
     assert some.products == 0
     assert "unknown of some pixels alone" in str(some)
+
+
+def test_one_pixel_takes_no_walks_of_the_others(device, monkeypatch):
+    """A launch has the chunks of 64 samples of the pixels that are asked for, and no more."""
+    S, _ = system(device, "a scene")
+    launched: list[int] = []
+    launch = Walker._launch
+
+    def spy(self: Walker, name: str, estimator: str, width: int, units: int, *rest: object) -> None:
+        launched.append(units)
+        launch(self, name, estimator, width, units, *rest)
+
+    monkeypatch.setattr(Walker, "_launch", spy)
+    ltcl.solve(S, np.ones(43), "monte_carlo", samples=128)
+    ltcl.solve(S, np.ones(43), "monte_carlo", samples=128, pixels=[17])
+    assert launched == [43 * 2, 2]
+
+
+def test_right_hand_sides_share_their_walks(device):
+    """Three colours of one S: the samples of each are those that it gets alone."""
+    S, _ = system(device, "a scene")
+    b = gallery.vectors(43, 3)
+    together = ltcl.solve(S, b, "monte_carlo", samples=100, seed=3)
+    for column, x in zip(b.T, together.x.T, strict=True):
+        np.testing.assert_array_equal(x, ltcl.solve(S, column, "monte_carlo", samples=100, seed=3).x)
 
 
 @pytest.mark.parametrize("options", [{}, {"gather": True}, {"adjoint": True}, {"error": 0.01}])

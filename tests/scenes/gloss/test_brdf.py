@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ltcl.errors import InputError
-from ltcl.scenes import directions
-from ltcl.scenes.brdf import lobe
+from ltcl.scenes.gloss import directions
+from ltcl.scenes.gloss.brdf import lobe
 
 VECTORS = directions.from_square(np.random.default_rng(0).random((40, 2)))
 

@@ -24,7 +24,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ltcl import checks
-from ltcl.scenes import contours
+from ltcl.scenes.exchange import contours
 from ltcl.scenes.walls import Wall
 
 _TIERS = ((12.0, 3), (4.0, 4), (2.5, 5), (2.0, 6), (1.5, 8))
@@ -48,7 +48,7 @@ def exchange(first: Wall, second: Wall, n: int) -> np.ndarray:
     --------
     >>> slope = Wall("slope", corner=(0, 0, 0), right=(0, 1, 0), down=(0.5, 0, 0.75**0.5))
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
-    >>> from ltcl.scenes.cube_tables import perpendicular
+    >>> from ltcl.scenes.exchange.cube_tables import perpendicular
     >>> upright = Wall("upright", corner=(0, 0, 1), right=(0, 1, 0), down=(0, 0, -1))
     >>> bool(np.isclose(exchange(upright, floor, 1).item(), perpendicular(1).item(), rtol=1e-9))
     True

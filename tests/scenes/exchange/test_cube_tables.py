@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import dblquad
 
 from ltcl.errors import InputError
-from ltcl.scenes.cube_tables import NEAR, parallel, perpendicular
+from ltcl.scenes.exchange.cube_tables import NEAR, parallel, perpendicular
 
 
 def point_to_rectangle(point: np.ndarray, normal: np.ndarray, corners: np.ndarray) -> float:

@@ -11,9 +11,9 @@ import numpy as np
 
 from ltcl.errors import InputError
 from ltcl.scenes.blocks import point
-from ltcl.scenes.geometry import check_blocks
+from ltcl.scenes.exchange.geometry import check_blocks
 from ltcl.scenes.patches import Patches
-from ltcl.scenes.rays import cast
+from ltcl.scenes.rays import clear
 from ltcl.scenes.walls import Wall
 
 _POINTS = 4  # along a patch
@@ -61,7 +61,7 @@ def sight(name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks
     v, u = (part.ravel()[:, None] for part in np.meshgrid(step, step, indexing="ij"))
     origins = patches.centre[:, None] + u * patches.right[:, None] + v * patches.down[:, None]
     origins = origins.reshape(-1, 3)
-    free = cast(walls, origins, place - origins, boxes).distance >= 1.0
+    free = clear(walls, origins, place, boxes)
     share = np.where(towards[:, 2] > 0, free.reshape(len(patches), -1).mean(axis=1), 0.0)
     if not share.any():
         raise InputError(

@@ -4,9 +4,9 @@
     S = (I - A)^-1,    A = K G (eq. 4),    T = P F Q + P A F Q + P A^2 F Q + ...    (eq. 29)
 
 A light field gives each of N patches M + 1 values. Leaving a patch: radiance into M bins of directions
-(`ltcl.scenes.directions`), and last the radiance towards the camera. Arriving: radiance from the M bins,
-and last the irradiance from the projector. G (`ltcl.scenes.beams`) carries light between bins; K
-(`ltcl.scenes.brdf`) reflects, block by block; F is K too, as it meets the projector's light. So P and Q only
+(`directions`), and last the radiance towards the camera. Arriving: radiance from the M bins,
+and last the irradiance from the projector. G (`beams`) carries light between bins; K
+(`brdf`) reflects, block by block; F is K too, as it meets the projector's light. So P and Q only
 pick and place the last values: camera and projector have the exact direction they see a patch from, not that
 of the nearest bin, and what P picks is a final gather over the light that arrives. Only between patches is
 light spread over bins.

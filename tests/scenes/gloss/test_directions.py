@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ltcl.errors import InputError
-from ltcl.scenes import directions
+from ltcl.scenes.gloss import directions
 
 
 def test_square_to_directions_and_back() -> None:

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Which part of a patch another one sees past opaque boxes: V (N, N), symmetric, 1 where nothing is between.
 
-V_ij is the share of s^2 rays between patches i and j that meet no box. Each patch has s x s points, one at
-random in each cell of a regular division, and ray k joins point k of one patch with point partner(k) of the
-other, where partner is a fixed random exchange: both directions have the same rays, so V = V^T to the bit.
+V_ij is the share of the rays between the fronts of patches i and j that meet no box. Rays that leave or
+meet a back carry no light and do not count: where the plane of one patch cuts the other, V is that of the
+part in front, as F is. Where no ray joins two fronts V is 1; there F is 0, or next to it.
+
+Each patch has s x s points, one at random in each cell of a regular division, and ray k joins point k of one
+patch with point partner(k) of the other, where partner is a fixed random exchange: both directions have the
+same rays, so V = V^T to the bit.
 
 Known limit: V counts rays, it is not weighted by the cosines along them; the standard error of an entry in
 a penumbra is at most 1 / (2 s), less as the points are spread evenly.
@@ -16,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import Device, open_device
+from ltcl.device import Array, Device, open_device
 from ltcl.errors import InputError
-from ltcl.scenes import geometry
-from ltcl.scenes.geometry import Frame
+from ltcl.scenes.exchange import geometry
+from ltcl.scenes.exchange.geometry import Frame
 from ltcl.scenes.patches import Patches
 
 _LAUNCH = 1 << 30  # tests of a ray and a box in one launch: a fraction of a second, also for slow devices
@@ -42,21 +46,27 @@ class Rays:
     def __init__(self, patches: Patches, blocks: np.ndarray, device: Device, samples: int) -> None:
         self.device, self.count, self.rays, self.boxes = device, len(patches), samples**2, len(blocks)
         frame = Frame.of(patches)
-        points = _points(frame.patches(patches), samples)
-        nbytes = 2 * points.size * 4
+        placed = frame.patches(patches)
+        points = _points(placed, samples)
+        nbytes = (2 * points.size + 3 * self.count) * 4
         device.require(nbytes, f"{samples}^2 points on each of {self.count} patches")
         self._starts = geometry.padded(device, points.reshape(-1, self.count))
         self._ends = geometry.padded(device, points[_partner(self.rays)].reshape(-1, self.count))
+        self._normals = geometry.padded(device, placed.normal.T)
         self._blocks = geometry.upload_blocks(device, frame, blocks)
         self._defines = {"LANES": geometry.lanes(device), "BLOCKS": self.boxes}
+
+    @property
+    def _buffers(self) -> tuple[Array, ...]:
+        return self._starts, self._ends, self._normals, self._blocks
 
     def rows(self, first: int, rows: int) -> np.ndarray:
         """V of patches first .. first + rows - 1 and all others, (rows, N) float32."""
         kernel = self.device.kernel("visibility", "visibility_rows", **self._defines)
         out = self.device.empty((rows, self.count))
         pitch, lanes = self._starts.shape[1], geometry.lanes(self.device)
-        given = (rows, first, self.count, pitch, self.rays, self._starts, self._ends, self._blocks, out)
-        kernel((-(-self.count // lanes), rows), None, *given)
+        numbers = (rows, first, self.count, pitch, self.rays)
+        kernel((-(-self.count // lanes), rows), None, *numbers, *self._buffers, out)
         return out.get()
 
     def pairs(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -68,8 +78,7 @@ class Rays:
             ends = [self.device.upload(end[start : start + most], np.int32) for end in (i, j)]
             out = self.device.empty(ends[0].shape)
             pitch = self._starts.shape[1]
-            given = (pitch, self.rays, *ends, self._starts, self._ends, self._blocks, out)
-            kernel(out.size, 64, out.size, *given)
+            kernel(out.size, 64, out.size, pitch, self.rays, *ends, *self._buffers, out)
             parts.append(out.get())
         return np.concatenate(parts)
 
@@ -82,7 +91,7 @@ class Rays:
 def visibility(
     patches: Patches, blocks: Any, device: Device | str | None = None, *, samples: int = 4
 ) -> np.ndarray:
-    """Shares of the rays between all patches that meet no box, (N, N) float32 on the host.
+    """Shares of the rays between the fronts of all patches that meet no box, (N, N) float32 on the host.
 
     Parameters
     ----------
@@ -99,7 +108,7 @@ def visibility(
     Returns
     -------
     ndarray, (N, N), float32
-        Symmetric to the bit.
+        Symmetric to the bit; 1 for patches that turn away from each other.
 
     Raises
     ------

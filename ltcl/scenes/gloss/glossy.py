@@ -11,13 +11,13 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
-from ltcl.scenes import beams, brdf
-from ltcl.scenes import directions as hemisphere
 from ltcl.scenes.blocks import Block, point
-from ltcl.scenes.light_field import GlossyScene
+from ltcl.scenes.gloss import beams, brdf
+from ltcl.scenes.gloss import directions as hemisphere
+from ltcl.scenes.gloss.light_field import GlossyScene
+from ltcl.scenes.gloss.sight import Sight, sight
 from ltcl.scenes.patches import cut
 from ltcl.scenes.scene import Scene
-from ltcl.scenes.sight import Sight, sight
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall, spread_albedo, vector
 
@@ -50,7 +50,7 @@ def glossy(
     gloss : array_like in [0, 1]
         Share of the reflected light that the lobe takes; a scalar or one per wall. 0 is matte.
     exponent : array_like, above 0
-        Of the lobe, see `ltcl.scenes.brdf`; a scalar or one per wall, at most 8 * directions.
+        Of the lobe, see `brdf`; a scalar or one per wall, at most 8 * directions.
     projector, camera : (3,)
         Where they stand. The camera of a scene stands where its viewer does, unless given.
     directions : int

@@ -33,8 +33,8 @@ def outline(corner: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarr
     ----------
     corner : ndarray, (P, 3)
         Top left corners.
-    right, down : ndarray, (3,)
-        The edges from there, the same for all.
+    right, down : ndarray, (P, 3) or (3,)
+        The edges from there.
 
     Examples
     --------
@@ -43,7 +43,7 @@ def outline(corner: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarr
     ((1, 4, 2, 3), [0.0, 0.0, 0.0])
     """
     starts = np.stack([corner, corner + down, corner + down + right, corner + right], axis=1)
-    edges = np.broadcast_to(np.stack([down, right, -down, -right]), starts.shape)
+    edges = np.broadcast_to(np.stack([down, right, -down, -right], axis=-2), starts.shape)
     return np.stack([starts, edges], axis=2)
 
 

@@ -13,13 +13,40 @@ general inverse and in the memory of the result alone; black patches (r = 0) nee
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.linalg
 
+from ltcl import checks
 from ltcl.errors import InputError
+from ltcl.scenes.walls import check_albedo
 
 _BLOCK = 512  # rows and columns touched at a time where a matrix meets its transpose
 _TOLERANCE = 1e-6  # form factors found by quadrature or sampling are a little off
+
+
+def checked(form_factors: Any, albedo: Any, area: Any, patches: int) -> dict[str, np.ndarray]:
+    """The arrays of a scene by name, float64 and not writeable, if they are what `Scene` says.
+
+    Raises
+    ------
+    InputError
+        If a shape, an albedo or the form factors are wrong.
+    """
+    found = {}
+    for name, given, shapes in (
+        ("form_factors", form_factors, [(patches, patches)]),
+        ("albedo", albedo, [(1, patches), (3, patches)]),
+        ("area", area, [(patches,)]),
+    ):
+        value = checks.real(name, given).astype(np.float64, copy=False)
+        # A view, so that the caller's own array stays writeable.
+        found[name] = checks.finite(name, checks.shape(name, value, *shapes)).view()
+        found[name].flags.writeable = False
+    check_albedo(found["albedo"])
+    check(found["form_factors"], found["area"])
+    return found
 
 
 def check(form_factors: np.ndarray, area: np.ndarray) -> None:

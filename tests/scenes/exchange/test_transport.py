@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ltcl.errors import InputError
-from ltcl.scenes import exchange
+from ltcl.scenes.exchange import transport as exchange
 
 
 def made_up(size: int, seed: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

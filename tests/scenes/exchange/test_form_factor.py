@@ -12,14 +12,15 @@ import ltcl
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import IdentityPlus
-from ltcl.scenes import FormFactor, Patches, box, cut, dihedral, near, visibility
-from ltcl.scenes import geometry as scene_geometry
+from ltcl.scenes import Block, FormFactor, Patches, box, cut, dihedral, visibility
 from ltcl.scenes.box import WALLS
+from ltcl.scenes.exchange import geometry as scene_geometry
+from ltcl.scenes.exchange import near
 from ltcl.scenes.walls import form_factors
 from tests import gallery, reference
 from tests.operators import helpers
-from tests.scenes.test_near import leaning, turned
-from tests.scenes.test_visibility import box_faces
+from tests.scenes.exchange.test_near import leaning, turned
+from tests.scenes.exchange.test_visibility import box_faces
 
 BLOCK = [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
 
@@ -27,9 +28,8 @@ BLOCK = [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
 def kernel_matrix(A: FormFactor) -> tuple[np.ndarray, np.ndarray]:
     """What the kernel and the stored corrections stand for, (N, N) float64 each, by the twin."""
     count = A.shape[0]
-    geometry, blocks = A._geometry.get()[:, :count], A._blocks.get()
-    boxes, outer, inner = (A._defines[name] for name in ("BLOCKS", "OUTER", "INNER"))
-    G = reference.form_factor_entries(geometry, blocks[:boxes], outer, inner)
+    geometry, blocks = A._geometry.get()[:, :count], A._blocks.get()[: A._defines["BLOCKS"]]
+    G = reference.form_factor_entries(geometry, blocks)
     albedo, area = A._albedo.get().astype(np.float64), A._area.get().astype(np.float64)
     return albedo[:, None] * G * area, A._near.to_dense()
 
@@ -102,6 +102,11 @@ def test_kernel_values_of_pairs_are_those_of_the_product(device, monkeypatch, la
     pairs = A._kernel_pairs(i, j).reshape(len(patches), -1)
     product = (A.to_dense() - A._near.to_dense()) / A._area.get()
     np.testing.assert_allclose(pairs, product, rtol=1e-5, atol=1e-5 * pairs.max())
+    read = A._geometry.get()[:, : len(patches)], A._blocks.get()[: A._defines["BLOCKS"]]
+    entries = reference.form_factor_entries(*read)
+    twin = reference.form_factor_pairs(entries, i, j).reshape(pairs.shape)
+    off = np.abs(pairs - twin) > 1e-4 * twin.max()  # a ray that grazes a block counts either way
+    assert np.count_nonzero(off) <= (0 if blocks is None else 0.01 * off.size)
 
 
 def smooth(patches: Patches) -> np.ndarray:
@@ -169,6 +174,29 @@ def test_block_hides_what_rays_say(device):
     assert np.abs(hidden.sum(axis=1)[inside] - 1).mean() < 0.1
 
 
+@pytest.mark.parametrize("n", [4, 8])
+@pytest.mark.parametrize(
+    "block",
+    [
+        Block((0.31, 0.23, 0), (0.37, 0.29, 0.43), albedo=0.5),  # on the floor, faces cut patches
+        Block((0.31, 0.23, 0.17), (0.37, 0.29, 0.43), albedo=0.5),  # in the air, faces cut patches
+        Block((0.25, 0.25, 0.25), (0.5, 0.5, 0.25), albedo=0.5),  # faces between patches
+        Block((0, 0.4, 0), (0.3, 0.6, 0.7), albedo=0.5),  # in a corner
+    ],
+)
+def test_rooms_with_a_block_are_those_of_the_host(device, n, block):
+    """Exact form factors times 256 rays a pair: 1.5 % of the norm, and no light made."""
+    room = box(n, albedo=0.5, occluder=block, device=device)
+    F = FormFactor(cut(room.walls, n), None, [(block.low, block.high)], device).to_dense()
+    assert np.linalg.norm(F - room.form_factors) < 0.015 * np.linalg.norm(room.form_factors)
+    sums, expected = F.sum(axis=1), room.form_factors.sum(axis=1)
+    np.testing.assert_allclose(sums, expected, atol=0.06)  # of a patch half under the block
+    assert sums.max() < 1.02
+    # Of a face and the room nothing is in between: only float32 and the kernel's quadrature are left.
+    face = np.arange(len(F)) // n % len(room.walls) >= 6
+    np.testing.assert_allclose(F[face], room.form_factors[face], atol=2e-3)
+
+
 def test_callers_own_near_values(device):
     patches, F = cut(WALLS, 3), form_factors(WALLS, 3)
     asked = []
@@ -190,7 +218,7 @@ def test_launches_in_slabs_give_the_same(device, monkeypatch):
     A = FormFactor(patches, 0.5, device=device)
     x = device.upload(gallery.vectors(len(patches), 5))
     whole = A.apply(x).get()
-    monkeypatch.setattr("ltcl.scenes.form_factor._LAUNCH", 7 * A._geometry.shape[1])
+    monkeypatch.setattr("ltcl.scenes.exchange.form_factor._LAUNCH", 7 * A._geometry.shape[1])
     with device.profile() as profile:
         cut_up = A.apply(x).get()
     assert profile.launches["form_factor_matvec"] == 2 * 8  # 4 + 1 right-hand sides, 54 rows by 7
@@ -211,6 +239,28 @@ def test_forward_light_without_storing_a_bounce(device):
         assert found.converged
         expected = np.linalg.solve(np.eye(len(l_d)) - dense, l_d)
         np.testing.assert_allclose(found.x, expected, rtol=1e-3)
+
+
+def test_a_scene_gives_its_operators(device):
+    """One per channel, as good as the scene's own matrix; light through them as through that."""
+    room = box(
+        6, albedo=(0.8, 0.5, 0.3), occluder=Block((0.31, 0.23, 0), (0.37, 0.29, 0.43), 0.6), device=device
+    )
+    l_d = np.random.default_rng(2).random(len(room.area))
+    operators, matrices = FormFactor.of(room, device), room.A
+    for A, dense in zip(operators, matrices, strict=True):
+        assert np.linalg.norm(A.to_dense() - dense) < 0.015 * np.linalg.norm(dense)
+        found = ltcl.solve(IdentityPlus(A, sign=-1), l_d, rtol=1e-4).x
+        expected = np.linalg.solve(np.eye(len(l_d)) - dense, l_d)
+        assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)
+    (A,) = FormFactor.of(dihedral(5, albedo=0.5), device)  # free of blocks: to the bound
+    np.testing.assert_allclose(A.to_dense(), dihedral(5, albedo=0.5).A, atol=A.error)
+
+
+def test_a_scene_of_oblong_walls_is_refused(device):
+    scene = dataclasses.replace(dihedral(2), grid=(1, 8))
+    with pytest.raises(InputError, match=r"scene has walls of 1 x 4 patches; they must be n x n"):
+        FormFactor.of(scene, device)
 
 
 @pytest.mark.parametrize("method", ["neumann", "richardson", "chebyshev", "gmres", "bicgstab", "cg"])

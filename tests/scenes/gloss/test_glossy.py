@@ -18,7 +18,7 @@ from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.reciprocity import defect
 from ltcl.scenes import Block, GlossyScene, box, dihedral, glossy, trihedral
 from ltcl.scenes.box import WALLS
-from ltcl.scenes.brdf import lobe
+from ltcl.scenes.gloss.brdf import lobe
 from ltcl.scenes.walls import Wall
 
 PROJECTOR, CAMERA = (1.5, 0.9, 0.8), (0.8, 1.6, 0.4)

@@ -10,7 +10,7 @@ from ltcl import checks
 from ltcl.errors import MemoryLimitError
 from ltcl.scenes import walls as cube
 from ltcl.scenes.box import WALLS
-from ltcl.scenes.oblique import exchange, form_factors
+from ltcl.scenes.exchange.oblique import exchange, form_factors
 from ltcl.scenes.patches import cut
 from ltcl.scenes.walls import Wall
 from tests.scenes.slanted import closed_room, sampled_exchange

@@ -12,7 +12,7 @@ from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.scenes import Block, FormFactor, Scene, box, cut
 from ltcl.scenes.box import WALLS
-from ltcl.scenes.occlusion import form_factors, lit_faces
+from ltcl.scenes.exchange.occlusion import form_factors, lit_faces
 from ltcl.scenes.viewer import frame
 from tests.scenes.slanted import sampled_exchange
 

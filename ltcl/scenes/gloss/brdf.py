@@ -5,7 +5,7 @@
 
 with h halfway between the directions u and v: a matte part and the lobe of Blinn, "Models of light
 reflection for computer synthesized pictures", SIGGRAPH 1977. Any lobe as it stands sends more light to some
-sides than to others; the scale s sets that right. It is found in the bins (`ltcl.scenes.directions`), where
+sides than to others; the scale s sets that right. It is found in the bins (`directions`), where
 each row of s p s must have the mean 1: the symmetric Sinkhorn scaling of a positive matrix, which always
 exists. Then f(u, v) = f(v, u), and exactly the share `albedo` of light from any side comes back.
 
@@ -23,7 +23,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes.directions import lattice
+from ltcl.scenes.gloss.directions import lattice
 
 POINTS = 4  # along a bin, over which its mean is taken
 SHARPEST = 8  # exponent per bin: lobes down to half a bin's width, two points of a bin

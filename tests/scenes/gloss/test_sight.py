@@ -10,8 +10,8 @@ import pytest
 
 from ltcl.errors import InputError
 from ltcl.scenes.box import WALLS
+from ltcl.scenes.gloss.sight import sight
 from ltcl.scenes.patches import cut
-from ltcl.scenes.sight import sight
 from ltcl.scenes.walls import Wall
 
 FLOOR = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Exchange of light fields between patches: G of A = K G (eq. 4), found by rays, reciprocal and lossless.
 
-A beam is a patch and a bin of directions over it (`ltcl.scenes.directions`); beam i M + m of N patches and M
+A beam is a patch and a bin of directions over it (`directions`); beam i M + m of N patches and M
 bins. All rays that leave beam a fall into beams b that point back, and the etendue E (area x projected
 solid angle) shared by two beams is the same from both ends:
 
@@ -29,8 +29,8 @@ import scipy.sparse
 import scipy.stats
 
 from ltcl import checks
-from ltcl.scenes import directions as hemisphere
-from ltcl.scenes.geometry import check_blocks
+from ltcl.scenes.exchange.geometry import check_blocks
+from ltcl.scenes.gloss import directions as hemisphere
 from ltcl.scenes.patches import Patches, cut
 from ltcl.scenes.rays import cast
 from ltcl.scenes.walls import Wall

@@ -10,9 +10,9 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Device
-from ltcl.scenes import occlusion
 from ltcl.scenes import walls as cube
 from ltcl.scenes.blocks import Block
+from ltcl.scenes.exchange import occlusion
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Wall, spread_albedo

@@ -8,8 +8,8 @@ import pytest
 
 from ltcl import checks
 from ltcl.errors import InputError, MemoryLimitError
-from ltcl.scenes.beams import exchange
 from ltcl.scenes.box import WALLS
+from ltcl.scenes.gloss.beams import exchange
 from ltcl.scenes.patches import cut
 from ltcl.scenes.walls import Wall, form_factors
 

@@ -10,7 +10,7 @@ import pytest
 from ltcl.errors import InputError
 from ltcl.scenes import dihedral
 from ltcl.scenes.box import WALLS
-from ltcl.scenes.crossing import refuse
+from ltcl.scenes.exchange.crossing import refuse
 from ltcl.scenes.walls import Wall
 
 FLOOR = WALLS[2]

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ltcl.scenes.contours import clip, exchange, outline
-from ltcl.scenes.cube_tables import parallel, perpendicular
+from ltcl.scenes.exchange.contours import clip, exchange, outline
+from ltcl.scenes.exchange.cube_tables import parallel, perpendicular
 
 X, Y, Z = np.eye(3)
 

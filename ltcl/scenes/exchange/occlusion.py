@@ -3,7 +3,7 @@
 
     F_ij = V_ij F'_ij      F' of the empty room, exact; V the share of rays between i and j that pass
 
-Rays are traced on the device, by `ltcl.scenes.visibility`: it needs no dependency, never stores a ray, and
+Rays are traced on the device, by `visibility`: it needs no dependency, never stores a ray, and
 also serves the product whose matrix is never stored. Ray libraries are made for the nearest hit of one
 ray on millions of triangles; here are N^2 bundles of rays and one box.
 
@@ -26,11 +26,11 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import InputError
-from ltcl.scenes import oblique
 from ltcl.scenes import walls as cube
 from ltcl.scenes.blocks import Block
+from ltcl.scenes.exchange import oblique
+from ltcl.scenes.exchange.visibility import visibility
 from ltcl.scenes.patches import cut
-from ltcl.scenes.visibility import visibility
 from ltcl.scenes.walls import Wall, vector
 
 _SAMPLES = 16  # along a side: 256 rays
