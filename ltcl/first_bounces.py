@@ -73,8 +73,11 @@ def _exact(matrix: Any) -> np.ndarray:
 def refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, matrices: Sequence[Any]) -> None:
     """Refuse pixels without a positive first bounce, unless they may be masked."""
     pixels = np.flatnonzero(dark.any(axis=0))
-    if on_dark == "mask" and len(pixels) == dark.shape[1]:
-        raise InputError("first_bounce is zero or negative at every pixel; there is nothing left to light")
+    if len(pixels) == dark.shape[1]:
+        raise InputError(
+            "first_bounce is zero or negative at every pixel; it must be positive where light falls: "
+            "check the sign and the black level of T"
+        )
     if on_dark == "mask" and all(isinstance(m, (np.ndarray, scipy.sparse.csr_array)) for m in matrices):
         return
     listed = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])

@@ -115,6 +115,8 @@ def separate(
     checks.count("bounces", bounces, least=0)
     sampled.check_whole(options)
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
+    pictures = sum(column.size for column in columns)
+    checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
     chains = [
         _chain(S, l_out, bounces, method, rtol, options) for S, l_out in zip(T.systems, columns, strict=True)
     ]

@@ -48,7 +48,8 @@ class Transport:
         Of the projector's colours, for a T of 3 channels: the light that channel c of T answers to is
         mixing[c] @ (red, green, blue) of the pattern.
     probes, seed : int
-        Of the estimate, whose error falls as 1 / sqrt(probes), each of about 20 products; at least 2.
+        Of the estimate, whose error falls as 1 / sqrt(probes), each of about 20 products; at least 2. With
+        few, bounces may be worse than with the diagonal: compare `first_bounce_error` with F - diag(T).
 
     Attributes
     ----------

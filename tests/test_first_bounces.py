@@ -142,7 +142,7 @@ def test_a_pixel_dark_in_one_channel_is_masked_in_all(device):
 @pytest.mark.parametrize(
     ("matrix", "F", "says"),
     [
-        (np.zeros((N, N)), "diagonal", "zero or negative at every pixel; there is nothing left to light"),
+        (np.zeros((N, N)), "diagonal", "zero or negative at every pixel; it must be positive"),
         (aslinearoperator(np.eye(N)), np.arange(N), "a LinearOperator cannot be masked here"),
     ],
 )

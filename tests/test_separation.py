@@ -167,6 +167,11 @@ def test_bad_input_is_refused_by_name(device, case):
     assert "\n" not in str(caught.value)
 
 
+def test_more_bounces_than_the_host_can_hold_are_refused(device):
+    with pytest.raises(ltcl.errors.MemoryLimitError, match="separating 1000000000000 bounces"):
+        ltcl.separate(transport(device), FINE, bounces=10**12)
+
+
 # What one camera cannot know (section 8.4).
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ltcl import checks
+from ltcl.errors import InputError
 from ltcl.scenes.walls import Wall
 
 
@@ -58,7 +59,7 @@ def cut(walls: Sequence[Wall], n: int) -> Patches:
     Raises
     ------
     InputError
-        If n is not a whole number of at least 1.
+        If there is no wall, or n is not a whole number of at least 1.
 
     Examples
     --------
@@ -68,6 +69,8 @@ def cut(walls: Sequence[Wall], n: int) -> Patches:
     ([[0.25, 0.25, 0.0], [0.25, 0.75, 0.0]], [0.25, 0.25, 0.25, 0.25])
     """
     n = checks.count("n", n)
+    if not walls:
+        raise InputError("walls is empty; there must be at least one wall to cut")
     place = (np.arange(n) + 0.5) / n
     corner, right, down = (
         np.array([getattr(wall, name) for wall in walls], np.float64) for name in ("corner", "right", "down")

@@ -33,3 +33,5 @@ def test_areas_add_up_to_those_of_the_walls() -> None:
 def test_no_patches_are_refused() -> None:
     with pytest.raises(InputError, match="n is 0"):
         cut(WALLS, 0)
+    with pytest.raises(InputError, match="walls is empty"):
+        cut([], 2)
