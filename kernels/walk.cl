@@ -53,8 +53,8 @@
 #define GROUP (WALKS % 8 ? WALKS : 8)
 #define LANES (WALKS % 4 ? 1 : 4)  // whose random numbers are made side by side
 
-// Where an item has several walks, what one will load is asked for while the others are at work: a fifth to a
-// quarter less time a step. The language's own prefetch() does nothing in PoCL.
+// Where an item has several walks, what one will load is asked for while the others are at work: a third
+// less time a step. The language's own prefetch() does nothing in PoCL.
 #if defined(__clang__) && WALKS > 1
 #define FETCH(p) __builtin_prefetch((const void *)(size_t)(p))
 #else
