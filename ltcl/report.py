@@ -63,9 +63,17 @@ def solution(solved: Solution | tuple[Solution, ...]) -> list[dict[str, Any]]:
             "residuals": list(one.residuals),
             "seconds": one.seconds,
             "reason": one.reason,
+            "standard_error": _spread(one.standard_error),
         }
         for one in (solved if isinstance(solved, tuple) else (solved,))
     ]
+
+
+def _spread(error: np.ndarray | None) -> dict[str, float] | None:
+    """Of the standard errors of pixels, where the method knows them."""
+    if error is None:
+        return None
+    return {"largest": float(np.max(error)), "median": float(np.median(error))}
 
 
 def device(opened: Device) -> dict[str, Any]:

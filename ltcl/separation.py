@@ -25,7 +25,7 @@ import numpy as np
 from ltcl import checks, layout
 from ltcl.operators import Operator
 from ltcl.single_view import negative_bounces
-from ltcl.solvers import Solution, solve
+from ltcl.solvers import Solution, sampled, solve
 from ltcl.transport import Transport, require
 
 logger = logging.getLogger(__name__)
@@ -113,6 +113,7 @@ def separate(
     """
     require(T)
     checks.count("bounces", bounces, least=0)
+    sampled.check_whole(options)
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     pictures = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))

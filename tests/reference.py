@@ -6,7 +6,10 @@ A twin is named after its kernel; the `_stream` and `_group` variants of a kerne
 
 from __future__ import annotations
 
+import bisect
 import itertools
+import math
+from fractions import Fraction
 
 import numpy as np
 import scipy.sparse
@@ -169,6 +172,211 @@ def southwell_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray,
     return southwell_dense(
         scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray().T, *arguments
     )
+
+
+def random_philox(counters: np.ndarray, seed: int) -> np.ndarray:
+    """Philox4x32-10 of counters (n, 4) and a key of 64 bits, as (n, 4) uint32."""
+    c = [counters[:, i].astype(np.uint64) for i in range(4)]
+    low, key = np.uint64(0xFFFFFFFF), [seed & 0xFFFFFFFF, seed >> 32]
+    for _ in range(10):
+        a, b = np.uint64(0xD2511F53) * c[0], np.uint64(0xCD9E8D57) * c[2]
+        high_a, high_b = a >> np.uint64(32), b >> np.uint64(32)
+        c = [high_b ^ c[1] ^ np.uint64(key[0]), b & low, high_a ^ c[3] ^ np.uint64(key[1]), a & low]
+        key = [(key[0] + 0x9E3779B9) & 0xFFFFFFFF, (key[1] + 0xBB67AE85) & 0xFFFFFFFF]
+    return np.stack(c, axis=1).astype(np.uint32)
+
+
+def _scaled(values: np.ndarray, shift: int) -> list[int]:
+    """|value| 2^shift rounded half up, exactly."""
+    exact = (Fraction(float(abs(value))) * Fraction(2) ** shift for value in values)
+    return [math.floor(value + Fraction(1, 2)) for value in exact]
+
+
+def _integers(values: np.ndarray, cdf: bool) -> tuple[list[int], Fraction]:
+    """The row scaled by a power of two so that its sum has as many bits as fit, and its sum unscaled."""
+    n, largest = len(values), float(np.max(np.abs(values)))
+    exponent = max(math.frexp(largest)[1], -125)  # of the smallest normal float32
+    budget = 41 if cdf else min(45, 63 - n.bit_length())
+    rough = 31 - exponent
+    shift = rough + budget - 1 - (sum(_scaled(values, rough)) + n).bit_length()
+    scaled = _scaled(values, shift)
+    return scaled, Fraction(sum(scaled)) / Fraction(2) ** shift
+
+
+def _alias(n: int, masses: list[int], capacity: int, targets: list[int]) -> list[int]:
+    """Table entries by one sweep, as Huebschle-Schneider and Sanders describe it, algorithm 4."""
+    light = [t for t in range(n) if masses[t] <= capacity] + [n]
+    heavy = [t for t in range(n) if masses[t] > capacity] + [n]
+    i = j = 0
+    left = masses[heavy[0]] if heavy[0] < n else 0
+    bins = [0] * n
+
+    def put(own: int, mass: int, other: int) -> None:
+        threshold = (mass * 2**18 + capacity // 2) // capacity
+        whole = threshold == 2**18
+        bins[own] = (0 if whole else threshold) << 46 | targets[own] << 23 | targets[own if whole else other]
+
+    while heavy[j] < n:
+        if left > capacity:
+            put(light[i], masses[light[i]], heavy[j])
+            left -= capacity - masses[light[i]]
+            i += 1
+        else:
+            following = heavy[j + 1]
+            put(heavy[j], left, following if following < n else heavy[j])
+            left += masses[following] - capacity if following < n else 0
+            j += 1
+    for t in light[i:-1]:
+        put(t, capacity, t)
+    return bins
+
+
+def alias_dense(values: np.ndarray, sampler: str) -> tuple[int, np.float32, list[int]]:
+    """Entries that count, |R_i| and the table of one row, columns 0, 1, ..."""
+    return alias_csr(np.arange(len(values)), values, sampler)
+
+
+def alias_csr(columns: np.ndarray, values: np.ndarray, sampler: str) -> tuple[int, np.float32, list[int]]:
+    """Entries that count, |R_i| and the table of one row."""
+    n = len(values)
+    if not np.any(values):
+        return 0, np.float32(0), []
+    scaled, exact = _integers(values, sampler == "cdf")
+    total = np.float32(float(exact))
+    count = n if total >= np.finfo(np.float32).tiny else 0
+    targets = [int(c) << 1 | int(np.signbit(v)) for c, v in zip(columns, values, strict=True)]
+    if sampler == "alias":
+        table = _alias(n, [n * mass for mass in scaled], sum(scaled), targets)
+    elif sampler == "cdf":
+        sums = itertools.accumulate(scaled)
+        table = [part << 23 | target for part, target in zip(sums, targets, strict=True)]
+    else:
+        bits = np.asarray(values, np.float32).view(np.uint32)
+        table = [int(bit) << 32 | int(c) for bit, c in zip(bits, columns, strict=True)]
+    return count, total if count else np.float32(0), table
+
+
+def walk(
+    tables: tuple[np.ndarray, np.ndarray, str],
+    steps: np.ndarray,
+    b: np.ndarray | None,
+    pixels: np.ndarray,
+    samples: np.ndarray,
+    seed: int,
+    stream: int = 0,
+    collision: bool = True,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Walks from pixels[w], sample samples[w], all at once: scores (w, k) float32, ends and lengths (w,).
+
+    `tables` are records, entries and the sampler; steps are (L, 2) uint32. Without b a walk scores its weight
+    where it ends, the adjoint.
+    """
+    records, entries, sampler = tables
+    row, step = np.array(pixels), np.zeros(len(pixels), np.int64)
+    weight = np.ones(len(row), np.float32)
+    scores = np.zeros((len(row), 1 if b is None else b.shape[1]), np.float32)
+    alive = np.ones(len(row), bool)
+    while alive.any():
+        counters = np.stack([pixels, samples, step // 2, np.full(len(row), stream)], axis=1)
+        words = random_philox(counters.astype(np.uint32), seed).astype(np.uint64).reshape(-1, 2, 2)
+        word = words[np.arange(len(row)), step % 2]
+        word = word[:, 0] | word[:, 1] << np.uint64(32)
+        target, factor = _draw(records[row], entries, word, sampler)
+        alive &= factor != 0
+        here = np.flatnonzero(alive)
+        row[here] = target[here] >> 1
+        weight[here] *= np.where(target[here] & 1, -factor[here], factor[here])
+        worth = weight[here] * np.ascontiguousarray(steps[step[here], 0]).view(np.float32)
+        goes_on = (word[here] & np.uint64(2**22 - 1)) < steps[step[here], 1]
+        step[here] += 1
+        scored = here if collision else here[~goes_on]
+        value = worth if collision else worth[~goes_on]
+        scores[scored] += value[:, None] * (1 if b is None else b[row[scored]])
+        alive[here] = goes_on
+    return scores, row, step
+
+
+def walk_rows(
+    tables: tuple[np.ndarray, np.ndarray, str],
+    steps: np.ndarray,
+    b: np.ndarray,
+    pixels: np.ndarray,
+    samples: np.ndarray,
+    seed: int,
+    stream: int,
+    collision: bool,
+    chunk: int,
+) -> np.ndarray:
+    """Sum, its rounding, sum of squares and its rounding of each chunk, (P, chunks, k, 4) float32."""
+    count = len(samples)
+    which = np.repeat(pixels, count), np.tile(samples, len(pixels))
+    scores, _, _ = walk(tables, steps, b, *which, seed, stream, collision)
+    scores = scores.reshape(len(pixels), count, -1).swapaxes(0, 1)
+    chunks = [scores[start : start + chunk] for start in range(0, count, chunk)]
+    return np.stack([np.stack([*two_sums(c), *two_sums(c**2)], axis=-1) for c in chunks], axis=1)
+
+
+def walk_columns(
+    tables: tuple[np.ndarray, np.ndarray, str],
+    steps: np.ndarray,
+    source: int,
+    samples: np.ndarray,
+    seed: int,
+    stream: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where samples from row `source` end, and what they bring there, float32."""
+    start = np.full(len(samples), source)
+    scores, ends, _ = walk(tables, steps, None, start, samples, seed, stream, collision=False)
+    return ends, scores[:, 0]
+
+
+def random_loads(items: int, chains: int, steps: int, words: np.ndarray) -> np.ndarray:
+    """Sums over the chains of each item after so many loads, (items,) uint64."""
+    with np.errstate(over="ignore"):
+        state = np.arange(1, items * chains + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        for _ in range(steps):
+            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+            state ^= words[(state >> np.uint64(32)) * np.uint64(len(words)) >> np.uint64(32)]
+        return state.reshape(items, chains).sum(axis=1)
+
+
+def _draw(
+    records: np.ndarray, entries: np.ndarray, word: np.ndarray, sampler: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Column and sign in one number, and what weights are multiplied by, of one entry of each row."""
+    count = records[:, 2].astype(np.uint64)
+    start = records[:, 0].astype(np.uint64) | records[:, 1].astype(np.uint64) << np.uint64(32)
+    factor = np.ascontiguousarray(records[:, 3]).view(np.float32)
+    place = (word >> np.uint64(22)) * count
+    slot = np.where(count > 0, start + (place >> np.uint64(42)), 0)
+    entry = entries[slot] if entries.size else np.zeros(len(slot), np.uint64)
+    if sampler == "alias":
+        fraction = place >> np.uint64(24) & np.uint64(2**18 - 1)
+        own = fraction < entry >> np.uint64(46)
+        target = np.where(own, entry >> np.uint64(23), entry) & np.uint64(2**23 - 1)
+        return target.astype(np.int64), factor
+    if sampler == "uniform":
+        value = (entry >> np.uint64(32)).astype(np.uint32).view(np.float32)
+        target = (entry & np.uint64(2**32 - 1)).astype(np.int64) * 2 + np.signbit(value)
+        return target, np.where(count > 0, count.astype(np.float32) * np.abs(value), np.float32(0))
+    target = np.zeros(len(word), np.int64)
+    for w in np.flatnonzero(count):
+        table = [int(e) for e in entries[int(start[w]) : int(start[w] + count[w])]]
+        sums = [e >> 23 for e in table]
+        part = (int(word[w]) >> 22) * sums[-1] >> 42
+        target[w] = table[bisect.bisect_right(sums, part)] & (2**23 - 1)
+    return target, factor
+
+
+def two_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over the first axis in float32, in order, and what their rounding took (Knuth)."""
+    total, low = (np.zeros(values.shape[1:], np.float32) for _ in range(2))
+    for value in values:
+        new = total + value
+        added = new - total
+        low = low + ((total - (new - added)) + (value - added))
+        total = new
+    return total, low
 
 
 def form_factor_pair(

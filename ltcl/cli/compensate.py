@@ -69,6 +69,8 @@ def run(
     camera_grid: options.CameraGrid = None,
     method: options.Method = "auto",
     rtol: options.Rtol = 1e-2,
+    samples: options.Samples = None,
+    seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
     on_dark: options.OnDark = "raise",
     gain: _GAIN = "1",
@@ -91,6 +93,7 @@ def run(
     from ltcl.compensation import compensate
 
     _check(gain, loss)
+    drawn = options.sampling(method, samples, seed)
     T = transports.load(
         transport,
         device,
@@ -111,6 +114,7 @@ def run(
         camera_grid=camera_grid,
         method=method,
         rtol=rtol,
+        **drawn,
         first_bounce=first_bounce,
         on_dark=on_dark,
         gain=gain,
@@ -123,7 +127,7 @@ def run(
         encoding=encoding,
         device=device,
     )
-    settings = {"bounds": (low, high), "gain": gain, "loss": loss, "method": method, "rtol": rtol}
+    settings = {"bounds": (low, high), "gain": gain, "loss": loss, "method": method, "rtol": rtol, **drawn}
     entries = text["pictures"] = []
     with console.Steps(len(desired), T.channels) as steps, results.fill(out, text) as folder:
         for (name, wanted), file in zip(desired.items(), picture, strict=True):

@@ -138,7 +138,8 @@ class Steps:
             done = (self._item - 1) * self._solves + min(
                 self._solve - 1 + _gained(residual, rtol), self._solves
             )
-            self._bar.update(self._task, completed=done, text=f"residual {residual:.1e}")
+            text = f"sampling, step {iteration}" if math.isnan(residual) else f"residual {residual:.1e}"
+            self._bar.update(self._task, completed=done, text=text)
 
         return step
 

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from ltcl.solvers import METHODS
+from ltcl.errors import InputError
+from ltcl.solvers.solve import METHODS, SAMPLED
 
 
 def _grid(text: str) -> tuple[int, int]:
@@ -29,6 +30,25 @@ def _method(name: str) -> str:
     if name not in METHODS:
         raise typer.BadParameter(f"{name!r} is no method; choose one of {', '.join(METHODS)}")
     return name
+
+
+def sampling(method: str, samples: int | None, seed: int | None) -> dict[str, int]:
+    """Options of a method that samples, for the solver and the report; none of the others.
+
+    Raises
+    ------
+    InputError
+        Samples or a seed for a method that draws none.
+    """
+    if method in SAMPLED:
+        usual = SAMPLED[method].usual
+        return {"samples": usual if samples is None else samples, "seed": seed or 0}
+    for name, value in (("samples", samples), ("seed", seed)):
+        if value is not None:
+            raise InputError(
+                f"--{name} is {value}, but --method is {method}; only {' and '.join(SAMPLED)} sample"
+            )
+    return {}
 
 
 Matrix = Annotated[Path, typer.Argument(metavar="TRANSPORT", help="Light transport: .npz, .npy or .mtx.")]
@@ -62,6 +82,27 @@ Device = Annotated[
 ]
 Method = Annotated[str, typer.Option(callback=_method, metavar="NAME", help=f"One of {', '.join(METHODS)}.")]
 Rtol = Annotated[float, typer.Option(metavar="FRACTION", help="Relative residual at which a solve is done.")]
+Samples = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=2**32 - 1,
+        metavar="N",
+        help="Random walks from each pixel (monte_carlo, default 256), or columns drawn of each row in an "
+        "iteration (hybrid, 32).",
+        show_default=False,
+    ),
+]
+Seed = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        max=2**64 - 1,
+        metavar="N",
+        help="Of the random numbers of monte_carlo and hybrid: the same gives the same result. Default: 0.",
+        show_default=False,
+    ),
+]
 Grid = Annotated[
     tuple | None,
     typer.Option(

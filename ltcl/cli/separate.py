@@ -24,6 +24,8 @@ def run(
     grid: options.Grid = None,
     method: options.Method = "auto",
     rtol: options.Rtol = 1e-3,
+    samples: options.Samples = None,
+    seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
     on_dark: options.OnDark = "raise",
     resize: options.Resize = False,
@@ -39,6 +41,7 @@ def run(
     """
     from ltcl.separation import separate
 
+    drawn = options.sampling(method, samples, seed)
     T = transports.load(transport, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
     seen = pictures.Reader(T.grid, "the camera", encoding, resize).read_all(picture)
     text = transports.heading(
@@ -49,6 +52,7 @@ def run(
         grid=grid,
         method=method,
         rtol=rtol,
+        **drawn,
         first_bounce=first_bounce,
         on_dark=on_dark,
         resize=resize,
@@ -59,7 +63,8 @@ def run(
     with console.Steps(len(seen), T.channels * (bounces + 1)) as steps, results.fill(out, text) as folder:
         for (name, image), file in zip(seen.items(), picture, strict=True):
             steps.item(file.name)
-            done = separate(T, image, bounces, method=method, rtol=rtol, callback=steps.solve(rtol))
+            settings = {"method": method, "rtol": rtol, **drawn}
+            done = separate(T, image, bounces, callback=steps.solve(rtol), **settings)
             # Several pictures get a folder each.
             place = f"{name}/" if len(seen) > 1 else ""
             entries.append({"file": str(file), "parts": _write(folder, place, done, image)})

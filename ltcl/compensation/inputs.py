@@ -11,8 +11,9 @@ import numpy as np
 
 from ltcl import checks, layout
 from ltcl.errors import InputError, InputTypeError
+from ltcl.solvers import sampled
 from ltcl.solvers.direct import Direct
-from ltcl.solvers.solve import ITERATIVE, METHODS
+from ltcl.solvers.solve import ITERATIVE, METHODS, SAMPLED
 from ltcl.transport import Transport
 
 logger = logging.getLogger(__name__)
@@ -96,12 +97,13 @@ def weights(value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Co
 
 def rules(T: Transport, method: str, rtol: Any, options: dict[str, Any]) -> dict[str, Any]:
     """Options of a solve within the bounds; of a T without S, those are all that there are."""
+    sampled.check_whole(options)
     if not T.is_square and method != "auto":
         raise InputError(f"method is {method!r}, but this T has no S for it to solve; it must be 'auto'")
     checks.one_of("method", method, METHODS)
     known = list(_OPTIONS)
     if T.is_square:
-        kind = {**ITERATIVE, Direct.name: Direct}.get(method)
+        kind = {**ITERATIVE, **SAMPLED, Direct.name: Direct}.get(method)
         known += ["x0", *(field.name for field in (dataclasses.fields(kind) if kind else ()))]
     for name in options:
         if name not in known:

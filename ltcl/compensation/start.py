@@ -81,10 +81,18 @@ def at_largest_gain(inverse: Inverse, problem: Problem, loss: float | None, exac
     light = None
     if gain is None:
         gain, light = _at_a_loss(problem, loss)
-    solutions = tuple(dataclasses.replace(s, x=gain * s.x[:, :k] - s.x[:, k:]) for s in solved)
+    solutions = tuple(_combined(s, gain, k) for s in solved)
     if light is not None:
         return Start(gain, light, solutions)
     return Start(gain, inverse.light([s.x for s in solutions]), solutions, meets=True)
+
+
+def _combined(sides: Solution, gain: float, k: int) -> Solution:
+    """gain * the first k columns - the others; both share their samples, so that errors add at worst."""
+    error = sides.standard_error
+    if error is not None:
+        error = gain * error[:, :k] + error[:, k:]
+    return dataclasses.replace(sides, x=gain * sides.x[:, :k] - sides.x[:, k:], standard_error=error)
 
 
 def _at_a_loss(problem: Problem, loss: float | None) -> tuple[float, Columns]:

@@ -63,7 +63,8 @@ def compensate(
         How much the error at each camera pixel counts, at least 0. When not given 1, and 0 where T.masked.
     method, rtol, **options
         Of `ltcl.solve`. Within the bounds the error is the least there is up to `rtol`, relative to
-        gain * desired - background.
+        gain * desired - background. Where no bound holds, noise of a method that samples stays; it is part of
+        `error` and `gap`, and makes the gain that gain="auto" finds smaller.
 
     Returns
     -------

@@ -59,6 +59,7 @@ class RowOperator(Operator):
         super().__init__(device, shape)
         self._fastest: dict[tuple[int, int], Launch] = {}
         self.relaxations: dict[tuple[Any, ...], Any] = {}  # of relaxation.py: lives as long
+        self.tables: dict[str, Any] = {}  # of alias.py
 
     @property
     def nbytes(self) -> int:

@@ -27,6 +27,10 @@ class Status(enum.Enum):
         "the method has no next step here, not even started anew; "
         "try method='gmres', 'cg' with normal=True, or 'direct'"
     )
+    SAMPLED = (
+        "the samples are spent, what is left is noise, told by .standard_error; raise samples=, "
+        "or take gather=True"
+    )
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
@@ -68,10 +72,12 @@ class Solution:
     method : str
         The one that ran; for "auto" the one chosen.
     reason : str
-        Why "auto" chose it, else empty.
+        Why "auto" chose it, or what a method that samples has sampled, else empty.
     lowest : float, optional
         Residual of the best iterate; the least of `residuals` when not given. Residuals that gmres foresees
         are no iterate's.
+    standard_error : like x, optional
+        Of a method that samples, where it knows it.
     """
 
     x: np.ndarray
@@ -83,6 +89,7 @@ class Solution:
     method: str
     reason: str = ""
     lowest: float | None = None
+    standard_error: np.ndarray | None = None
 
     @property
     def converged(self) -> bool:
@@ -100,6 +107,8 @@ class Solution:
     def __str__(self) -> str:
         best, last = self.residual, self.residuals[-1]
         residual = f"{best:.2g}"
+        if np.isnan(last) and self.status is Status.SAMPLED:
+            residual = "unknown of some pixels alone"
         if last > best:
             residual += f" at best and {last:.2g} at the end"
         return (

@@ -15,7 +15,7 @@ from ltcl import checks
 from ltcl.device import Array
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
-from ltcl.solvers import auto
+from ltcl.solvers import auto, sampled
 from ltcl.solvers.bicgstab import BiCGStab
 from ltcl.solvers.block_gauss_seidel import BlockGaussSeidel
 from ltcl.solvers.cg import CG
@@ -23,7 +23,9 @@ from ltcl.solvers.chebyshev import Chebyshev
 from ltcl.solvers.direct import Direct
 from ltcl.solvers.gauss_seidel import GaussSeidel
 from ltcl.solvers.gmres import GMRES
+from ltcl.solvers.hybrid import Hybrid
 from ltcl.solvers.jacobi import Jacobi
+from ltcl.solvers.monte_carlo import MonteCarlo
 from ltcl.solvers.neumann import Neumann
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.richardson import Richardson
@@ -47,7 +49,8 @@ ITERATIVE = {
         BiCGStab,
     )
 }
-METHODS: tuple[str, ...] = (*ITERATIVE, Direct.name, "auto")
+SAMPLED = {method.name: method for method in (MonteCarlo, Hybrid)}
+METHODS: tuple[str, ...] = (*ITERATIVE, *SAMPLED, Direct.name, "auto")
 _MAXITER = 1000
 
 
@@ -74,7 +77,8 @@ def solve(
         k right-hand sides are solved together, each to its own tolerance.
     method : str
         "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor",
-        "block_gauss_seidel", "southwell", "cg", "gmres", "bicgstab", "direct" or "auto".
+        "block_gauss_seidel", "southwell", "cg", "gmres", "bicgstab", "monte_carlo",
+        "hybrid", "direct" or "auto".
     rtol, atol : float
         Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column.
     maxiter : int, optional
@@ -82,9 +86,11 @@ def solve(
     x0 : like b, optional
         Start; zero when not given.
     callback : callable(iteration, relative residual), optional
-        Called with every entry of `residuals`, as it is found.
+        Called with every entry of `residuals`, as it is found; of methods that sample also at each step
+        of theirs, whose residual is unknown, NaN.
     throw : bool
-        Raise where the tolerance is not met; otherwise look at ``.converged``.
+        Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that sample,
+        whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
     **options
         Of the method, for instance ``spectrum=(0.5, 4.0)`` of chebyshev. An unknown one is an error.
 
@@ -123,6 +129,14 @@ def solve(
     |                     normal: solve S^T S x = S^T b; False
     gmres                 restart: directions of a cycle; 20
     bicgstab              none
+    monte_carlo           samples: walks of each pixel; 256. seed: below 2^64; 0
+    |                     pixels: (P,) of them to estimate; all. error: standard error wanted
+    |                     estimator: "collision" or "endpoint". sampler: "alias", "uniform", "cdf"
+    |                     albedo: m of eq. 24. adjoint: walks from b; False
+    |                     gather: one exact product at the end; False
+    |                     series: "neumann" or "chebyshev". degree: of the latter
+    hybrid                samples: columns of each row; 32. seed, sampler, gather: as above
+    |                     iterations: of Jacobi; those that rtol asks for
     direct, auto          none
     ====================  =======================================================================
 
@@ -140,11 +154,13 @@ def solve(
     rule = _rule(shape, b_host, rtol, atol, maxiter, callback)
     guess = _guess(x0, b_host)
     chosen = _method(method, options)
+    if isinstance(chosen, MonteCarlo):
+        chosen.check(shape[0])
     S = as_operator(S)
     solve_it = _automatic if chosen is None else functools.partial(_run, chosen)
     solution = solve_it(S, b_host, guess, rule)
     solution = dataclasses.replace(solution, seconds=time.perf_counter() - start)
-    if throw and not solution.converged:
+    if throw and solution.status not in (Status.CONVERGED, Status.SAMPLED):
         raise ConvergenceError(str(solution), solution)
     return solution
 
@@ -192,7 +208,7 @@ def _method(name: str, options: dict[str, Any]) -> Any:
         if options:
             raise InputTypeError(f"unknown option {next(iter(options))!r}; name a method to give it options")
         return None
-    kind = Direct if name == Direct.name else ITERATIVE[name]
+    kind = Direct if name == Direct.name else (ITERATIVE | SAMPLED)[name]
     known = [field.name for field in dataclasses.fields(kind)]
     for option in options:
         if option not in known:
@@ -228,8 +244,12 @@ def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule
         return _run_direct(method, S, b, rule)
     unit = _unit(b)
     system = System(S, S.device.upload(b / unit))
-    monitor = Monitor(system, dataclasses.replace(rule, atol=rule.atol / unit))
+    rule = dataclasses.replace(rule, atol=rule.atol / unit)
     x, r = _start(system, None if guess is None else guess / unit)
+    if isinstance(method, MonteCarlo | Hybrid):
+        found = method.estimate(system, x.get().astype(np.float64), r, rule, unit)
+        return sampled.solution(method, system, found, rule, functools.partial(_in_units, unit=unit))
+    monitor = Monitor(system, rule)
     method.iterate(system, x, r, monitor)
     best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
     assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so

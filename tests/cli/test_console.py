@@ -78,3 +78,15 @@ def test_bar_follows_the_digits_gained() -> None:
     steps.item("b.png")
     steps.solve(1e-2)(0, float("nan"))
     assert task.completed == 2
+
+
+def test_bar_tells_the_steps_of_a_method_that_samples() -> None:
+    steps = console.Steps(items=1)
+    (task,) = steps._bar.tasks
+    steps.item("a.png")
+    callback = steps.solve(1e-2)
+    callback(0, 1.0)
+    callback(1, float("nan"))
+    assert (task.completed, task.fields["text"]) == (0, "sampling, step 1")
+    callback(1, 1e-3)
+    assert (task.completed, task.fields["text"]) == (1, "residual 1.0e-03")

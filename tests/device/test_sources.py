@@ -36,7 +36,7 @@ def test_every_kernel_has_its_arguments_known_and_a_twin(name):
     declared = re.findall(r"^kernel void (\w+)", source.text, re.MULTILINE)
     assert set(source.signatures) == set(declared)
     for kernel, types in source.signatures.items():
-        assert set(types) <= {None, np.int32, np.float32}
+        assert set(types) <= {None, np.int32, np.uint32, np.uint64, np.float32}
         assert kernel.startswith(f"{name}_")
         assert callable(getattr(reference, re.sub("_(stream|group)$", "", kernel)))
 

@@ -6,9 +6,11 @@ from __future__ import annotations
 from typing import Any
 
 from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
-from ltcl.solvers.solve import METHODS
+from ltcl.solvers.solve import METHODS as ALL
+from ltcl.solvers.solve import SAMPLED as _SAMPLED
 
 ITERATIVE = tuple(_ITERATIVE)
+METHODS = tuple(method for method in ALL if method not in _SAMPLED)  # those that keep a tolerance
 READS_ROWS = (
     "gauss_seidel",
     "sor",
@@ -22,4 +24,4 @@ def small_blocks(method: str, block: int = 4) -> dict[str, Any]:
     return {"block": block} if method == "block_gauss_seidel" else {}
 
 
-__all__ = ["ITERATIVE", "METHODS", "READS_ROWS", "small_blocks"]
+__all__ = ["ALL", "ITERATIVE", "METHODS", "READS_ROWS", "small_blocks"]

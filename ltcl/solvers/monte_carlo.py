@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Monte Carlo (section 7 of the paper): every pixel of S^-1 b on its own, by random walks over the rows of R.
+
+    l_d(i) = l_out(i) + sum over k >= 1 and paths of (-1)^k R_i i1 R_i1 i2 ... l_out(ik)    (eq. 23)
+
+A walk samples one path, its entries in proportion to |R_ij| (eq. 25), its length by eq. 24. The forward dual
+(eq. 22) is the same on I - A. A pixel costs the same whether others are asked for or not: it is for a few
+pixels and for previews, not for a whole picture to 1 %, where any iteration is faster. All right-hand
+sides share their walks: frames and colours of one S cost one walk a sample. The three S of a transport in
+colour have tables and walks of their own.
+
+The series needs rho(|R|) < 1, and a finite variance some more (`ltcl.theory.walks`); elsewhere it is refused.
+``series="chebyshev"`` samples a polynomial of finite degree instead, which converges for every albedo; its
+coefficients alternate and grow, and with them the noise, which the standard error tells.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ltcl import checks, theory
+from ltcl.device import Array
+from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import CSR, Dense
+from ltcl.operators.alias import SAMPLERS, tables, tables_of_columns
+from ltcl.operators.entrywise import rows_of_R, squares
+from ltcl.operators.walks import ESTIMATORS, Lengths, Sums, Walker, geometric, whole
+from ltcl.solvers import sampled
+from ltcl.solvers.polynomials import chebyshev_bias, chebyshev_coefficients, chebyshev_degree
+from ltcl.solvers.sampled import Estimate
+from ltcl.solvers.stopping import Rule, System
+from ltcl.theory.walks import chance_to_go_on, second_moment_radius
+
+_MOST = 1 << 20  # samples of a pixel with a target error
+_PILOT = 256  # samples that tell how many are needed
+_PILOT_STREAM = 1
+Measured = tuple[np.ndarray, np.ndarray]  # estimates and their standard errors
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Estimates with their standard errors.
+
+    Parameters
+    ----------
+    samples : int, optional
+        Of each pixel; 256 when not given. With `error` the most a pixel gets, 2^20 when not given. With
+        `adjoint` the mean of all pixels.
+    seed : int
+        Below 2^64. The same seed gives the same bits on every device.
+    pixels : (P,) integers, optional
+        The pixels to estimate; x and its standard error are then (P,) or (P, k), in their order.
+    error : float, optional
+        Standard error wanted of every value of x, in its units. As many samples as it needs, by a pilot.
+    estimator : str, optional
+        "collision": walks score at every step. "endpoint": where they end (eq. 26, the paper's).
+    sampler : str
+        "alias" (eq. 25); "uniform", which the paper compares with; "cdf", for reference.
+    albedo : float, optional
+        m of eq. 24, in (0, 1/2); by default such that walks are as long as their variance asks for.
+    adjoint : bool
+        Walks from b instead of from each pixel, for whole pictures with few lights: the end-point estimator.
+    gather : bool
+        Final gather: one exact product at the end, b - R x.
+    series : str
+        "neumann" or "chebyshev", to `degree`; that which rtol asks for when not given.
+    """
+
+    name: ClassVar[str] = "monte_carlo"
+    usual: ClassVar[int] = 256
+    samples: int | None = None
+    seed: int = 0
+    pixels: Any = None
+    error: float | None = None
+    estimator: str | None = None
+    sampler: str = "alias"
+    albedo: float | None = None
+    adjoint: bool = False
+    gather: bool = False
+    series: str = "neumann"
+    degree: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.samples is not None:
+            sampled.check_samples(self.samples)
+        sampled.check_seed(self.seed)
+        if self.error is not None:
+            checks.number("error", self.error, above=0.0)
+        if self.estimator is not None:
+            checks.one_of("estimator", self.estimator, ESTIMATORS)
+        checks.one_of("sampler", self.sampler, SAMPLERS)
+        checks.one_of("series", self.series, ("neumann", "chebyshev"))
+        if self.albedo is not None:
+            chance_to_go_on(0.0, self.albedo)
+        if self.degree is not None:
+            checks.count("degree", self.degree)
+        self._refuse_together()
+
+    def check(self, n: int) -> None:
+        """Refuse what does not fit S, (n, n)."""
+        if self.pixels is not None:
+            _pixels(self.pixels, n)
+        if self.adjoint and self._count(n) >= 1 << 32:
+            most = ((1 << 32) - 1) // n
+            raise InputError(f"samples is {self.samples}; of {n} pixels adjoint=True takes at most {most}")
+
+    def estimate(self, system: System, x: np.ndarray, r: Array, rule: Rule, unit: np.ndarray) -> Estimate:
+        """`x` plus the estimate of S^-1 r, where r is the residual of x."""
+        R, sign = rows_of_R(system.S, self.name)
+        first, lengths, reason = self._lengths(system, R, sign, rule)
+        pixels = np.arange(len(x)) if self.pixels is None else _pixels(self.pixels, len(x))
+        rest, error = self._walk(R, lengths, r, pixels, unit, rule)
+        x = _within_float32(x[pixels] + first * r.get()[pixels].astype(np.float64) + rest)
+        found = Estimate(x, error, whole=self.pixels is None, reason=reason)
+        return _gather(system, R, found) if self.gather else found
+
+    def _lengths(self, system: System, R: CSR | Dense, sign: float, rule: Rule) -> tuple[float, Lengths, str]:
+        """c_0, the terms that walks estimate, and both in words."""
+        if self.series == "chebyshev":
+            bounds = theory.free_bounds(system.S)
+            degree = max(1, chebyshev_degree(rule.rtol, bounds)) if self.degree is None else self.degree
+            c = _within_float32(chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1))
+            bias = chebyshev_bias(degree, bounds)
+            reason = f"Chebyshev series of degree {degree}, which leaves {bias:.2g} of the residual"
+            return float(c[0]), whole(c[1:]), reason
+        made = tables_of_columns(R) if self.adjoint else tables(R, self.sampler)
+        q = chance_to_go_on(second_moment_radius(R, made, self.adjoint), self.albedo)
+        return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}"
+
+    def _walk(
+        self, R: CSR | Dense, lengths: Lengths, r: Array, pixels: np.ndarray, unit: np.ndarray, rule: Rule
+    ) -> Measured:
+        """Estimates of the terms k >= 1, and their standard errors."""
+        if self.adjoint:
+            return self._from_light(R, lengths, r, rule)
+        watch = sampled.watch(rule)
+        made, estimator = tables(R, self.sampler), self.estimator or "collision"
+        walker = Walker(made, lengths, estimator, self.seed, watch=watch)
+        if self.error is None:
+            return _measured(walker.rows(r, pixels, 0, self.samples or self.usual))
+        pilot = walker.rows(r, pixels, 0, _PILOT, _PILOT_STREAM)
+        # Samples of the pilot do not count: chosen by their own spread, they would be biased.
+        wanted = _PILOT * (pilot.standard_error * unit / self.error) ** 2
+        counts = _rounded_up(wanted.reshape(len(pixels), -1).max(axis=1), self.samples or _MOST)
+        return _each(walker, r, pixels, counts)
+
+    def _from_light(self, R: CSR | Dense, lengths: Lengths, r: Array, rule: Rule) -> Measured:
+        made, host = tables_of_columns(R), r.get()
+        walker = Walker(made, lengths, "endpoint", self.seed, watch=sampled.watch(rule))
+        count = self._count(len(host))
+        mean, error = np.zeros((2, len(host), r.columns))
+        for c, column in enumerate(host.reshape(len(host), -1).T):
+            made.append(r.device.upload(column))
+            mean[:, c], error[:, c] = _measured(walker.columns(0, count, stream=c))
+        return mean.reshape(host.shape), error.reshape(host.shape)
+
+    def _count(self, n: int) -> int:
+        return n * (self.samples or self.usual)
+
+    def _refuse_together(self) -> None:
+        """Options that exclude each other."""
+        if self.gather and self.pixels is not None:
+            raise InputTypeError("gather=True needs x at every pixel; leave pixels= out")
+        if self.series == "chebyshev" and (self.adjoint or self.estimator == "endpoint"):
+            raise InputTypeError("series='chebyshev' scores at every step; leave adjoint= and estimator= out")
+        if self.series == "chebyshev" and self.albedo is not None:
+            raise InputTypeError("series='chebyshev' has walks of one length; leave albedo= out")
+        if self.series == "neumann" and self.degree is not None:
+            raise InputTypeError("degree= is for series='chebyshev'; give albedo= for other walks")
+        if not self.adjoint:
+            return
+        if self.pixels is not None or self.error is not None:
+            raise InputTypeError("adjoint=True estimates whole pictures; leave pixels= and error= out")
+        if self.estimator == "collision" or self.sampler != "alias":
+            raise InputTypeError("adjoint=True has estimator='endpoint' and sampler='alias'; leave them out")
+
+
+def _within_float32(values: np.ndarray) -> np.ndarray:
+    """Coefficients or estimates of a polynomial of too high a degree are infinite, or NaN."""
+    if not np.all(np.abs(values) <= np.finfo(np.float32).max):
+        raise InputError(
+            "the terms of this series are beyond float32; lower degree=, or use method='chebyshev'"
+        )
+    return values
+
+
+def _pixels(pixels: Any, n: int) -> np.ndarray:
+    array = np.asarray(pixels)
+    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "iu":
+        raise InputError(f"pixels has shape {array.shape} of {array.dtype}; it must be (P,) whole numbers")
+    worst = int(array.min() if array.min() < 0 else array.max())
+    if not 0 <= worst < n:
+        raise InputError(f"pixels holds {worst}; they must be in 0..{n - 1}")
+    return array.astype(np.int64)
+
+
+def _rounded_up(wanted: np.ndarray, most: int) -> np.ndarray:
+    """Powers of two, so that pixels of like need share a launch, within 2 .. most."""
+    powers = 2.0 ** np.ceil(np.log2(np.clip(wanted, 2.0, most)))
+    return np.minimum(powers, most).astype(np.int64)
+
+
+def _each(walker: Walker, r: Array, pixels: np.ndarray, counts: np.ndarray) -> Measured:
+    """Pixels with counts of samples of their own."""
+    shape = (len(pixels), *r.shape[1:])
+    mean, error = np.zeros(shape), np.zeros(shape)
+    for count in np.unique(counts):
+        here = counts == count
+        mean[here], error[here] = _measured(walker.rows(r, pixels[here], 0, int(count)))
+    return mean, error
+
+
+def _measured(sums: Sums) -> Measured:
+    return sums.mean, sums.standard_error
+
+
+def _gather(system: System, R: CSR | Dense, found: Estimate) -> Estimate:
+    """Errors of the pixels are independent: their variances pass through the squares of R."""
+    error = found.standard_error
+    assert error is not None  # noqa: S101 - Monte Carlo always tells it
+    x = sampled.gathered(system, found.x)
+    return dataclasses.replace(found, x=x, standard_error=np.sqrt(np.asarray(squares(R) @ error**2)))

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Chebyshev iteration written out as a polynomial in R, for methods that sample its terms one by one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def chebyshev_coefficients(degree: int, bounds: tuple[float, float]) -> np.ndarray:
+    """c_0 .. c_degree of p(R) = sum c_k R^k near (I + R)^-1 for a spectrum of S = I + R within `bounds`.
+
+    It is the iterate after degree + 1 steps from zero: Saad, Iterative Methods for Sparse Linear Systems, 2nd
+    ed., algorithm 12.1, carried out on the coefficients.
+
+    >>> chebyshev_coefficients(0, (0.5, 1.5)).tolist()
+    [1.0]
+    """
+    centre, radius, sigma = _interval(bounds)
+    x, r = np.zeros(degree + 1), np.zeros(degree + 2)
+    r[0], rho = 1.0, 1.0 / sigma
+    d = r[:-1] / centre
+    for _ in range(degree + 1):
+        x += d
+        r = -np.append(x, 0.0) - np.append(0.0, x)  # 1 - (1 + R) x
+        r[0] += 1.0
+        previous, rho = rho, 1.0 / (2.0 * sigma - rho)
+        d = 2.0 * rho / radius * r[:-1] + rho * previous * d
+    return x
+
+
+def chebyshev_bias(degree: int, bounds: tuple[float, float]) -> float:
+    """The largest relative residual p leaves, 1 / T_(degree + 1)(centre / radius), where S is self-adjoint.
+
+    >>> round(chebyshev_bias(0, (0.5, 1.5)), 9)
+    0.5
+    """
+    return 1.0 / math.cosh((degree + 1) * math.acosh(_interval(bounds)[2]))
+
+
+def chebyshev_degree(rtol: float, bounds: tuple[float, float]) -> int:
+    """The least degree whose bias is at most `rtol`.
+
+    >>> chebyshev_degree(0.5, (0.5, 1.5)), chebyshev_degree(1e-2, (0.5, 1.5))
+    (0, 4)
+    """
+    steps = math.acosh(1.0 / max(rtol, 1e-7)) / math.acosh(_interval(bounds)[2])
+    return max(0, math.ceil(steps - 1e-9) - 1)
+
+
+def _interval(bounds: tuple[float, float]) -> tuple[float, float, float]:
+    """Centre, radius, and their ratio sigma."""
+    lower, upper = bounds
+    centre = (upper + lower) / 2.0
+    radius = max((upper - lower) / 2.0, 1e-6 * centre)
+    return centre, radius, centre / radius

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where random walks have a mean and a variance, and how long they should be.
+
+The weight of a walk that goes on with chance q after each step has second moments that grow like powers of
+
+    Q_ij = |R_i| |R_ij| / q      entries drawn in proportion (eq. 25)
+    Q_ij = n_i R_ij^2 / q        one of n_i entries, all alike
+
+so that its variance is finite where the spectral radius of Q is below 1. Whenever it is, rho(|R|) < 1 too,
+and the mean exists: by Cauchy and Schwarz rho(|R|)^2 <= q rho(Q).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.device import Array, vectors
+from ltcl.errors import InputError
+from ltcl.operators import CSR, Dense, Operator
+from ltcl.operators.alias import Tables
+from ltcl.operators.entrywise import mapped
+from ltcl.theory.spectrum import spectral_radius
+
+_LONGEST = 0.9999  # chance to go on; beyond, walks of many thousand steps would carry nothing
+_SHORTEST = 1 / 16  # below, terms that matter little are seen so rarely that nobody can tell their error
+
+
+class SecondMoments(Operator):
+    """q Q: what a step makes of the second moments of weights.
+
+    Parameters
+    ----------
+    R : CSR or Dense, (N, N)
+    made : Tables
+        Of R for the sampler in question, or with `columns` of R^T, over which the walks of the adjoint go.
+    columns : bool
+    """
+
+    def __init__(self, R: CSR | Dense, made: Tables, columns: bool = False) -> None:
+        super().__init__(R.device, R.shape)
+        uniform = made.sampler == "uniform"
+        self._entries, self._columns = mapped(R, np.square if uniform else np.abs), columns
+        d = made.counts() if uniform else made.sums()
+        self._d = R.device.upload(d[: R.shape[0]])
+
+    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        if transpose or add is not None:
+            raise TypeError("SecondMoments is for power iteration only")
+        self._entries._product(x, out, scale, None, self._columns)
+        vectors.scale_rows(self._d, out, out)
+
+
+def second_moment_radius(R: CSR | Dense, made: Tables, columns: bool = False) -> float:
+    """q times the spectral radius of Q, by power iteration; kept with R. See `SecondMoments`.
+
+    >>> import ltcl
+    >>> from ltcl.operators.alias import tables
+    >>> R = Dense(ltcl.open_device(), [[0.0, 0.5], [-0.5, 0.0]])
+    >>> round(second_moment_radius(R, tables(R)), 6)
+    0.25
+    """
+    key = f"second moments, {'columns' if columns else made.sampler}"
+    if key not in R.tables:
+        R.tables[key] = spectral_radius(SecondMoments(R, made, columns)).value
+    return R.tables[key]
+
+
+def chance_to_go_on(radius: float, albedo: float | None) -> float:
+    """q = m / (1 - m) of eq. 24; where no albedo m is given sqrt(radius), at which rho(Q) = q.
+
+    For equal row sums that is rho(R), hence the m of a closed scene (eq. 14).
+
+    Parameters
+    ----------
+    radius : float
+        From `second_moment_radius`.
+    albedo : float, optional
+
+    Raises
+    ------
+    InputError
+        m outside (0, 1/2), or an infinite variance.
+
+    Examples
+    --------
+    >>> chance_to_go_on(0.25, None), round(chance_to_go_on(0.25, 0.3), 4)
+    (0.5, 0.4286)
+    """
+    if albedo is None:
+        q = max(math.sqrt(radius), _SHORTEST)
+        if not q < _LONGEST:  # NaN neither, where moments overflow
+            raise InputError(
+                "walks over R have no finite variance: the second moments of their weights grow by "
+                f"{radius:.3g} a step, which must be below 1; use series='chebyshev' or method='chebyshev'"
+            )
+        return q
+    m = checks.number("albedo", albedo, above=0.0)
+    if m >= 0.5 or m / (1.0 - m) > _LONGEST:
+        raise InputError(
+            f"albedo is {m:g}; walks go on with chance m / (1 - m) (eq. 24), so they need m below 1/2: "
+            "from there on use series='chebyshev' or method='chebyshev'"
+        )
+    q = m / (1.0 - m)
+    if not radius < q:
+        least = f"below {radius / (1.0 + radius):.3g}" if radius < 1.0 else "whatever it is"
+        raise InputError(
+            f"albedo is {m:g}; over this R the variance of walks is infinite {least}: the second moments of "
+            f"weights grow by {radius / q:.3g} a step; leave albedo out, or use series='chebyshev'"
+        )
+    return q
