@@ -26,6 +26,7 @@ from ltcl import checks, layout
 from ltcl.operators import Operator
 from ltcl.single_view import negative_bounces
 from ltcl.solvers import Solution, sampled, solve
+from ltcl.solvers.solve import SAMPLED
 from ltcl.transport import Transport, require
 
 logger = logging.getLogger(__name__)
@@ -170,9 +171,18 @@ def _chain(
     S: Operator, l_out: np.ndarray, bounces: int, method: str, rtol: float, options: dict[str, Any]
 ) -> _Chain:
     found, solutions, left = [], [], l_out.astype(np.float64)
-    for _ in range(bounces + 1):
-        solution = solve(S, left, method, rtol=rtol, **options)
+    for k in range(bounces + 1):
+        solution = solve(S, left, method, rtol=rtol, **_fresh(method, options, k))
         found.append(solution.x.astype(np.float64))
         solutions.append(solution)
         left = left - found[-1]
     return _Chain(found, left, solutions)
+
+
+def _fresh(method: str, options: dict[str, Any], k: int) -> dict[str, Any]:
+    """The options of bounce k: with random numbers of its own, or its noise would go with that of others."""
+    if method not in SAMPLED:
+        return options
+    seed = options.get("seed", 0)
+    sampled.check_seed(seed)
+    return {**options, "seed": (seed + k) % 2**64}

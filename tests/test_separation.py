@@ -167,6 +167,18 @@ def test_bad_input_is_refused_by_name(device, case):
     assert "\n" not in str(caught.value)
 
 
+def test_bounces_are_sampled_with_random_numbers_of_their_own(device):
+    """Bounce k takes seed + k: the same as solves of its own, to the bit."""
+    T = ltcl.Transport(lambertian(N, 0.5, seed=64).T, GRID, device=device)
+    image = T @ np.ones(GRID)
+    b = ltcl.separate(T, image, bounces=1, method="monte_carlo", samples=64, seed=7)
+    left = image.ravel().astype(np.float64)
+    for seed, found in ((7, b.direct), (8, b.bounces[0])):
+        x = ltcl.solve(T.interreflection, left, "monte_carlo", rtol=1e-3, samples=64, seed=seed).x
+        np.testing.assert_array_equal(found.ravel(), x.astype(np.float32))
+        left = left - x.astype(np.float64)
+
+
 def test_more_bounces_than_the_host_can_hold_are_refused(device):
     with pytest.raises(ltcl.errors.MemoryLimitError, match="separating 1000000000000 bounces"):
         ltcl.separate(transport(device), FINE, bounces=10**12)

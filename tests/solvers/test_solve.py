@@ -235,12 +235,12 @@ def test_an_exact_end_reads_well(device):
     assert said.endswith("relative residual 0: the true residual is within the tolerance")
 
 
-@pytest.mark.parametrize("method", ITERATIVE)
+@pytest.mark.parametrize("method", [*ITERATIVE, "monte_carlo", "hybrid"])
 def test_help_tells_the_options_of_every_method(method):
     _, _, table = (ltcl.solve.__doc__ or "").partition("method                options")
     assert re.search(rf"\b{method}\b", table)
-    for option in dataclasses.fields(module_of_solve().ITERATIVE[method]):
-        assert re.search(rf"\b{option.name}: ", table), option.name
+    for option in dataclasses.fields((module_of_solve().ITERATIVE | module_of_solve().SAMPLED)[method]):
+        assert re.search(rf"\b{option.name}[:,]", table), option.name
 
 
 def module_of_solve() -> Any:
