@@ -28,8 +28,8 @@ class Status(enum.Enum):
         "try method='gmres', 'cg' with normal=True, or 'direct'"
     )
     SAMPLED = (
-        "the samples are spent, what is left is noise, told by .standard_error; raise samples=, "
-        "or take gather=True"
+        "the samples are spent, what is left is noise, told by .standard_error; try more "
+        "samples=, or gather=True"
     )
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
