@@ -217,7 +217,7 @@ def test_the_true_residual_decides(device):
     noisy = ltcl.solve(S, b, "monte_carlo", samples=16, rtol=1e-3)
     assert noisy.status is Status.SAMPLED
     assert noisy.residual == pytest.approx(residual(dense, noisy.x, b), rel=1e-4)
-    assert "raise samples=" in str(noisy)
+    assert "try more samples=" in str(noisy)
     close = ltcl.solve(S, b, "monte_carlo", samples=4096, gather=True)
     assert close.converged
     assert residual(dense, close.x, b) <= 1e-2
