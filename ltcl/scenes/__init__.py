@@ -12,6 +12,7 @@ from __future__ import annotations
 from ltcl.scenes.blocks import Block
 from ltcl.scenes.box import box
 from ltcl.scenes.dihedral import dihedral
+from ltcl.scenes.exchange.corner import CornerRows
 from ltcl.scenes.exchange.form_factor import FormFactor
 from ltcl.scenes.exchange.visibility import visibility
 from ltcl.scenes.gloss.glossy import glossy
@@ -23,6 +24,7 @@ from ltcl.scenes.trihedral import trihedral
 
 __all__ = [
     "Block",
+    "CornerRows",
     "FormFactor",
     "GlossyScene",
     "Patches",
