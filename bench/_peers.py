@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Sparse products of others, in float32 with 32-bit indices: what the extra `bench` brings, and PyTorch.
+
+A peer that is not installed is named and left out; SciPy and NumPy are always there.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import warnings
+from collections.abc import Callable
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+Product = Callable[[], np.ndarray]
+PEERS = {"scipy": "scipy", "numba": "numba", "sparse_dot_mkl": "sparse_dot_mkl", "torch": "torch"}
+
+
+def missing() -> list[str]:
+    """Peers that are not installed."""
+    return [name for name, module in PEERS.items() if importlib.util.find_spec(module) is None]
+
+
+def sparse_products(A: Any, x: np.ndarray) -> dict[str, Product]:
+    """A @ x by every peer that is there, for a csr_array A of float32 and x (N,) or (N, k)."""
+    makers = {"scipy": _scipy, "numba": _numba, "sparse_dot_mkl": _mkl, "torch": _torch}
+    absent = missing()
+    return {name: make(A, x) for name, make in makers.items() if name not in absent}
+
+
+def _scipy(A: Any, x: np.ndarray) -> Product:
+    return lambda: A @ x
+
+
+def _mkl(A: Any, x: np.ndarray) -> Product:
+    import scipy.sparse
+
+    # It looks for the library beside Python itself, where an environment of `venv` has it not.
+    found = [file for file in metadata.files("mkl") or () if file.name.startswith("libmkl_rt")]
+    if found:
+        os.environ.setdefault("MKL_RT", str(found[0].locate()))
+    mkl: Any = importlib.import_module("sparse_dot_mkl")
+
+    matrix = scipy.sparse.csr_matrix(A)  # it takes no csr_array
+    return lambda: mkl.dot_product_mkl(matrix, x)
+
+
+def _torch(A: Any, x: np.ndarray) -> Product:
+    torch: Any = importlib.import_module("torch")  # in no extra: it brings gigabytes
+
+    pointers, columns = (torch.from_numpy(part.astype(np.int32)) for part in (A.indptr, A.indices))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that its sparse rows are in beta state
+        matrix = torch.sparse_csr_tensor(pointers, columns, torch.from_numpy(A.data), size=A.shape)
+    operand = torch.from_numpy(x if x.ndim == 2 else x[:, None])
+    return lambda: (matrix @ operand).numpy().reshape(A.shape[0], *x.shape[1:])
+
+
+def _numba(A: Any, x: np.ndarray) -> Product:
+    numba: Any = importlib.import_module("numba")
+
+    @numba.njit(parallel=True, fastmath=True)
+    def product(pointers: Any, columns: Any, values: Any, x: Any, out: Any) -> None:
+        for row in numba.prange(len(pointers) - 1):
+            for c in range(x.shape[1]):
+                total = np.float32(0)
+                for t in range(pointers[row], pointers[row + 1]):
+                    total += values[t] * x[columns[t], c]
+                out[row, c] = total
+
+    operand = x if x.ndim == 2 else x[:, None]
+    out = np.empty((A.shape[0], operand.shape[1]), np.float32)
+
+    def run() -> np.ndarray:
+        product(A.indptr, A.indices, A.data, operand, out)
+        return out.reshape(A.shape[0], *x.shape[1:])
+
+    return run
