@@ -14,6 +14,8 @@ from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.packing import smallest
+from ltcl.operators.tiles import Tiles
 
 __all__ = [
     "CSR",
@@ -26,9 +28,11 @@ __all__ = [
     "Pattern",
     "ScaledColumns",
     "Shifted",
+    "Tiles",
     "Transposed",
     "as_operator",
     "interreflections",
+    "smallest",
 ]
 
 
