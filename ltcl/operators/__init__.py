@@ -14,7 +14,8 @@ from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
-from ltcl.operators.packing import smallest
+from ltcl.operators.orders import hilbert, relatives
+from ltcl.operators.packing import smallest, spread
 from ltcl.operators.tiles import Tiles
 
 __all__ = [
@@ -31,8 +32,11 @@ __all__ = [
     "Tiles",
     "Transposed",
     "as_operator",
+    "hilbert",
     "interreflections",
+    "relatives",
     "smallest",
+    "spread",
 ]
 
 
