@@ -14,6 +14,9 @@ from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.orders import hilbert, relatives
+from ltcl.operators.packing import smallest, spread
+from ltcl.operators.tiles import Tiles
 
 __all__ = [
     "CSR",
@@ -26,9 +29,14 @@ __all__ = [
     "Pattern",
     "ScaledColumns",
     "Shifted",
+    "Tiles",
     "Transposed",
     "as_operator",
+    "hilbert",
     "interreflections",
+    "relatives",
+    "smallest",
+    "spread",
 ]
 
 
