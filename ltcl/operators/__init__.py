@@ -15,6 +15,8 @@ from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.named_bases import basis, basis_of
+from ltcl.operators.pyramid import Pyramid
 from ltcl.operators.wavelets import Wavelet
 
 __all__ = [
@@ -29,11 +31,14 @@ __all__ = [
     "Operator",
     "Ordered",
     "Pattern",
+    "Pyramid",
     "ScaledColumns",
     "Shifted",
     "Transposed",
     "Wavelet",
     "as_operator",
+    "basis",
+    "basis_of",
     "interreflections",
 ]
 
