@@ -17,7 +17,7 @@ import scipy.sparse
 
 from ltcl.device import Device, cache, list_devices, sources, trial
 from ltcl.errors import DeviceError, FileError
-from ltcl.operators import CSR, Dense, IdentityPlus, Operator, Wavelet
+from ltcl.operators import CSR, Dense, IdentityPlus, Operator, Tiles, Wavelet
 from ltcl.operators.base import WIDTHS
 from ltcl.solvers import solve
 
@@ -65,6 +65,7 @@ def on_device(device: Device) -> dict[str, Callable[[], str]]:
     return {
         **{f"kernels/{file}.cl": partial(_compile, device, file) for file in files},
         "sparse product": lambda: _product(CSR(device, scipy.sparse.csr_array(R)), R),
+        "products of tiles": lambda: _tiles(device, scipy.sparse.csr_array(R)),
         "dense product": lambda: _product(Dense(device, R), R),
         "wavelets": lambda: _product(Wavelet(device, (8, 8), "db2", levels=1), _wavelets()),
         "solve": lambda: _solve(IdentityPlus(Dense(device, R)), R),
@@ -100,6 +101,13 @@ def _wavelets() -> np.ndarray:
     pictures = np.eye(64).reshape(64, 8, 8)
     coefficients = [pywt.dwt2(picture, "db2", "periodization") for picture in pictures]
     return np.stack([pywt.coeffs_to_array(list(c))[0].ravel() for c in coefficients], axis=1)
+
+
+def _tiles(device: Device, R: scipy.sparse.csr_array) -> str:
+    """Each width and each precision once, against what the tiles stand for."""
+    kinds = ((16, "float32"), (8, "bfloat16"), (1, "float16"), (16, "int8"))
+    made = [Tiles(device, R, width, precision) for width, precision in kinds]
+    return max(_product(tiles, tiles.to_dense()) for tiles in made)
 
 
 def _solve(S: Operator, R: np.ndarray) -> str:

@@ -16,7 +16,10 @@ from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
 from ltcl.operators.named_bases import basis, basis_of
+from ltcl.operators.orders import hilbert, relatives
+from ltcl.operators.packing import smallest, spread
 from ltcl.operators.pyramid import Pyramid
+from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
 
 __all__ = [
@@ -34,12 +37,17 @@ __all__ = [
     "Pyramid",
     "ScaledColumns",
     "Shifted",
+    "Tiles",
     "Transposed",
     "Wavelet",
     "as_operator",
     "basis",
     "basis_of",
+    "hilbert",
     "interreflections",
+    "relatives",
+    "smallest",
+    "spread",
 ]
 
 

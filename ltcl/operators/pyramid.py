@@ -72,13 +72,12 @@ class Pyramid(Basis):
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
         if x.columns == 0:
             return
-        steps = [("gather", level) for level in range(len(self.cells))]
-        if transpose:
-            steps = [("spread", level) for level, _ in reversed(list(enumerate(self.cells)))]
+        levels = range(len(self.cells))
+        name, levels = ("spread", reversed(levels)) if transpose else ("gather", levels)
         with self._lock:
             if self._sums.size < self.shape[0] * x.columns:
                 self._sums = self.device.empty(self.shape[0] * x.columns)
-            for name, level in steps:
+            for level in levels:
                 self._launch(name, level, scale, int(add is not None), x, self._sums, add or out, out)
 
     def _launch(self, name: str, level: int, *arguments: Any) -> None:
