@@ -13,7 +13,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import InputError
-from ltcl.operators.base import Operator, group_of, lanes_of
+from ltcl.operators.base import MOST, Operator, group_of, lanes_of
 from ltcl.operators.orders import hilbert
 
 
@@ -103,7 +103,7 @@ class Ordered(Basis):
         pieces = -(-k // lanes)
         across, group = (1, (1, 64)) if self.device.is_cpu else (pieces, group_of(pieces))
         adds, added = (0, out) if add is None else (1, add)
-        kernel((across, rows), group, rows, k, scale, adds, self._orders[transpose], x, added, out)
+        kernel((across, min(rows, MOST)), group, rows, k, scale, adds, self._orders[transpose], x, added, out)
 
 
 class Chained(Basis):

@@ -14,7 +14,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, Device
-from ltcl.operators.base import group_of, lanes_of
+from ltcl.operators.base import MOST, group_of, lanes_of
 from ltcl.operators.bases import Basis
 
 
@@ -86,9 +86,9 @@ class Pyramid(Basis):
         kernel = self.device.kernel("pyramid", f"pyramid_{name}", K=lanes)
         pieces = -(-k // lanes)
         if self.device.is_cpu:
-            size, group = (1, min(w, -(-64 // h)), h), (1, 1, 1)
+            size, group = (1, min(w, -(-64 // h)), min(h, MOST)), (1, 1, 1)
         else:
-            size, group = (pieces, w, h), (*group_of(pieces), 1)
+            size, group = (pieces, min(w, MOST), min(h, MOST)), (*group_of(pieces), 1)
         kernel(size, group, *self.grid, level, len(self.cells), k, *arguments)
 
 

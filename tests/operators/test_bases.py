@@ -13,6 +13,7 @@ from tests import gallery, reference
 from tests.operators import helpers
 
 GRIDS = ((1, 1), (3, 5), (1, 70), (9, 8))
+LONG = 20000  # more pixels than there are items
 
 
 def shuffled(n: int) -> np.ndarray:
@@ -38,8 +39,8 @@ def test_orders_meet_their_twin(device, monkeypatch, grid, kind):
 
 
 def test_orders_lose_no_bit(device):
-    x = gallery.vectors(72, 3)
-    W = Ordered(device, (9, 8), shuffled(72))
+    x = gallery.vectors(LONG, 3)
+    W = Ordered(device, (LONG, 1), shuffled(LONG))
     found = helpers.product(W, x)
     helpers.same_bits(found, x[W.order])
     helpers.same_bits(helpers.product(W.T, found), x)
