@@ -9,29 +9,40 @@ import scipy.sparse
 
 from ltcl.device import Device, open_device
 from ltcl.operators.base import Norms, Operator, Transposed
+from ltcl.operators.bases import Basis, Chained, Ordered
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
 from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.named_bases import basis, basis_of
 from ltcl.operators.orders import hilbert, relatives
 from ltcl.operators.packing import smallest, spread
+from ltcl.operators.pyramid import Pyramid
 from ltcl.operators.tiles import Tiles
+from ltcl.operators.wavelets import Wavelet
 
 __all__ = [
     "CSR",
+    "Basis",
+    "Chained",
     "Coupled",
     "Dense",
     "Host",
     "IdentityPlus",
     "Norms",
     "Operator",
+    "Ordered",
     "Pattern",
+    "Pyramid",
     "ScaledColumns",
     "Shifted",
     "Tiles",
     "Transposed",
+    "Wavelet",
     "as_operator",
+    "basis",
+    "basis_of",
     "hilbert",
     "interreflections",
     "relatives",
