@@ -72,26 +72,26 @@ class Links(Tables):
 
     def second_moments(self) -> Iterator[CSR]:
         """Of each channel R_cij^2 / p(j | i), which a step makes of the second moments of weights."""
-        made, p = self.links.get(), self._chances()
+        made, inverse = self.links.get(), self._inverse_chances()
         for bits in made.T[1:]:
-            Q = np.minimum(p * np.square(bits.view(np.float32), dtype=np.float64), _LARGEST)
-            columns = made[:, 0].astype(np.int32)
+            squares = np.square(bits.view(np.float32), dtype=np.float64)
+            Q = np.divide(squares, inverse, out=np.zeros_like(squares), where=inverse > 0.0)
+            Q, columns = np.minimum(Q, _LARGEST), made[:, 0].astype(np.int32)
             yield CSR(self.device, scipy.sparse.csr_array((Q, columns, self._indptr), shape=self.shape))
 
-    def _chances(self) -> np.ndarray:
-        """p(j | i) of each entry, float64; 0 in rows without."""
-        uniform = self.sampler == "uniform"
-        total = (self.counts() if uniform else self.sums()).astype(np.float64)
-        chance = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0.0)
-        return _per_entry(self._indptr, chance) * (1.0 if uniform else self._P)
+    def _inverse_chances(self) -> np.ndarray:
+        """1 / p(j | i) of each entry, float64; 0 where it is never drawn."""
+        if self.sampler == "uniform":
+            return _per_entry(self._indptr, self.counts().astype(np.float64))
+        total = _per_entry(self._indptr, self.sums().astype(np.float64))
+        return np.divide(total, self._P, out=np.zeros_like(total), where=self._P > 0.0)
 
     def _linked(self, columns: np.ndarray, signs: Sequence[float], values: list[np.ndarray]) -> np.ndarray:
-        made, p = np.zeros((len(columns), 4), np.uint32), self._chances()
+        made, inverse = np.zeros((len(columns), 4), np.uint32), self._inverse_chances()
         made[:, 0] = columns
-        for c, (sign, R) in enumerate(zip(signs, values, strict=True)):
-            factor = np.divide(sign * R, p, out=np.zeros_like(p), where=p > 0.0)
-            with np.errstate(over="ignore"):  # then their moments overflow, too
-                made[:, 1 + c] = factor.astype(np.float32).view(np.uint32)
+        with np.errstate(over="ignore"):  # then their moments overflow, too
+            for c, (sign, R) in enumerate(zip(signs, values, strict=True)):
+                made[:, 1 + c] = (sign * R * inverse).astype(np.float32).view(np.uint32)
         return made
 
 
@@ -141,7 +141,7 @@ def _pooled(indptr: np.ndarray, values: list[np.ndarray]) -> np.ndarray:
     """P in units of the largest |R_ci| of its row, so that that of equal channels is |R_c| to the bit."""
     rows = _per_entry(indptr, np.arange(len(indptr) - 1))
     sums = np.stack([np.bincount(rows, np.abs(v), len(indptr) - 1) for v in values])
-    times = np.divide(sums.max(axis=0), sums, out=np.zeros_like(sums), where=sums > 0.0)
+    times = np.divide(sums.max(axis=0), sums, out=np.zeros(sums.shape), where=sums > 0.0)
     squares = np.zeros(len(rows))
     for v, factor in zip(values, times, strict=True):
         squares += np.square(factor[rows] * v)

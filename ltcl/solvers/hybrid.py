@@ -19,7 +19,7 @@ import numpy as np
 
 from ltcl import checks, theory
 from ltcl.errors import InputError, MemoryLimitError
-from ltcl.operators.alias import SAMPLERS
+from ltcl.operators.alias import SAMPLERS, Tables
 from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.walks import Walker, whole
 from ltcl.solvers import sampled
@@ -62,14 +62,17 @@ class Hybrid:
 
     def estimate(self, channels: Sequence[Channel]) -> list[Estimate]:
         """The start plus what the iterations make of its residual r, begun at zero; columns are shared."""
-        try:
-            made, sign = sampled.tables_of(
-                channels, self
-            )  # rows that overflow have no spectral radius either
+        try:  # rows that overflow have no spectral radius either
+            made, sign = sampled.tables_of(channels, self)
         except MemoryLimitError as error:
             if len(channels) == 1:
                 raise
-            return sampled.each_alone(self, channels, str(error))
+            why = str(error)
+        else:
+            return self._iterate(channels, made, sign)
+        return sampled.each_alone(self, channels, why)
+
+    def _iterate(self, channels: Sequence[Channel], made: Tables, sign: float) -> list[Estimate]:
         count = max(self._iterations(one) for one in channels)
         walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed)
         start = sampled.side_by_side([one.r.get().astype(np.float64) for one in channels])

@@ -119,10 +119,12 @@ class MonteCarlo:
         except (InputError, MemoryLimitError) as error:
             if len(channels) == 1:
                 raise
-            return sampled.each_alone(self, channels, str(error).partition(";")[0])
-        rest, error = self._walk(channels, made, lengths)
-        found = zip(channels, sampled.each(rest, channels), sampled.each(error, channels), strict=True)
-        return [self._estimate(one, first, mean, error, reason) for one, mean, error in found]
+            why = str(error).partition(";")[0]
+        else:
+            rest, error = self._walk(channels, made, lengths)
+            found = zip(channels, sampled.each(rest, channels), sampled.each(error, channels), strict=True)
+            return [self._estimate(one, first, mean, error, reason) for one, mean, error in found]
+        return sampled.each_alone(self, channels, why)
 
     def _tables(self, channels: Sequence[Channel]) -> tuple[Tables, float]:
         """What walks go over, and the sign in S = I + sign R."""
