@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Tables that three channels share: a step is in the mean the row of each, and equal channels have their own."""
+"""Tables that three channels share: a step is the row of each in the mean, and of equal ones their own."""
 
 from __future__ import annotations
 
