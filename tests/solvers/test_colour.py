@@ -216,7 +216,7 @@ def test_hybrid_converges_to_every_channel(device):
 
 
 def test_where_shared_walks_have_no_variance_channels_have_their_own(device, launched):
-    """Channels lit from places of their own: row sums of 0.8, and moments of up to three times their square."""
+    """Channels lit from places of their own: row sums of 0.8, moments of up to three times their square."""
     Rs = []
     for c in range(3):
         R = np.zeros((N, N))
