@@ -54,15 +54,14 @@ class Links(Tables):
     channels = 3
 
     def __init__(self, Rs: Sequence[CSR | Dense], signs: Sequence[float], sampler: str = "alias") -> None:
-        parts = [_in_rows(R) for R in Rs]
-        checks.fits_host("links of walks that channels share", _BYTES * max(part.nnz for part in parts))
-        pattern, values = _together(parts)
-        indptr, self.others = pattern.indptr, tuple(Rs[1:])
-        self._P = _pooled(indptr, values)
-        places = np.arange(pattern.nnz) - _per_entry(indptr, indptr[:-1])
-        super().__init__(CSR(Rs[0].device, _with(pattern, self._P, places)), sampler)
-        self._check_room(self._used, 16)
-        self._indptr = indptr
+        self.device, self.others = Rs[0].device, tuple(Rs[1:])
+        entries = max(R.nnz if isinstance(R, CSR) else R.shape[0] * R.shape[1] for R in Rs)
+        checks.fits_host("links of walks that channels share", _BYTES * entries)
+        pattern, values = _together([_in_rows(R) for R in Rs])
+        self._check_room(pattern.nnz, 16)
+        self._indptr, self._P = pattern.indptr, _pooled(pattern.indptr, values)
+        places = np.arange(pattern.nnz) - _per_entry(pattern.indptr, pattern.indptr[:-1])
+        super().__init__(CSR(self.device, _with(pattern, self._P, places)), sampler)
         self.links = self.device.upload(self._linked(pattern.indices, signs, values), np.uint32)
 
     @property

@@ -5,7 +5,8 @@
 
 Each iteration draws fresh columns, so that noise of one is damped by those after it as light is. It costs
 `samples` loads a pixel in place of a row, and leaves the noise of the last product; final gather makes that
-product exactly. It converges in the mean where rho(R) < 1, as Jacobi does.
+product exactly. It converges in the mean where rho(R) < 1, as Jacobi does. The three S of a transport in
+colour draw the same columns (`ltcl.operators.links`).
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Hybrid:
         count = max(self._iterations(one) for one in channels)
         walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed)
         start = sampled.side_by_side([one.r.get().astype(np.float64) for one in channels])
-        l, watch = start, sampled.watch(channels[0].rule)
+        l, watch = start, sampled.watch(channels)
         for k in range(count):
             product = walker.rows(made.device.upload(l), np.arange(len(l)), 0, self.samples, stream=k)
             l = start + product.mean

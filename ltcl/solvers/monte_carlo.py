@@ -164,7 +164,7 @@ class MonteCarlo:
 
     def _walk(self, channels: Sequence[Channel], made: Tables, lengths: Lengths) -> Measured:
         """Estimates of the terms k >= 1 of channels side by side, and their standard errors."""
-        watch, pixels = sampled.watch(channels[0].rule), self._which(channels[0])
+        watch, pixels = sampled.watch(channels), self._which(channels[0])
         host = sampled.side_by_side([one.r.get() for one in channels])
         if self.adjoint:
             return self._from_light(Walker(made, lengths, "endpoint", self.seed, watch=watch), host)

@@ -110,12 +110,13 @@ def each(found: np.ndarray, channels: Sequence[Channel]) -> list[np.ndarray]:
     return list(np.moveaxis(found.reshape(len(found), *columns, len(channels)), -1, 0))
 
 
-def watch(rule: Rule) -> Callable[[], object]:
-    """Tell the callback of a rule that sampling begins; what comes back tells it of each step, as NaN."""
-    callback, steps = rule.callback, itertools.count(1)
+def watch(channels: Sequence[Channel]) -> Callable[[], object]:
+    """Tell the callback that sampling begins, once a channel; what comes back tells of each step, as NaN."""
+    callback, steps = channels[0].rule.callback, itertools.count(1)
     if callback is None:
         return lambda: None
-    callback(0, 1.0)
+    for _ in channels:
+        callback(0, 1.0)
     return lambda: callback(next(steps), np.nan)
 
 

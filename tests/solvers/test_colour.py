@@ -193,6 +193,17 @@ def test_final_gather_and_a_start_are_those_of_each_channel(device):
 
 
 @pytest.mark.parametrize("method", ["monte_carlo", "hybrid"])
+def test_the_callback_hears_of_three_beginnings_and_ends(device, method):
+    S, _ = systems(device, "scenes")
+    seen: list[tuple[int, float]] = []
+    found = ltcl.solve(S, pictures(), method, samples=16, callback=lambda *step: seen.append(step))
+    assert seen[:3] == [(0, 1.0)] * 3
+    assert all(np.isnan(value) for _, value in seen[3:-3])
+    assert len(seen) == 6 + found.iterations
+    assert max(value for _, value in seen[-3:]) == found.residual
+
+
+@pytest.mark.parametrize("method", ["monte_carlo", "hybrid"])
 def test_the_largest_residual_is_told_and_all_products_are_counted(device, method):
     S, dense = systems(device, "scenes")
     b = pictures()
