@@ -6,7 +6,10 @@ R has 131072 pixels and 100 nonzeros a row at random places. Walks start at ever
 sums, all walks at once; Numba by alias tables of float32 and int32 in a `prange` over pixels. A step of ours
 loads the record of a row, an entry of its table and b; a random load is one of 8 bytes in a table of the same
 size.
-Walks of all three are checked against the same float64 solution. Error against time is that of `_pays.py`.
+One walk for three colours is measured beside three walks, of R whose rows have albedos of their own in each
+colour and whose entries differ by a tenth; its steps count for all three.
+The walks of all walkers are checked against the same float64 solution. Error against time is that of
+`_pays.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ import _pays as pays
 from _harness import Options, Row, options, report, seconds
 from ltcl import plots
 from ltcl.operators import CSR
-from ltcl.operators.alias import Tables
+from ltcl.operators.alias import Tables, tables
+from ltcl.operators.links import links
 from ltcl.operators.walks import Walker, geometric
 
 NUMPY_TARGET, NUMBA_TARGET, LOADS_TARGET = 10.0, 1.5, 0.6
@@ -106,6 +110,31 @@ def numba_walker(R: scipy.sparse.csr_array, b: np.ndarray, made: Tables) -> Call
     return run
 
 
+def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
+    """Steps of walks that three channels share, counted for each, beside those of a walk a channel."""
+    random, n = np.random.default_rng(3), len(R.indptr) - 1
+    Rs: list[CSR] = []
+    for _ in range(3):
+        rows = np.repeat(random.uniform(0.3, 1.0, n), np.diff(R.indptr))
+        data = R.data * rows * random.uniform(0.9, 1.1, R.nnz)
+        host = scipy.sparse.csr_array((data.astype(np.float32), R.indices, R.indptr), shape=R.shape)
+        Rs.append(CSR(given.device, host, Rs[0].pattern if Rs else None))
+    b, lengths = random.random((n, 3), dtype=np.float32), geometric(GO_ON, -1.0)
+    together = Walker(links(Rs, (1.0, 1.0, 1.0)), lengths, "collision", 0), given.device.upload(b)
+    apart = [
+        (Walker(tables(M), lengths, "collision", 0), given.device.upload(column))
+        for M, column in zip(Rs, b.T, strict=True)
+    ]
+    actions = {
+        "one walk": lambda: together[0].rows(together[1], np.arange(n), 0, samples),
+        "three walks": lambda: [walker.rows(b_c, np.arange(n), 0, samples) for walker, b_c in apart],
+    }
+    times = seconds(actions)
+    rate = {name: 3 * samples * n * STEPS / time / 1e6 for name, time in times.items()}
+    theirs, ours = rate["three walks"], rate["one walk"]
+    return Row("steps for three colours", "three walks", theirs, ours, "M/s", ours / theirs)
+
+
 def check(name: str, found: np.ndarray, exact: np.ndarray, samples: int) -> None:
     """Stop where the mean over all pixels is not that of the solution: nobody is timed doing less."""
     if abs(float(np.mean(found - exact))) > 5.0 / (len(exact) * samples) ** 0.5:
@@ -155,6 +184,7 @@ def rows(given: Options, n: int, per_row: int, samples: int) -> tuple[list[Row],
     ]
     ours, other = times["tables"] * 1e3, times["NumPy cumulative sums"] * 1e3
     found.append(Row("tables", "NumPy cumulative sums", other, ours, "ms", other / ours))
+    found.append(colours(given, R, samples))
     return found, {
         "pixels": n,
         "nonzeros": R.nnz,

@@ -12,6 +12,9 @@
 //   COLLISION    scored at every step
 // Rows without entries end a walk.
 //
+// The R of several colour channels share a walk: it steps by a table of entries that any of them has, and the
+// entry t of its row leads to links[t], a column and what the weight of each channel is multiplied by there.
+//
 // A work-item takes WALKS chunks of CHUNK samples of one pixel, one walk of each at a time: their loads do not
 // wait for each other. Samples of a chunk are summed in order, with the rounding errors of the sums kept
 // (Knuth's two-sum). So the result does not depend on WALKS, nor on how chunks are spread over work-items.
@@ -19,11 +22,12 @@
 // falls below 2^-126, where devices round differently.
 //
 // Required defines: TABLE, see common/table.h; CHUNK; WALKS; K, the right-hand sides of one launch;
-// ESTIMATOR: 0 ENDPOINT, 1 COLLISION (walk_columns: ENDPOINT).
+// ESTIMATOR: 0 ENDPOINT, 1 COLLISION (walk_columns: ENDPOINT); CHANNELS: 1, or 3 with links (walk_rows only).
 // Counters of random numbers: pixel, sample, step / 2, stream; a step takes half a block.
 // Layout: chunk c of a pixel holds samples first + c CHUNK up to `end`; `chunks` chunks a pixel. b is row-major
-// with `stride` columns, of which offset .. offset + K - 1 are taken. Out of walk_rows: (units, K) of (sum, its
-// rounding, sum of squares, its rounding).
+// with `stride` columns, of which offset .. offset + K - 1 are taken, the first of channel 0, the next of channel
+// 1 and so on. Out of walk_rows: (units, K) of (sum, its rounding, sum of squares, its rounding). Without links
+// `links` is not read.
 
 #include "common/random.h"
 #include "common/real.h"
@@ -42,6 +46,9 @@
 #endif
 #ifndef ESTIMATOR
 #error "walk.cl needs -DESTIMATOR=<0 end-point, 1 collision>"
+#endif
+#if !defined(CHANNELS) || K % CHANNELS
+#error "walk.cl needs -DCHANNELS=<1, or 3 that share walks>, which divides K"
 #endif
 #define ENDPOINT 0
 #define COLLISION 1
@@ -123,11 +130,11 @@ typedef struct {
     uint pixel[WALKS], start[WALKS], next[WALKS], stop[WALKS];  // samples start .. stop, `next` comes next
     uint row[WALKS], step[WALKS];
     int alive[WALKS];
-    real weight[WALKS];
+    real weight[CHANNELS][WALKS];
     ulong word[WALKS];  // of the step to come, with the record of its row, where it leads and by what factor
     uint4 record[WALKS];
     uint target[WALKS];
-    real factor[WALKS];
+    real factor[CHANNELS][WALKS];
 } walks;
 
 inline void set_out(walks *walk, int units, int chunks, uint first, uint end, global const uint *pixels)
@@ -141,7 +148,8 @@ inline void set_out(walks *walk, int units, int chunks, uint first, uint end, gl
         walk->row[w] = walk->pixel[w];
         walk->step[w] = 0;
         walk->alive[w] = 0;
-        walk->weight[w] = 0;
+        for (int c = 0; c < CHANNELS; ++c)
+            walk->weight[c][w] = 0;
     }
 }
 
@@ -173,7 +181,8 @@ inline int set_off(
         walk->next[w] += starts;
         walk->alive[w] |= starts;
         walk->step[w] = starts ? 0 : walk->step[w];
-        walk->weight[w] = starts ? 1 : walk->weight[w];
+        for (int c = 0; c < CHANNELS; ++c)
+            walk->weight[c][w] = starts ? 1 : walk->weight[c][w];
         busy |= walk->alive[w];
     }
     for (int w = begin; w < begin + GROUP; w += LANES)
@@ -194,17 +203,40 @@ inline int set_off_all(
     return busy;
 }
 
+#if CHANNELS > 1
+// Replace the entries that walks have drawn by what they are linked to.
+inline void follow(walks *walk, global const uint4 *links)
+{
+    for (int w = 0; w < WALKS; ++w)
+        FETCH(links + first_entry(walk->record[w]) + (walk->target[w] >> 1));
+    for (int w = 0; w < WALKS; ++w) {
+        const uint4 record = walk->record[w];
+        const uint4 link = record.z ? links[first_entry(record) + (walk->target[w] >> 1)] : (uint4)(0);
+        walk->target[w] = link.x << 1;
+        walk->factor[0][w] = as_float(link.y);
+        walk->factor[1][w] = as_float(link.z);
+        walk->factor[2][w] = as_float(link.w);
+    }
+}
+#endif
+
 // The columns and signs that the walks step to, and what weights are multiplied by, 0 where the row is empty.
 // `b` may be 0.
 inline void draw_targets(
-    walks *walk, global const uint4 *rows, global const ulong *entries, global const real *b, int stride)
+    walks *walk, global const uint4 *rows, global const ulong *entries, global const uint4 *links,
+    global const real *b, int stride)
 {
     for (int w = 0; w < WALKS; ++w) {
-        walk->target[w] = draw(walk->record[w], entries, walk->word[w], walk->factor + w);
+        walk->target[w] = draw(walk->record[w], entries, walk->word[w], walk->factor[0] + w);
+        walk->factor[0][w] = walk->record[w].z ? walk->factor[0][w] : 0;
+    }
+#if CHANNELS > 1
+    follow(walk, links);
+#endif
+    for (int w = 0; w < WALKS; ++w) {
         FETCH(rows + (walk->target[w] >> 1));
         if (b)
             FETCH(b + (int)(walk->target[w] >> 1) * stride);
-        walk->factor[w] = walk->record[w].z ? walk->factor[w] : 0;
     }
 }
 
@@ -214,23 +246,28 @@ inline void end_walk(walks *walk, int w)
     walk->row[w] = walk->pixel[w];
 }
 
-// Move walk w; returns whether it goes on after its score, and in `worth` what a score is multiplied by: left as
-// it is, 0, where the row is empty.
+// Move walk w; returns whether it goes on after its score, and in `worth` what a score of each channel is
+// multiplied by: left as it is, 0, where the row is empty.
 inline int move(walks *walk, int w, global const uint2 *steps, real *worth)
 {
-    if (walk->factor[w] == 0)
+    int seen = 0;
+    for (int c = 0; c < CHANNELS; ++c)
+        seen |= walk->factor[c][w] != 0;
+    if (!seen)
         return 0;
     const uint2 step = steps[walk->step[w]++];
     walk->row[w] = walk->target[w] >> 1;
-    walk->weight[w] *= walk->target[w] & 1 ? -walk->factor[w] : walk->factor[w];
-    *worth = walk->weight[w] * as_float(step.x);
+    for (int c = 0; c < CHANNELS; ++c) {
+        walk->weight[c][w] *= walk->target[w] & 1 ? -walk->factor[c][w] : walk->factor[c][w];
+        worth[c] = walk->weight[c][w] * as_float(step.x);
+    }
     return ((uint)walk->word[w] & ((1u << GO_ON_BITS) - 1)) < step.y;
 }
 
 kernel void walk_rows(
     int units, int chunks, uint first, uint end, ulong seed, uint stream, int stride, int offset,
-    global const uint *pixels, global const uint4 *rows, global const ulong *entries, global const uint2 *steps,
-    global const real *b, global real4 *out)
+    global const uint *pixels, global const uint4 *rows, global const ulong *entries, global const uint4 *links,
+    global const uint2 *steps, global const real *b, global real4 *out)
 {
     walks walk;
     real score[WALKS][K], sum[WALKS][K], low[WALKS][K], square[WALKS][K], square_low[WALKS][K];
@@ -240,17 +277,17 @@ kernel void walk_rows(
             score[w][c] = sum[w][c] = low[w][c] = square[w][c] = square_low[w][c] = 0;
     int busy = set_off_all(&walk, seed, stream, rows, entries);
     while (busy) {
-        draw_targets(&walk, rows, entries, b, stride);
+        draw_targets(&walk, rows, entries, links, b, stride);
         busy = 0;
         for (int begin = 0; begin < WALKS; begin += GROUP) {
             for (int w = begin; w < begin + GROUP; ++w) {
                 if (!walk.alive[w])
                     continue;
-                real worth = 0;
-                const int goes_on = move(&walk, w, steps, &worth);
+                real worth[CHANNELS] = {0};
+                const int goes_on = move(&walk, w, steps, worth);
                 if (ESTIMATOR == COLLISION || !goes_on)
                     for (int c = 0; c < K; ++c)
-                        score[w][c] += worth * b[(int)walk.row[w] * stride + offset + c];
+                        score[w][c] += worth[c % CHANNELS] * b[(int)walk.row[w] * stride + offset + c];
                 if (goes_on)
                     continue;
                 end_walk(&walk, w);
@@ -279,15 +316,15 @@ kernel void walk_columns(
     walks walk;
     set_out(&walk, units, units, first, end, pixel);
     while (set_off_all(&walk, seed, stream, rows, entries)) {
-        draw_targets(&walk, rows, entries, 0, 0);
+        draw_targets(&walk, rows, entries, 0, 0, 0);
         for (int w = 0; w < WALKS; ++w) {
             if (!walk.alive[w])
                 continue;
-            real worth = 0;
-            if (move(&walk, w, steps, &worth))
+            real worth[CHANNELS] = {0};
+            if (move(&walk, w, steps, worth))
                 continue;
             ends[walk.next[w] - 1 - first] = walk.row[w];
-            scores[walk.next[w] - 1 - first] = worth;
+            scores[walk.next[w] - 1 - first] = worth[0];
             end_walk(&walk, w);
         }
     }

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks, layout
-from ltcl.operators import Operator
 from ltcl.single_view import negative_bounces
-from ltcl.solvers import Solution, sampled, solve
+from ltcl.solvers import Solution, sampled, solve_each
 from ltcl.solvers.solve import SAMPLED
 from ltcl.transport import Transport, require
 
@@ -118,25 +117,22 @@ def separate(
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     pictures = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
-    chains = [
-        _chain(S, l_out, bounces, method, rtol, options) for S, l_out in zip(T.systems, columns, strict=True)
-    ]
+    chain = _chain(T, columns, bounces, method, rtol, options)
 
     def picture(parts: list[np.ndarray]) -> np.ndarray:
         return shape.pack(parts, T.grid).astype(np.float32)
 
-    direct, *indirect = [picture([chain.bounces[k] for chain in chains]) for k in range(bounces + 1)]
+    direct, *indirect = [picture(found) for found in chain.bounces]
     negative = max(negative_bounces(T))
     warning = _warning(T.reciprocity_defect, negative)
     if warning:
         logger.warning(warning)
-    per_bounce = [tuple(chain.solutions[k] for chain in chains) for k in range(bounces + 1)]
     return Separation(
         direct=direct,
-        indirect=picture([l_out - chain.bounces[0] for l_out, chain in zip(columns, chains, strict=True)]),
+        indirect=picture([l_out - b_0 for l_out, b_0 in zip(columns, chain.bounces[0], strict=True)]),
         bounces=np.stack(indirect) if indirect else np.empty((0, *direct.shape), np.float32),
-        rest=picture([chain.rest for chain in chains]),
-        solutions=tuple(found[0] if T.channels == 1 else found for found in per_bounce),
+        rest=picture(chain.rest),
+        solutions=tuple(found[0] if T.channels == 1 else found for found in chain.solutions),
         reciprocity_defect=T.reciprocity_defect,
         negative_bounce=negative,
         warning=warning,
@@ -160,22 +156,21 @@ def _warning(defect: float, negative: float) -> str:
 
 @dataclass(frozen=True)
 class _Chain:
-    """Bounces 0, 1, ... of one channel, (N, k) each, and what is left."""
+    """Bounces 0, 1, ..., (N, k) of each channel, what is left of each, and the solves of each bounce."""
 
-    bounces: list[np.ndarray]
-    rest: np.ndarray
-    solutions: list[Solution]
+    bounces: list[list[np.ndarray]]
+    rest: list[np.ndarray]
+    solutions: list[tuple[Solution, ...]]
 
 
 def _chain(
-    S: Operator, l_out: np.ndarray, bounces: int, method: str, rtol: float, options: dict[str, Any]
+    T: Transport, columns: list[np.ndarray], bounces: int, method: str, rtol: float, options: dict[str, Any]
 ) -> _Chain:
-    found, solutions, left = [], [], l_out.astype(np.float64)
+    found, solutions, left = [], [], [l_out.astype(np.float64) for l_out in columns]
     for k in range(bounces + 1):
-        solution = solve(S, left, method, rtol=rtol, **_fresh(method, options, k))
-        found.append(solution.x.astype(np.float64))
-        solutions.append(solution)
-        left = left - found[-1]
+        solutions.append(solve_each(T.systems, left, method, rtol=rtol, **_fresh(method, options, k)))
+        found.append([solution.x.astype(np.float64) for solution in solutions[-1]])
+        left = [l - b_k for l, b_k in zip(left, found[-1], strict=True)]
     return _Chain(found, left, solutions)
 
 

@@ -10,6 +10,7 @@ import bisect
 import itertools
 import math
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -276,7 +277,7 @@ def alias_csr(columns: np.ndarray, values: np.ndarray, sampler: str) -> tuple[in
 
 
 def walk(
-    tables: tuple[np.ndarray, np.ndarray, str],
+    tables: tuple[Any, ...],
     steps: np.ndarray,
     b: np.ndarray | None,
     pixels: np.ndarray,
@@ -287,12 +288,12 @@ def walk(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Walks from pixels[w], sample samples[w], all at once: scores (w, k) float32, ends and lengths (w,).
 
-    `tables` are records, entries and the sampler; steps are (L, 2) uint32. Without b a walk scores its weight
-    where it ends, the adjoint.
+    `tables` are records, entries, the sampler and, of walks with three weights, links; then column j of b is
+    of channel j % 3. steps are (L, 2) uint32. Without b a walk scores its weight where it ends, the adjoint.
     """
-    records, entries, sampler = tables
+    records, entries, sampler, *links = tables
     row, step = np.array(pixels), np.zeros(len(pixels), np.int64)
-    weight = np.ones(len(row), np.float32)
+    weight = np.ones((len(row), 3 if links else 1), np.float32)
     scores = np.zeros((len(row), 1 if b is None else b.shape[1]), np.float32)
     alive = np.ones(len(row), bool)
     while alive.any():
@@ -301,22 +302,27 @@ def walk(
         word = words[np.arange(len(row)), step % 2]
         word = word[:, 0] | word[:, 1] << np.uint64(32)
         target, factor = _draw(records[row], entries, word, sampler)
-        alive &= factor != 0
+        factor = factor[:, None]
+        if links:
+            target, factor = _linked(links[0], records[row], target)
+        alive &= np.any(factor != 0, axis=1)
         here = np.flatnonzero(alive)
         row[here] = target[here] >> 1
-        weight[here] *= np.where(target[here] & 1, -factor[here], factor[here])
-        worth = weight[here] * np.ascontiguousarray(steps[step[here], 0]).view(np.float32)
+        weight[here] *= np.where(target[here, None] & 1, -factor[here], factor[here])
+        worth = weight[here] * np.ascontiguousarray(steps[step[here], 0]).view(np.float32)[:, None]
         goes_on = (word[here] & np.uint64(2**22 - 1)) < steps[step[here], 1]
         step[here] += 1
         scored = here if collision else here[~goes_on]
         value = worth if collision else worth[~goes_on]
-        scores[scored] += value[:, None] * (1 if b is None else b[row[scored]])
+        scores[scored] += (
+            value if b is None else np.tile(value, scores.shape[1] // value.shape[1]) * b[row[scored]]
+        )
         alive[here] = goes_on
     return scores, row, step
 
 
 def walk_rows(
-    tables: tuple[np.ndarray, np.ndarray, str],
+    tables: tuple[Any, ...],
     steps: np.ndarray,
     b: np.ndarray,
     pixels: np.ndarray,
@@ -336,7 +342,7 @@ def walk_rows(
 
 
 def walk_columns(
-    tables: tuple[np.ndarray, np.ndarray, str],
+    tables: tuple[Any, ...],
     steps: np.ndarray,
     source: int,
     samples: np.ndarray,
@@ -385,6 +391,14 @@ def _draw(
         part = (int(word[w]) >> 22) * sums[-1] >> 42
         target[w] = table[bisect.bisect_right(sums, part)] & (2**23 - 1)
     return target, factor
+
+
+def _linked(links: np.ndarray, records: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Column, doubled, and three factors of the entries drawn; 0 of rows without."""
+    start = records[:, 0].astype(np.int64) | records[:, 1].astype(np.int64) << 32
+    full = records[:, 2] > 0
+    link = np.where(full[:, None], links[np.where(full, start + (target >> 1), 0)], 0).astype(np.uint32)
+    return link[:, 0].astype(np.int64) << 1, np.ascontiguousarray(link[:, 1:]).view(np.float32)
 
 
 def two_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

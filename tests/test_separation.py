@@ -179,6 +179,23 @@ def test_bounces_are_sampled_with_random_numbers_of_their_own(device):
         left = left - x.astype(np.float64)
 
 
+@pytest.mark.parametrize("method", ["monte_carlo", "hybrid"])
+def test_colours_share_their_walks(device, method):
+    """Each bounce is one solve of all three S, to the bit, and told as one solution a channel."""
+    T = ltcl.Transport([lambertian(N, rho, seed=64).T for rho in (0.5, 0.2, 0.4)], GRID, device=device)
+    image = T @ random.uniform(0.0, 1.0, (*GRID, 3))
+    b = ltcl.separate(T, image, bounces=1, method=method, samples=64, seed=7)
+    left = np.moveaxis(image.reshape(N, 3), -1, 0).astype(np.float64)
+    for k, found in enumerate((b.direct, b.bounces[0])):
+        together = ltcl.solve(T.interreflection, left, method, rtol=1e-3, samples=64, seed=7 + k)
+        np.testing.assert_array_equal(found.reshape(N, 3).T, together.x)
+        solutions = b.solutions[k]
+        assert isinstance(solutions, tuple)
+        assert sum(one.products for one in solutions) == together.products
+        assert max(one.residual for one in solutions) == together.residual
+        left = left - together.x
+
+
 def test_more_bounces_than_the_host_can_hold_are_refused(device):
     with pytest.raises(ltcl.errors.MemoryLimitError, match="separating 1000000000000 bounces"):
         ltcl.separate(transport(device), FINE, bounces=10**12)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ltcl.compensation import gain as gains
 from ltcl.compensation.problem import Problem
-from ltcl.solvers import Solution, solve
+from ltcl.solvers import Solution, solve_each
 from ltcl.transport import Transport
 
 Columns = list[np.ndarray]
@@ -50,8 +50,7 @@ class Inverse:
 
     def __call__(self, parts: Columns) -> tuple[Solution, ...]:
         """One solution a channel, of one target a system."""
-        pairs = zip(self.T.systems, self.T.split(parts), strict=True)
-        return tuple(solve(S, l_out, self.method, **self.options) for S, l_out in pairs)
+        return solve_each(self.T.systems, self.T.split(parts), self.method, **self.options)
 
 
 def at_gain(inverse: Inverse, problem: Problem, gain: float) -> Start:

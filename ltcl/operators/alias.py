@@ -42,6 +42,10 @@ class Tables:
         Of each row: place of its first entry, low word first; entries, 0 for a row of zeros; the bits of its
         sum of absolute values.
     entries : Array, (entries,) uint64
+    channels : int
+        Weights of a walk; with more than one also `links`, see `Links`.
+    radius : float, optional
+        See `ltcl.theory.walks.second_moment_radius`, which keeps it here.
 
     Raises
     ------
@@ -50,6 +54,8 @@ class Tables:
     MemoryLimitError
         More entries than the device's largest buffer holds.
     """
+
+    channels = 1
 
     def __init__(self, M: CSR | Dense, sampler: str = "alias", behind: int = 0) -> None:
         checks.one_of("sampler", sampler, SAMPLERS)
@@ -61,6 +67,8 @@ class Tables:
         self._check_room(self._used + behind)
         self.records = self.device.empty((rows + (behind > 0), 4), np.uint32)
         self.entries = self.device.empty((self._used + behind,), np.uint64)
+        self.links = self.records  # no kernel reads it
+        self.radius: float | None = None
         for slab in M.slabs:
             self._build(M.file, slab, slab.first, self._base(M, slab))
         self._refuse_overflow(self.sums()[:rows])
@@ -92,8 +100,8 @@ class Tables:
     def _base(self, M: CSR | Dense, slab: Slab) -> int:
         return int(M.pattern.indptr[slab.first]) if isinstance(M, CSR) else slab.first * M.shape[1]
 
-    def _check_room(self, entries: int) -> None:
-        needed, most = 8 * entries, self.device.max_allocation - SPARE_BYTES
+    def _check_room(self, entries: int, size: int = 8) -> None:
+        needed, most = size * entries, self.device.max_allocation - SPARE_BYTES
         if needed > most:
             raise MemoryLimitError(
                 f"tables of the {entries} entries of R need {checks.size(needed)} in one buffer; "

@@ -147,7 +147,8 @@ class Walker:
         Parameters
         ----------
         b : Array, (N,) or (N, k)
-            All right-hand sides share the walks.
+            All right-hand sides share the walks. Of walks with three weights column j is of channel j % 3,
+            and there are as many of each.
         pixels : (P,) integers
         first, samples : int
             Below 2^32 together.
@@ -161,7 +162,7 @@ class Walker:
             place = self.tables.device.upload(pixels[some], np.uint32)
             for part in _pieces(samples, _UNITS * CHUNK // place.size):
                 bounds = (first + part.start, first + part.stop)
-                for offset, width in widths(b.columns):
+                for offset, width in self._widths(b):
                     found = self._row_sums(b, place, bounds, stream, steps, offset, width)
                     here = (some, slice(offset, offset + width))
                     total[here] = _added(total[here], found[..., 0], found[..., 1])
@@ -169,6 +170,11 @@ class Walker:
                     self.watch()
         shape = (len(pixels), *b.shape[1:])
         return Sums(samples, total.reshape(shape), squares.reshape(shape))
+
+    def _widths(self, b: Array) -> list[tuple[int, int]]:
+        """Launches of as many right-hand sides of each channel: (offset, width) pairs."""
+        channels = self.tables.channels
+        return [(channels * offset, channels * width) for offset, width in widths(b.columns // channels)]
 
     def _row_sums(
         self,
@@ -184,7 +190,7 @@ class Walker:
         first, end = bounds
         chunks = -(-(end - first) // CHUNK)
         out = b.device.empty((pixels.size * chunks, width, 4))
-        tables = (self.tables.records, self.tables.entries, steps)
+        tables = (self.tables.records, self.tables.entries, self.tables.links, steps)
         place = (out.shape[0], chunks, first, end, self.seed, stream, b.columns, offset)
         self._launch("walk_rows", self.estimator, width, *place, pixels, *tables, b, out)
         return out.get().reshape(pixels.size, chunks, width, 4)
@@ -218,6 +224,7 @@ class Walker:
             name,
             TABLE=SAMPLERS[self.tables.sampler],
             ESTIMATOR=ESTIMATORS[estimator],
+            CHANNELS=self.tables.channels,
             CHUNK=CHUNK,
             WALKS=how.walks,
             K=width,

@@ -6,7 +6,7 @@ from __future__ import annotations
 from ltcl.solvers.bounded import Bounded
 from ltcl.solvers.matrices import matrix_iteration, matrix_series
 from ltcl.solvers.result import Solution, Status
-from ltcl.solvers.solve import METHODS, solve
+from ltcl.solvers.solve import METHODS, solve, solve_each
 
 __all__ = [
     "METHODS",
@@ -16,4 +16,5 @@ __all__ = [
     "matrix_iteration",
     "matrix_series",
     "solve",
+    "solve_each",
 ]

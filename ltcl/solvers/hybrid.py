@@ -5,27 +5,27 @@
 
 Each iteration draws fresh columns, so that noise of one is damped by those after it as light is. It costs
 `samples` loads a pixel in place of a row, and leaves the noise of the last product; final gather makes that
-product exactly. It converges in the mean where rho(R) < 1, as Jacobi does.
+product exactly. It converges in the mean where rho(R) < 1, as Jacobi does. The three S of a transport in
+colour draw the same columns (`ltcl.operators.links`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from ltcl import checks, theory
-from ltcl.device import Array
-from ltcl.errors import InputError
-from ltcl.operators import CSR, Dense
-from ltcl.operators.alias import SAMPLERS, tables
+from ltcl.errors import InputError, MemoryLimitError
+from ltcl.operators.alias import SAMPLERS, Tables
 from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.walks import Walker, whole
 from ltcl.solvers import sampled
-from ltcl.solvers.sampled import Estimate
-from ltcl.solvers.stopping import Rule, System
+from ltcl.solvers.sampled import Channel, Estimate
+from ltcl.solvers.stopping import System
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,35 @@ class Hybrid:
             checks.count("iterations", self.iterations)
         checks.one_of("sampler", self.sampler, SAMPLERS)
 
-    def estimate(self, system: System, x: np.ndarray, r: Array, rule: Rule, unit: np.ndarray) -> Estimate:
-        """`x` plus what the iterations make of its residual r, started from zero."""
-        R, sign = rows_of_R(system.S, self.name)
-        made = tables(R, self.sampler)  # rows that overflow have no spectral radius either
-        count = self._iterations(R, rule)
+    def estimate(self, channels: Sequence[Channel]) -> list[Estimate]:
+        """The start plus what the iterations make of its residual r, begun at zero; columns are shared."""
+        try:  # rows that overflow have no spectral radius either
+            made, sign = sampled.tables_of(channels, self)
+        except MemoryLimitError as error:
+            if len(channels) == 1:
+                raise
+            why = str(error)
+        else:
+            return self._iterate(channels, made, sign)
+        return sampled.each_alone(self, channels, why)
+
+    def _iterate(self, channels: Sequence[Channel], made: Tables, sign: float) -> list[Estimate]:
+        count = max(self._iterations(one) for one in channels)
         walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed)
-        pixels, start = np.arange(len(x)), r.get().astype(np.float64)
-        l, watch = start, sampled.watch(rule)
+        start = sampled.side_by_side([one.r.get().astype(np.float64) for one in channels])
+        l, watch = start, sampled.watch(channels)
         for k in range(count):
-            product = walker.rows(system.S.device.upload(l), pixels, 0, self.samples, stream=k)
+            product = walker.rows(made.device.upload(l), np.arange(len(l)), 0, self.samples, stream=k)
             l = start + product.mean
             watch()
-        x = x + l
-        return Estimate(sampled.gathered(system, x) if self.gather else x, iterations=count)
+        found = zip(channels, sampled.each(l, channels), strict=True)
+        return [self._estimate(one.system, one.x.get() + l, count) for one, l in found]
 
-    def _iterations(self, R: CSR | Dense, rule: Rule) -> int:
+    def _estimate(self, system: System, x: np.ndarray, iterations: int) -> Estimate:
+        return Estimate(sampled.gathered(system, x) if self.gather else x, iterations=iterations)
+
+    def _iterations(self, channel: Channel) -> int:
+        (R, _), rule = rows_of_R(channel.system.S, self.name), channel.rule
         key = "spectral radius"
         if key not in R.tables:
             R.tables[key] = theory.spectral_radius(R).value

@@ -7,7 +7,8 @@ A walk samples one path, its entries in proportion to |R_ij| (eq. 25), its lengt
 (eq. 22) is the same on I - A. A pixel costs the same whether others are asked for or not: it is for a few
 pixels and for previews, not for a whole picture to 1 %, where any iteration is faster. All right-hand
 sides share their walks: frames and colours of one S cost one walk a sample. The three S of a transport in
-colour have tables and walks of their own.
+colour share them, too, where that leaves a finite variance (`ltcl.operators.links`); otherwise, and in the
+adjoint form, each has walks of its own, and the reason is told.
 
 The series needs rho(|R|) < 1, and a finite variance some more (`ltcl.theory.walks`); elsewhere it is refused.
 ``series="chebyshev"`` samples a polynomial of finite degree instead, which converges for every albedo; its
@@ -17,6 +18,7 @@ coefficients alternate and grow, and with them the noise, which the standard err
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -24,15 +26,14 @@ import numpy as np
 
 from ltcl import checks, theory
 from ltcl.device import Array
-from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import CSR, Dense
-from ltcl.operators.alias import SAMPLERS, tables, tables_of_columns
+from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.operators.alias import SAMPLERS, Tables, tables_of_columns
 from ltcl.operators.entrywise import rows_of_R, squares
 from ltcl.operators.walks import ESTIMATORS, Lengths, Sums, Walker, geometric, whole
 from ltcl.solvers import sampled
 from ltcl.solvers.polynomials import chebyshev_bias, chebyshev_coefficients, chebyshev_degree
-from ltcl.solvers.sampled import Estimate
-from ltcl.solvers.stopping import Rule, System
+from ltcl.solvers.sampled import Channel, Estimate
+from ltcl.solvers.stopping import System
 from ltcl.theory.walks import chance_to_go_on, second_moment_radius
 
 _MOST = 1 << 20  # samples of a pixel with a target error
@@ -108,55 +109,88 @@ class MonteCarlo:
             most = ((1 << 32) - 1) // n
             raise InputError(f"samples is {self.samples}; of {n} pixels adjoint=True takes at most {most}")
 
-    def estimate(self, system: System, x: np.ndarray, r: Array, rule: Rule, unit: np.ndarray) -> Estimate:
-        """`x` plus the estimate of S^-1 r, where r is the residual of x."""
-        R, sign = rows_of_R(system.S, self.name)
-        first, lengths, reason = self._lengths(system, R, sign, rule)
-        pixels = np.arange(len(x)) if self.pixels is None else _pixels(self.pixels, len(x))
-        rest, error = self._walk(R, lengths, r, pixels, unit, rule)
-        x = _within_float32(x[pixels] + first * r.get()[pixels].astype(np.float64) + rest)
-        found = Estimate(x, error, whole=self.pixels is None, reason=reason)
-        return _gather(system, R, found) if self.gather else found
+    def estimate(self, channels: Sequence[Channel]) -> list[Estimate]:
+        """The start plus the estimate of S^-1 r, r its residual; channels share walks where they can."""
+        if self.adjoint and len(channels) > 1:
+            return sampled.each_alone(self, channels, "those from b are of one channel")
+        try:
+            made, sign = self._tables(channels)
+            first, lengths, reason = self._lengths(channels, made, sign)
+        except (InputError, MemoryLimitError) as error:
+            if len(channels) == 1:
+                raise
+            why = str(error).partition(";")[0]
+        else:
+            rest, error = self._walk(channels, made, lengths)
+            found = zip(channels, sampled.each(rest, channels), sampled.each(error, channels), strict=True)
+            return [self._estimate(one, first, mean, error, reason) for one, mean, error in found]
+        return sampled.each_alone(self, channels, why)
 
-    def _lengths(self, system: System, R: CSR | Dense, sign: float, rule: Rule) -> tuple[float, Lengths, str]:
+    def _tables(self, channels: Sequence[Channel]) -> tuple[Tables, float]:
+        """What walks go over, and the sign in S = I + sign R."""
+        if not self.adjoint:
+            return sampled.tables_of(channels, self)
+        R, sign = rows_of_R(channels[0].system.S, self.name)
+        return tables_of_columns(R), sign
+
+    def _estimate(
+        self, channel: Channel, first: float, rest: np.ndarray, error: np.ndarray, reason: str
+    ) -> Estimate:
+        """Of one channel, by the coefficient of its residual and the walks."""
+        pixels = self._which(channel)
+        x, r = (array.get()[pixels].astype(np.float64) for array in (channel.x, channel.r))
+        found = Estimate(
+            _within_float32(x + first * r + rest), error, whole=self.pixels is None, reason=reason
+        )
+        return self._gathered(channel.system, found) if self.gather else found
+
+    def _which(self, channel: Channel) -> np.ndarray:
+        rows = channel.x.shape[0]
+        return np.arange(rows) if self.pixels is None else _pixels(self.pixels, rows)
+
+    def _lengths(self, channels: Sequence[Channel], made: Tables, sign: float) -> tuple[float, Lengths, str]:
         """c_0, the terms that walks estimate, and both in words."""
         if self.series == "chebyshev":
-            bounds = theory.free_bounds(system.S)
+            lowest, largest = zip(*(theory.free_bounds(one.system.S) for one in channels), strict=True)
+            bounds, rule = (min(lowest), max(largest)), channels[0].rule
             degree = max(1, chebyshev_degree(rule.rtol, bounds)) if self.degree is None else self.degree
             c = _within_float32(chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1))
             bias = chebyshev_bias(degree, bounds)
             reason = f"Chebyshev series of degree {degree}, which leaves {bias:.2g} of the residual"
             return float(c[0]), whole(c[1:]), reason
-        made = tables_of_columns(R) if self.adjoint else tables(R, self.sampler)
+        R, _ = rows_of_R(channels[0].system.S, self.name)
         q = chance_to_go_on(second_moment_radius(R, made, self.adjoint), self.albedo)
         return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}"
 
-    def _walk(
-        self, R: CSR | Dense, lengths: Lengths, r: Array, pixels: np.ndarray, unit: np.ndarray, rule: Rule
-    ) -> Measured:
-        """Estimates of the terms k >= 1, and their standard errors."""
+    def _walk(self, channels: Sequence[Channel], made: Tables, lengths: Lengths) -> Measured:
+        """Estimates of the terms k >= 1 of channels side by side, and their standard errors."""
+        watch, pixels = sampled.watch(channels), self._which(channels[0])
+        host = sampled.side_by_side([one.r.get() for one in channels])
         if self.adjoint:
-            return self._from_light(R, lengths, r, rule)
-        watch = sampled.watch(rule)
-        made, estimator = tables(R, self.sampler), self.estimator or "collision"
-        walker = Walker(made, lengths, estimator, self.seed, watch=watch)
+            return self._from_light(Walker(made, lengths, "endpoint", self.seed, watch=watch), host)
+        walker = Walker(made, lengths, self.estimator or "collision", self.seed, watch=watch)
+        r = made.device.upload(host)
         if self.error is None:
             return _measured(walker.rows(r, pixels, 0, self.samples or self.usual))
         pilot = walker.rows(r, pixels, 0, _PILOT, _PILOT_STREAM)
         # Samples of the pilot do not count: chosen by their own spread, they would be biased.
+        unit = np.stack([one.unit for one in channels], axis=-1).ravel()
         wanted = _PILOT * (pilot.standard_error * unit / self.error) ** 2
-        counts = _rounded_up(wanted.reshape(len(pixels), -1).max(axis=1), self.samples or _MOST)
-        return _each(walker, r, pixels, counts)
+        return _each(walker, r, pixels, _rounded_up(wanted.max(axis=1), self.samples or _MOST))
 
-    def _from_light(self, R: CSR | Dense, lengths: Lengths, r: Array, rule: Rule) -> Measured:
-        made, host = tables_of_columns(R), r.get()
-        walker = Walker(made, lengths, "endpoint", self.seed, watch=sampled.watch(rule))
-        count = self._count(len(host))
-        mean, error = np.zeros((2, len(host), r.columns))
-        for c, column in enumerate(host.reshape(len(host), -1).T):
-            made.append(r.device.upload(column))
-            mean[:, c], error[:, c] = _measured(walker.columns(0, count, stream=c))
-        return mean.reshape(host.shape), error.reshape(host.shape)
+    def _from_light(self, walker: Walker, r: np.ndarray) -> Measured:
+        mean, error = np.zeros(r.shape), np.zeros(r.shape)
+        for c, column in enumerate(r.T):
+            walker.tables.append(walker.tables.device.upload(column))
+            mean[:, c], error[:, c] = _measured(walker.columns(0, self._count(len(r)), stream=c))
+        return mean, error
+
+    def _gathered(self, system: System, found: Estimate) -> Estimate:
+        """Errors of the pixels are independent: their variances pass through the squares of R."""
+        error, (R, _) = found.standard_error, rows_of_R(system.S, self.name)
+        assert error is not None  # noqa: S101 - Monte Carlo always tells it
+        x = sampled.gathered(system, found.x)
+        return dataclasses.replace(found, x=x, standard_error=np.sqrt(np.asarray(squares(R) @ error**2)))
 
     def _count(self, n: int) -> int:
         return n * (self.samples or self.usual)
@@ -206,8 +240,7 @@ def _rounded_up(wanted: np.ndarray, most: int) -> np.ndarray:
 
 def _each(walker: Walker, r: Array, pixels: np.ndarray, counts: np.ndarray) -> Measured:
     """Pixels with counts of samples of their own."""
-    shape = (len(pixels), *r.shape[1:])
-    mean, error = np.zeros(shape), np.zeros(shape)
+    mean, error = np.zeros((2, len(pixels), r.columns))
     for count in np.unique(counts):
         here = counts == count
         mean[here], error[here] = _measured(walker.rows(r, pixels[here], 0, int(count)))
@@ -216,11 +249,3 @@ def _each(walker: Walker, r: Array, pixels: np.ndarray, counts: np.ndarray) -> M
 
 def _measured(sums: Sums) -> Measured:
     return sums.mean, sums.standard_error
-
-
-def _gather(system: System, R: CSR | Dense, found: Estimate) -> Estimate:
-    """Errors of the pixels are independent: their variances pass through the squares of R."""
-    error = found.standard_error
-    assert error is not None  # noqa: S101 - Monte Carlo always tells it
-    x = sampled.gathered(system, found.x)
-    return dataclasses.replace(found, x=x, standard_error=np.sqrt(np.asarray(squares(R) @ error**2)))

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,11 +56,11 @@ def _advice(status: Status, method: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Result of `ltcl.solve`.
+    """Result of `ltcl.solve`; of three S at once `products` are those of all, and `residuals` the largest.
 
     Attributes
     ----------
-    x : (N,) or (N, k) float32 (float64 of method "direct", and of values beyond float32)
+    x : like b, float32 (float64 of method "direct", and of values beyond float32)
         The solution; where `converged` is False, the iterate with the smallest residual.
     status : Status
     iterations : int
@@ -115,3 +117,18 @@ class Solution:
             f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, "
             f"{self.products} products, relative residual {residual}: {_advice(self.status, self.method)}"
         )
+
+
+def joined(channels: Sequence[Solution]) -> Solution:
+    """One solution of what was sampled together, x (3, N) or (3, N, k)."""
+    first = channels[0]
+    errors = [one.standard_error for one in channels if one.standard_error is not None]
+    return dataclasses.replace(
+        first,
+        x=np.stack([one.x for one in channels]),
+        status=Status.CONVERGED if all(one.converged for one in channels) else Status.SAMPLED,
+        products=sum(one.products for one in channels),
+        residuals=tuple(map(max, zip(*(one.residuals for one in channels), strict=True))),
+        reason="; ".join(dict.fromkeys(one.reason for one in channels if one.reason)),
+        standard_error=np.stack(errors) if errors else None,
+    )

@@ -7,18 +7,37 @@ true residual of what they found is measured with one product; it decides betwee
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import vectors
+from ltcl.device import Array, vectors
 from ltcl.errors import InputError, InputTypeError
+from ltcl.operators.alias import Tables, tables
+from ltcl.operators.entrywise import rows_of_R
+from ltcl.operators.links import links
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.stopping import Rule, System
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A system to be sampled, alone or with those of the other colour channels.
+
+    `x` is where to start, (N,) or (N, k), and `r` its residual; both in the units of `system.b`, which are
+    `unit` of the caller's, as `rule` is.
+    """
+
+    system: System
+    x: Array
+    r: Array
+    rule: Rule
+    unit: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -37,9 +56,10 @@ class Estimate:
 
 
 def solution(
-    method: Any, system: System, found: Estimate, rule: Rule, in_units: Callable[[np.ndarray], np.ndarray]
+    method: Any, channel: Channel, found: Estimate, in_units: Callable[[np.ndarray], np.ndarray]
 ) -> Solution:
     """The estimate in the caller's units, with its residual."""
+    system, rule = channel.system, channel.rule
     relative, met = np.nan, False
     if found.whole:
         relative, met = _residual(system, gathered(system, found.x, add=False), rule)
@@ -59,12 +79,44 @@ def solution(
     )
 
 
-def watch(rule: Rule) -> Callable[[], object]:
-    """Tell the callback of a rule that sampling begins; what comes back tells it of each step, as NaN."""
-    callback, steps = rule.callback, itertools.count(1)
+def tables_of(channels: Sequence[Channel], method: Any) -> tuple[Tables, float]:
+    """What walks go over, of one channel or shared by all, and the sign in S = I + sign R."""
+    found = [rows_of_R(one.system.S, method.name) for one in channels]
+    if len(found) == 1:
+        return tables(found[0][0], method.sampler), found[0][1]
+    Rs, signs = zip(*found, strict=True)
+    return links(Rs, signs, method.sampler), 1.0
+
+
+def each_alone(method: Any, channels: Sequence[Channel], why: str) -> list[Estimate]:
+    """Estimates by walks of each channel's own, where they cannot share them."""
+    found = [method.estimate([one])[0] for one in channels]
+    why = f"channels share no walks: {why}"
+    return [dataclasses.replace(one, reason="; ".join(filter(None, (one.reason, why)))) for one in found]
+
+
+def side_by_side(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """(N,) or (N, k) of each channel as the right-hand sides of walks that they share.
+
+    >>> side_by_side([np.array([[1, 2]]), np.array([[3, 4]]), np.array([[5, 6]])]).tolist()
+    [[1, 3, 5, 2, 4, 6]]
+    """
+    return np.stack(arrays, axis=-1).reshape(len(arrays[0]), -1)
+
+
+def each(found: np.ndarray, channels: Sequence[Channel]) -> list[np.ndarray]:
+    """What was `side_by_side`, of some pixels, one array a channel."""
+    columns = channels[0].r.shape[1:]
+    return list(np.moveaxis(found.reshape(len(found), *columns, len(channels)), -1, 0))
+
+
+def watch(channels: Sequence[Channel]) -> Callable[[], object]:
+    """Tell the callback that sampling begins, once a channel; what comes back tells of each step, as NaN."""
+    callback, steps = channels[0].rule.callback, itertools.count(1)
     if callback is None:
         return lambda: None
-    callback(0, 1.0)
+    for _ in channels:
+        callback(0, 1.0)
     return lambda: callback(next(steps), np.nan)
 
 

@@ -4,18 +4,15 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import Array
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
-from ltcl.solvers import auto, sampled
 from ltcl.solvers.bicgstab import BiCGStab
 from ltcl.solvers.block_gauss_seidel import BlockGaussSeidel
 from ltcl.solvers.cg import CG
@@ -27,11 +24,12 @@ from ltcl.solvers.hybrid import Hybrid
 from ltcl.solvers.jacobi import Jacobi
 from ltcl.solvers.monte_carlo import MonteCarlo
 from ltcl.solvers.neumann import Neumann
-from ltcl.solvers.result import Solution, Status
+from ltcl.solvers.result import Solution, Status, joined
 from ltcl.solvers.richardson import Richardson
+from ltcl.solvers.run import Problem, automatic, run, sample
 from ltcl.solvers.sor import SOR
 from ltcl.solvers.southwell import Southwell
-from ltcl.solvers.stopping import Monitor, Rule, System
+from ltcl.solvers.stopping import Rule
 
 ITERATIVE = {
     method.name: method
@@ -72,8 +70,9 @@ def solve(
     Parameters
     ----------
     S : (N, N) Operator, array, scipy.sparse matrix or LinearOperator
-        `T.interreflection` undoes bounces (eq. 7); ``I - A`` adds them (eq. 4): the same call.
-    b : (N,) or (N, k)
+        `T.interreflection` undoes bounces (eq. 7); ``I - A`` adds them (eq. 4): the same call. Of a T in
+        colour those are three Operators, which "monte_carlo" and "hybrid" take together.
+    b : (N,) or (N, k), or (3, N) or (3, N, k) of three S
         k right-hand sides are solved together, each to its own tolerance.
     method : str
         "jacobi", "neumann", "richardson", "chebyshev", "gauss_seidel", "sor",
@@ -149,6 +148,72 @@ def solve(
     """
     start = time.perf_counter()
     checks.one_of("method", method, METHODS)
+    settings = {"rtol": rtol, "atol": atol, "maxiter": maxiter, "x0": x0, "callback": callback}
+    if _is_several(S):
+        return joined(_in_colour(S, b, method, **settings, **options))
+    chosen, given = _checked(S, b, method, **settings, **options)
+    solution = automatic(given) if chosen is None else run(chosen, given)
+    solution = dataclasses.replace(solution, seconds=time.perf_counter() - start)
+    if throw and solution.status not in (Status.CONVERGED, Status.SAMPLED):
+        raise ConvergenceError(str(solution), solution)
+    return solution
+
+
+def solve_each(
+    systems: Sequence[Operator], parts: Sequence[np.ndarray], method: str = "auto", **settings: Any
+) -> tuple[Solution, ...]:
+    """One solution a colour channel, as `solve` gives; methods that sample take walks that all three share.
+
+    `parts` are b of each, (N,) or (N, k); `settings` those of `solve`, but for x0.
+    """
+    if len(systems) == 1 or method not in SAMPLED:
+        return tuple(solve(S, b, method, **settings) for S, b in zip(systems, parts, strict=True))
+    settings.pop("throw", None)  # noise is no failure
+    return _in_colour(systems, np.stack(parts), method, **settings)
+
+
+def _in_colour(
+    systems: Sequence[Operator], b: Any, method: str, *, x0: Any = None, **settings: Any
+) -> tuple[Solution, ...]:
+    start, n = time.perf_counter(), len(systems)
+    if method not in SAMPLED or n != 3:
+        raise InputTypeError(f"S is {n} operators, one per colour channel; it must be one: solve each")
+    shapes = [_shape(S) for S in systems]
+    if len(set(shapes)) > 1:
+        raise InputError(f"S is operators of shapes {shapes}; all must be the same")
+    parts = _channels("b", b, shapes[0][0])
+    guesses = [None] * n if x0 is None else _channels("x0", x0, shapes[0][0])
+    checked = [
+        _checked(S, part, method, x0=guess, **settings)
+        for S, part, guess in zip(systems, parts, guesses, strict=True)
+    ]
+    found = sample(checked[0][0], [given for _, given in checked])
+    seconds = time.perf_counter() - start
+    return tuple(dataclasses.replace(solution, seconds=seconds) for solution in found)
+
+
+def _channels(name: str, value: Any, rows: int) -> np.ndarray:
+    array = checks.real(name, value)
+    if array.ndim not in (2, 3) or array.shape[:2] != (3, rows):
+        raise InputError(
+            f"{name} has shape {array.shape}; of three S it must be (3, {rows}) or (3, {rows}, k)"
+        )
+    return array
+
+
+def _checked(
+    S: Any,
+    b: Any,
+    method: str,
+    *,
+    rtol: float = 1e-2,
+    atol: float = 0.0,
+    maxiter: int | None = None,
+    x0: Any = None,
+    callback: Any = None,
+    **options: Any,
+) -> tuple[Any, Problem]:
+    """The method, None of "auto", and what it is to solve; nothing was uploaded where it is refused."""
     b_host = checks.finite("b", checks.real("b", b))
     shape = _shape(S)
     rule = _rule(shape, b_host, rtol, atol, maxiter, callback)
@@ -156,19 +221,15 @@ def solve(
     chosen = _method(method, options)
     if isinstance(chosen, MonteCarlo):
         chosen.check(shape[0])
-    S = as_operator(S)
-    solve_it = _automatic if chosen is None else functools.partial(_run, chosen)
-    solution = solve_it(S, b_host, guess, rule)
-    solution = dataclasses.replace(solution, seconds=time.perf_counter() - start)
-    if throw and solution.status not in (Status.CONVERGED, Status.SAMPLED):
-        raise ConvergenceError(str(solution), solution)
-    return solution
+    return chosen, Problem(as_operator(S), b_host, guess, rule)
+
+
+def _is_several(S: Any) -> bool:
+    return isinstance(S, (tuple, list)) and any(isinstance(part, Operator) for part in S)
 
 
 def _shape(S: Any) -> tuple[int, ...]:
     """The shape of whatever was given for S, before it becomes an operator on a device."""
-    if isinstance(S, (tuple, list)) and any(isinstance(part, Operator) for part in S):
-        raise InputTypeError(f"S is {len(S)} operators, one per colour channel; it must be one: solve each")
     if hasattr(S, "interreflection"):
         raise InputTypeError(
             f"S is a {type(S).__name__}; give its interreflection operator, T.interreflection"
@@ -215,88 +276,3 @@ def _method(name: str, options: dict[str, Any]) -> Any:
             has = f"has {', '.join(known)}" if known else "has none"
             raise InputTypeError(f"unknown option {option!r}; method {name!r} {has}")
     return kind(**options)
-
-
-def _automatic(S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
-    """The first method of the plan that converges, else the best iterate; all products are counted."""
-    attempts: list[Solution] = []
-    reasons, products = [], 0
-    for choice in auto.plan(S, _wanted(b, rule), 1 if b.ndim == 1 else b.shape[1]):
-        reasons.append(choice.why)
-        attempts.append(_run(choice.method, S, b, guess, rule))
-        products += choice.products + attempts[-1].products
-        if attempts[-1].converged:
-            break
-        reasons.append(f"{attempts[-1].method} ended {attempts[-1].status.name.lower()}")
-    best = attempts[-1] if attempts[-1].converged else min(attempts, key=lambda one: one.residual)
-    return dataclasses.replace(best, products=products, reason="; ".join(filter(None, reasons)))
-
-
-def _wanted(b: np.ndarray, rule: Rule) -> float:
-    """The relative residual that all columns have to reach."""
-    norms = np.linalg.norm(b.astype(np.float64), axis=0)
-    wanted = np.maximum(rule.rtol, rule.atol / np.where(norms > 0.0, norms, np.inf))
-    return min(float(np.min(np.where(norms > 0.0, wanted, 0.5))), 0.5)
-
-
-def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
-    if isinstance(method, Direct):
-        return _run_direct(method, S, b, rule)
-    unit = _unit(b)
-    system = System(S, S.device.upload(b / unit))
-    rule = dataclasses.replace(rule, atol=rule.atol / unit)
-    x, r = _start(system, None if guess is None else guess / unit)
-    if isinstance(method, MonteCarlo | Hybrid):
-        found = method.estimate(system, x.get().astype(np.float64), r, rule, unit)
-        return sampled.solution(method, system, found, rule, functools.partial(_in_units, unit=unit))
-    monitor = Monitor(system, rule)
-    method.iterate(system, x, r, monitor)
-    best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
-    assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
-    return Solution(
-        _in_units(best.get(), unit),
-        monitor.status,
-        monitor.iterations,
-        system.products,
-        tuple(monitor.residuals),
-        0.0,
-        method.name,
-        lowest=monitor.lowest,
-    )
-
-
-def _unit(b: np.ndarray) -> np.ndarray:
-    """A power of two for each column, near its largest value: in such units norms stay inside float32."""
-    largest = np.max(np.abs(b, dtype=np.float64), axis=0)
-    return np.exp2(np.floor(np.log2(np.where(largest > 0.0, largest, 1.0))))
-
-
-def _in_units(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """x times its unit in float32, or in float64 where it is beyond float32."""
-    wide = x * unit
-    return wide if np.any(np.abs(wide) > np.finfo(np.float32).max) else wide.astype(np.float32)
-
-
-def _start(system: System, guess: np.ndarray | None) -> tuple[Array, Array]:
-    """The first iterate and its residual; that of zero is b and costs no product."""
-    device, b = system.S.device, system.b
-    if guess is None:
-        return device.upload(np.zeros(b.shape, np.float32)), b.copy()
-    x = device.upload(guess)
-    return x, system.residual(x, b.like())
-
-
-def _run_direct(method: Direct, S: Operator, b: np.ndarray, rule: Rule) -> Solution:
-    b = b.astype(np.float64)
-    try:
-        x, residual = method.solve(S, b)
-    except np.linalg.LinAlgError:
-        return Solution(np.zeros(b.shape), Status.BREAKDOWN, 0, 0, (1.0,), 0.0, method.name)
-    norms = np.linalg.norm(b, axis=0)
-    left = np.linalg.norm(residual, axis=0)
-    relative = float(np.max(left / np.where(norms > 0, norms, 1.0)))
-    met = np.all(left <= np.maximum(rule.rtol * norms, rule.atol))
-    if rule.callback is not None:
-        rule.callback(0, 1.0)
-        rule.callback(1, relative)
-    return Solution(x, Status.CONVERGED if met else Status.STAGNATED, 1, 0, (1.0, relative), 0.0, method.name)

@@ -5,6 +5,7 @@ The weight of a walk that goes on with chance q after each step has second momen
 
     Q_ij = |R_i| |R_ij| / q      entries drawn in proportion (eq. 25)
     Q_ij = n_i R_ij^2 / q        one of n_i entries, all alike
+    Q_ij = R_ij^2 / (p_ij q)     drawn by p, as walks are that channels share (`ltcl.operators.links`)
 
 so that its variance is finite where the spectral radius of Q is below 1. Whenever it is, rho(|R|) < 1 too,
 and the mean exists: by Cauchy and Schwarz rho(|R|)^2 <= q rho(Q).
@@ -22,6 +23,7 @@ from ltcl.errors import InputError
 from ltcl.operators import CSR, Dense, Operator
 from ltcl.operators.alias import Tables
 from ltcl.operators.entrywise import mapped
+from ltcl.operators.links import Links
 from ltcl.theory.spectrum import spectral_radius
 
 _LONGEST = 0.9999  # chance to go on; beyond, walks of many thousand steps would carry nothing
@@ -54,7 +56,9 @@ class SecondMoments(Operator):
 
 
 def second_moment_radius(R: CSR | Dense, made: Tables, columns: bool = False) -> float:
-    """q times the spectral radius of Q, by power iteration; kept with R. See `SecondMoments`.
+    """q times the spectral radius of Q, by power iteration; kept with the tables. See `SecondMoments`.
+
+    Of `Links` the largest of all channels; R is not looked at.
 
     >>> import ltcl
     >>> from ltcl.operators.alias import tables
@@ -62,10 +66,10 @@ def second_moment_radius(R: CSR | Dense, made: Tables, columns: bool = False) ->
     >>> round(second_moment_radius(R, tables(R)), 6)
     0.25
     """
-    key = f"second moments, {'columns' if columns else made.sampler}"
-    if key not in R.tables:
-        R.tables[key] = spectral_radius(SecondMoments(R, made, columns)).value
-    return R.tables[key]
+    if made.radius is None:
+        moments = made.second_moments() if isinstance(made, Links) else [SecondMoments(R, made, columns)]
+        made.radius = float(np.max([spectral_radius(Q).value for Q in moments]))
+    return made.radius
 
 
 def chance_to_go_on(radius: float, albedo: float | None) -> float:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.sparse
@@ -10,6 +12,7 @@ import scipy.stats
 
 from ltcl.operators import CSR, Dense
 from ltcl.operators.alias import SAMPLERS, Tables, tables, tables_of_columns
+from ltcl.operators.links import links
 from ltcl.operators.walks import CHUNK, ESTIMATORS, Launching, Lengths, Sums, Walker, geometric, whole
 from tests import gallery, reference
 
@@ -40,8 +43,22 @@ MATRICES = {
 }
 
 
-def raw(made: Tables) -> tuple[np.ndarray, np.ndarray, str]:
-    return made.records.get(), made.entries.get(), made.sampler
+# Three R of colour channels: signs, places and empty rows of their own, and one for which all are empty.
+COLOURS = {
+    "1x1": [np.array([[value]], np.float32) for value in (0.5, -0.25, 0.0)],
+    "no entries": [MATRICES["no entries"]] * 3,
+    "apart": [
+        MATRICES["signs, empty rows"],
+        gallery.sparse(53, 53, 0.2, 1).toarray() / 9,
+        gallery.sparse(53, 53, 0.1, 2).toarray() / 9,
+    ],
+    "alike": [gallery.bounces(29, rho) for rho in (0.6, 0.3, 0.5)],
+}
+
+
+def raw(made: Tables) -> tuple[Any, ...]:
+    links = (made.links.get(),) if made.channels > 1 else ()
+    return made.records.get(), made.entries.get(), made.sampler, *links
 
 
 def twin_sums(
@@ -83,6 +100,35 @@ def test_sums_are_those_of_the_twin_to_the_bit(device, name, estimator, sampler,
     same(found, *twin_sums(made, lengths, estimator, b.reshape(len(R), -1), pixels, range(10, 80)))
 
 
+@pytest.mark.parametrize("k", [1, 3, 5])
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("name", COLOURS)
+def test_walks_of_three_channels_are_those_of_the_twin_to_the_bit(device, name, estimator, sampler, k):
+    """k right-hand sides of each, one column a channel in turn; `k` of 5 takes two launches."""
+    Rs = [FORMATS["csr" if c else "dense"](device, R) for c, R in enumerate(COLOURS[name])]
+    made, lengths, n = links(Rs, (1.0, 1.0, -1.0), sampler), geometric(0.6, -1.0), len(COLOURS[name][0])
+    b, pixels = gallery.vectors(n, 3 * k), np.arange(n)[::-1]
+    found = Walker(made, lengths, estimator, SEED).rows(device.upload(b), pixels, 10, 70, stream=3)
+    same(found, *twin_sums(made, lengths, estimator, b, pixels, range(10, 80)))
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("form", FORMATS)
+def test_equal_channels_walk_as_one_does_to_the_bit(device, form, sampler):
+    R, b = MATRICES["signs, empty rows"], gallery.vectors(53, 2)
+    Rs, pixels = [FORMATS[form](device, R) for _ in range(3)], np.arange(53)
+    walkers = [
+        Walker(made, geometric(0.6, -1.0), "collision", SEED)
+        for made in (tables(Rs[0], sampler), links(Rs, (1.0, 1.0, 1.0), sampler))
+    ]
+    alone, together = (
+        walker.rows(device.upload(x), pixels, 0, 100)
+        for walker, x in zip(walkers, (b, b.repeat(3, axis=1)), strict=True)
+    )
+    same(together, alone.total.repeat(3, axis=1), alone.squares.repeat(3, axis=1))
+
+
 @pytest.mark.parametrize("lengths", [geometric(0.9, 1.0), whole(np.array([1.5, -2.0, 0.0, 0.25]))])
 def test_dense_rows_and_other_lengths_too(device, lengths):
     R = MATRICES["signs, empty rows"]
@@ -102,6 +148,16 @@ def test_no_bit_depends_on_how_it_is_launched(device, monkeypatch, units, launch
     same(walker.rows(device.upload(b), pixels, 0, 200), wanted.total, wanted.squares)
     some = walker.rows(device.upload(b), np.array([28, 3]), 0, 200)  # one pixel does not see another
     same(some, wanted.total[[28, 3]], wanted.squares[[28, 3]])
+
+
+@pytest.mark.parametrize("launching", LAUNCHINGS)
+def test_nor_does_a_bit_of_walks_of_three_channels(device, monkeypatch, launching):
+    Rs, b = [Dense(device, R) for R in COLOURS["alike"]], gallery.vectors(29, 6)
+    made, pixels, lengths = links(Rs, (1.0, 1.0, 1.0)), np.arange(29), geometric(0.7, -1.0)
+    wanted = Walker(made, lengths, "collision", SEED).rows(device.upload(b), pixels, 0, 200)
+    monkeypatch.setattr("ltcl.operators.walks._UNITS", 5)
+    walker = Walker(made, lengths, "collision", SEED, launching)
+    same(walker.rows(device.upload(b), pixels, 0, 200), wanted.total, wanted.squares)
 
 
 @pytest.mark.parametrize("launching", LAUNCHINGS)

@@ -10,6 +10,7 @@ import scipy.sparse
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Dense
 from ltcl.operators.alias import tables, tables_of_columns
+from ltcl.operators.links import links
 from ltcl.operators.walks import Walker, geometric
 from ltcl.theory.walks import chance_to_go_on, second_moment_radius
 from tests import gallery
@@ -47,6 +48,23 @@ def test_the_variance_of_walks_is_what_the_moments_say(device):
         device.upload(np.ones(11)), np.arange(11), 0, 200_000
     )
     np.testing.assert_allclose(found.squares / found.samples, squares, rtol=0.05)
+
+
+def test_each_channel_of_shared_walks_has_the_variance_that_its_moments_say(device):
+    """The same with three R, whose Q are R^2 / p; the radius is the largest of all."""
+    dense = [gallery.sparse(11, 11, 0.7, seed).toarray() / (14 + seed) for seed in range(3)]
+    Rs, q = [CSR(device, scipy.sparse.csr_array(R)) for R in dense], 0.6
+    made = links(Rs, (1.0, 1.0, 1.0))
+    walker = Walker(made, geometric(q, -1.0), "endpoint", 0)
+    found = walker.rows(device.upload(np.ones((11, 3))), np.arange(11), 0, 200_000)
+    units = [np.abs(R.astype(float)).sum(axis=1, keepdims=True) for R in dense]
+    P = np.sqrt(sum((R / unit) ** 2 for R, unit in zip(dense, units, strict=True)))
+    p = P / P.sum(axis=1, keepdims=True)
+    moments = [np.divide(R.astype(float) ** 2, p, out=np.zeros((11, 11)), where=p > 0) for R in dense]
+    for Q, squares in zip(moments, found.squares.T, strict=True):
+        wanted = np.linalg.solve(np.eye(11) - Q / q, Q / q @ np.ones(11)) * q / (1 - q)
+        np.testing.assert_allclose(squares / found.samples, wanted, rtol=0.05)
+    assert second_moment_radius(Rs[0], made) == pytest.approx(max(map(radius, moments)), rel=1e-3)
 
 
 @pytest.mark.parametrize("m", [-0.1, 0.0, 0.5, 0.7, np.nan, "dark"])
