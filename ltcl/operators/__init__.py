@@ -9,7 +9,9 @@ import scipy.sparse
 
 from ltcl.device import Device, open_device
 from ltcl.operators.base import Norms, Operator, Transposed
+from ltcl.operators.bases import Basis
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators.compressed import Compressed, Sum
 from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
@@ -17,6 +19,8 @@ from ltcl.operators.interreflection import interreflections
 
 __all__ = [
     "CSR",
+    "Basis",
+    "Compressed",
     "Coupled",
     "Dense",
     "Host",
@@ -26,6 +30,7 @@ __all__ = [
     "Pattern",
     "ScaledColumns",
     "Shifted",
+    "Sum",
     "Transposed",
     "as_operator",
     "interreflections",
