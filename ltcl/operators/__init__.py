@@ -16,6 +16,8 @@ from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.packing import smallest
+from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
 
 __all__ = [
@@ -34,10 +36,12 @@ __all__ = [
     "ScaledColumns",
     "Shifted",
     "Sum",
+    "Tiles",
     "Transposed",
     "Wavelet",
     "as_operator",
     "interreflections",
+    "smallest",
 ]
 
 
