@@ -91,7 +91,7 @@ class Parts:
     @property
     def entries(self) -> int:
         """Values that are not 0, of all cores."""
-        ends = (".data", ".values", ".matrix")
+        ends = (".data", ".codes", ".matrix")
         stored = [array for name, array in self.arrays.items() if name.endswith(ends)]
         return sum(int(np.count_nonzero(array)) for array in stored)
 

@@ -157,7 +157,7 @@ def test_bad_arrays_are_refused_in_one_line(device, name):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["pointers", "starts", "values", "layout", "shape", "unit"])
+@pytest.mark.parametrize("name", ["pointers", "starts", "codes", "layout", "shape", "unit"])
 def test_bad_tiles_are_refused(device, name):
     arrays = stored.to_arrays([_systems(device, (8, "int8"))["two-sided"]])
     key = f"system_0.R.core.{name}"

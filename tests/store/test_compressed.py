@@ -136,8 +136,8 @@ def test_what_is_known_without_a_device(device, tmp_path):
     assert parts.kinds == ("tiles", "db2")
     inside = [S.R.core for S in C.systems if isinstance(S.R, Compressed)]
     packed = [core.packed for core in inside if isinstance(core, Tiles)]
-    assert parts.entries == sum(np.count_nonzero(one.values) for one in packed)
-    assert parts.nbytes > sum(one.values.nbytes + one.starts.nbytes for one in packed)
+    assert parts.entries == sum(np.count_nonzero(one.stored.codes) for one in packed)
+    assert parts.nbytes > sum(one.stored.codes.nbytes + one.starts.nbytes for one in packed)
 
 
 def test_other_formats_and_operators_are_refused(device, tmp_path):
