@@ -67,6 +67,10 @@ def test_exact_ones_have_no_error(device):
     assert T.error == 0.0
     assert "compressed" not in repr(T)
     assert ltcl.Transport(np.ones((12, N)), GRID, camera_grid=(3, 4)).error == 0.0
+    matrix, _, _ = given(device)
+    coupled = ltcl.Transport([[matrix] * 3] * 3, GRID)  # of which no S is solved
+    assert coupled.error == 0.0
+    assert repr(coupled) == "<ltcl Transport 42 x 42, colour, grid 6 x 7>"
 
 
 def test_three_share_what_they_share(device):
