@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks, layout
+from ltcl.exact import beside
 from ltcl.single_view import negative_bounces
 from ltcl.solvers import Solution, sampled, solve_each
 from ltcl.solvers.solve import SAMPLED
@@ -58,7 +59,7 @@ class Separation:
         scene. The first bounce of a glossy scene is off by a few times as much, later ones by more.
     warning : str
         Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 and the
-        negative light at most 0.005, or unknown.
+        negative light at most 0.005, or unknown; of a compressed T both may be more by its error.
     """
 
     direct: np.ndarray
@@ -76,7 +77,14 @@ class Separation:
 
 
 def separate(
-    T: Transport, image: Any, bounces: int = 4, *, method: str = "auto", rtol: float = 1e-3, **options: Any
+    T: Transport,
+    image: Any,
+    bounces: int = 4,
+    *,
+    method: str = "auto",
+    rtol: float = 1e-3,
+    exact: Transport | None = None,
+    **options: Any,
 ) -> Separation:
     """Split an image of the scene into direct light and bounces.
 
@@ -90,6 +98,8 @@ def separate(
         How many indirect bounces to tell apart.
     method, rtol, **options
         Of `ltcl.solve`; rtol is per bounce.
+    exact : Transport, optional
+        What a compressed T stands for: T then solves, to any `rtol`, and all that is told is of `exact`.
 
     Returns
     -------
@@ -98,7 +108,8 @@ def separate(
     Raises
     ------
     InputError
-        A rectangular T, shapes that do not fit, a negative number of bounces.
+        A rectangular T, shapes that do not fit, a negative number of bounces, an `rtol` below the error of
+        a compressed T without `exact`.
     ConvergenceError
         A solve did not reach `rtol`.
 
@@ -117,14 +128,15 @@ def separate(
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     pictures = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
-    chain = _chain(T, columns, bounces, method, rtol, options)
+    true, judges = beside(T, exact)
+    chain = _chain(T, columns, bounces, method, {**options, "rtol": rtol, "exact": judges})
 
     def picture(parts: list[np.ndarray]) -> np.ndarray:
         return shape.pack(parts, T.grid).astype(np.float32)
 
     direct, *indirect = [picture(found) for found in chain.bounces]
-    negative = max(negative_bounces(T))
-    warning = _warning(T.reciprocity_defect, negative)
+    negative = max(negative_bounces(true))
+    warning = _warning(true.reciprocity_defect, negative, true.error)
     if warning:
         logger.warning(warning)
     return Separation(
@@ -133,19 +145,22 @@ def separate(
         bounces=np.stack(indirect) if indirect else np.empty((0, *direct.shape), np.float32),
         rest=picture(chain.rest),
         solutions=tuple(found[0] if T.channels == 1 else found for found in chain.solutions),
-        reciprocity_defect=T.reciprocity_defect,
+        reciprocity_defect=true.reciprocity_defect,
         negative_bounce=negative,
         warning=warning,
     )
 
 
-def _warning(defect: float, negative: float) -> str:
-    """What is wrong with T for a separation; nothing where both are small, or unknown."""
+def _warning(defect: float, negative: float, error: float) -> str:
+    """What is wrong with T for a separation; nothing where both are small, or unknown.
+
+    What a compressed T may be off by is no sign of anything.
+    """
     found = []
-    if defect > LARGEST_DEFECT:
-        found.append(f"T is not reciprocal (defect {defect:.2g}, above {LARGEST_DEFECT:g})")
-    if negative > LARGEST_NEGATIVE:
-        found.append(f"a bounce takes away {negative:.2g} of its light (above {LARGEST_NEGATIVE:g})")
+    if defect > (most := LARGEST_DEFECT + error):
+        found.append(f"T is not reciprocal (defect {defect:.2g}, above {most:.2g})")
+    if negative > (most := LARGEST_NEGATIVE + error):
+        found.append(f"a bounce takes away {negative:.2g} of its light (above {most:.2g})")
     if not found:
         return ""
     return (
@@ -164,11 +179,11 @@ class _Chain:
 
 
 def _chain(
-    T: Transport, columns: list[np.ndarray], bounces: int, method: str, rtol: float, options: dict[str, Any]
+    T: Transport, columns: list[np.ndarray], bounces: int, method: str, options: dict[str, Any]
 ) -> _Chain:
     found, solutions, left = [], [], [l_out.astype(np.float64) for l_out in columns]
     for k in range(bounces + 1):
-        solutions.append(solve_each(T.systems, left, method, rtol=rtol, **_fresh(method, options, k)))
+        solutions.append(solve_each(T.systems, left, method, **_fresh(method, options, k)))
         found.append([solution.x.astype(np.float64) for solution in solutions[-1]])
         left = [l - b_k for l, b_k in zip(left, found[-1], strict=True)]
     return _Chain(found, left, solutions)

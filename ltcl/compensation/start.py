@@ -15,6 +15,7 @@ import numpy as np
 
 from ltcl.compensation import gain as gains
 from ltcl.compensation.problem import Problem
+from ltcl.operators import IdentityPlus
 from ltcl.solvers import Solution, solve_each
 from ltcl.transport import Transport
 
@@ -43,6 +44,7 @@ class Inverse:
     T: Transport
     method: str
     options: dict[str, Any] = field(default_factory=dict)
+    exact: tuple[IdentityPlus | None, ...] = ()  # what a compressed S stands for, in every channel
 
     def light(self, parts: Columns) -> Columns:
         """Projector light, one array a system, of one solution a channel."""
@@ -50,7 +52,8 @@ class Inverse:
 
     def __call__(self, parts: Columns) -> tuple[Solution, ...]:
         """One solution a channel, of one target a system."""
-        return solve_each(self.T.systems, self.T.split(parts), self.method, **self.options)
+        parts = self.T.split(parts)
+        return solve_each(self.T.systems, parts, self.method, exact=self.exact, **self.options)
 
 
 def at_gain(inverse: Inverse, problem: Problem, gain: float) -> Start:

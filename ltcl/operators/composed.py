@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,9 @@ class IdentityPlus(Operator):
         +1 for I + R, -1 for I - R.
     weights : (N,), optional
         All positive: S is self-adjoint in the inner product <x, y> = sum_i w_i x_i y_i, as far as is known.
+    solution_error : float
+        What solutions with a compressed R may be off by: ``||S^-1|| ||E||``, E what was dropped. Infinite
+        where nothing is known.
 
     Examples
     --------
@@ -38,14 +42,24 @@ class IdentityPlus(Operator):
     [1.0, 0.5]
     """
 
-    def __init__(self, R: Operator, sign: float = 1.0, weights: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        R: Operator,
+        sign: float = 1.0,
+        weights: np.ndarray | None = None,
+        *,
+        solution_error: float = 0.0,
+    ) -> None:
         if R.shape[0] != R.shape[1]:
             raise InputError(f"R has shape {R.shape}; S = I + R needs a square one")
         if sign not in (1.0, -1.0):
             raise InputError(f"sign is {sign!r}; it must be 1 for I + R or -1 for I - R")
+        if not solution_error >= 0.0:
+            raise InputError(f"solution_error is {solution_error!r}; it must be a number of at least 0")
         super().__init__(R.device, R.shape)
         self.R = R
         self.sign = float(sign)
+        self.solution_error = float(solution_error)
         self.error = R.error
         self.weights = None if weights is None else checks.shape("weights", weights, R.shape[:1])
 
@@ -57,6 +71,10 @@ class IdentityPlus(Operator):
     def diagonal(self) -> np.ndarray:
         """1 + sign diag(R), (N,) float64."""
         return 1.0 + self.sign * self.R.diagonal()
+
+    def as_it_stands(self) -> IdentityPlus:
+        """The same S taken for exact: what is asked of it is asked of no other."""
+        return self if self.solution_error == 0.0 else IdentityPlus(self.R, self.sign, self.weights)
 
     def to_dense(self) -> np.ndarray:
         """I + sign R, (N, N) float64, on the host."""
@@ -83,6 +101,7 @@ class ScaledColumns(Operator):
         self.d = checks.finite("d", checks.shape("d", checks.real("d", d), A.shape[1:]))
         self._d = A.device.upload(self.d)
         self.error = A.error * float(np.max(np.abs(self.d), initial=0.0))
+        self.solution_error = A.solution_error and A.solution_error * spread(self.d)
 
     @property
     def nbytes(self) -> int:
@@ -105,6 +124,17 @@ class ScaledColumns(Operator):
             out.copy_from(product)
         else:
             vectors.axpby(1.0, product, 1.0, add, out)
+
+
+def spread(d: np.ndarray) -> float:
+    """max |d| / min |d|, what a diagonal may change relative errors by; infinite where some d is 0.
+
+    >>> spread(np.array([0.5, -2.0])), spread(np.array([0.0, 1.0]))
+    (4.0, inf)
+    """
+    sizes = np.abs(np.asarray(d, np.float64))
+    least = float(np.min(sizes, initial=np.inf))
+    return float(np.max(sizes, initial=0.0)) / least if least > 0.0 else math.inf
 
 
 class Shifted(Operator):

@@ -13,31 +13,38 @@ from typing import Any
 
 import numpy as np
 
+from ltcl.device import Array
 from ltcl.operators import Operator
-from ltcl.solvers import auto, sampled
+from ltcl.solvers import auto, coefficients, refinement, sampled, units
 from ltcl.solvers.direct import Direct
 from ltcl.solvers.hybrid import Hybrid
 from ltcl.solvers.monte_carlo import MonteCarlo
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.sampled import Channel
-from ltcl.solvers.stopping import Monitor, Rule, System
+from ltcl.solvers.stopping import Rule, System
 
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """S x = b with b (N,) or (N, k), where to start and when to stop; `guess` is like b, None for zero."""
+    """S x = b with b (N,) or (N, k), where to start and when to stop; `guess` is like b, None for zero.
+
+    `exact` is what a compressed S stands for, None where S itself is solved.
+    """
 
     S: Operator
     b: np.ndarray
     guess: np.ndarray | None
     rule: Rule
+    exact: Operator | None = None
 
 
 def automatic(given: Problem) -> Solution:
     """The first method of the plan that converges, else the best iterate; all products are counted."""
     attempts: list[Solution] = []
     reasons, products = [], 0
-    for choice in auto.plan(given.S, _wanted(given.b, given.rule), given.b[0].size):
+    reached = min(wanted(given.b, given.rule), 0.5)
+    reached = reached if given.exact is None else refinement.step_tolerance(given.S)
+    for choice in auto.plan(given.S, reached, given.b[0].size):
         reasons.append(choice.why)
         attempts.append(run(choice.method, given))
         products += choice.products + attempts[-1].products
@@ -48,29 +55,30 @@ def automatic(given: Problem) -> Solution:
     return dataclasses.replace(best, products=products, reason="; ".join(filter(None, reasons)))
 
 
-def _wanted(b: np.ndarray, rule: Rule) -> float:
-    """The relative residual that all columns have to reach."""
+def wanted(b: np.ndarray, rule: Rule) -> float:
+    """The relative residual that all columns have to reach; infinite where all are dark."""
     norms = np.linalg.norm(b.astype(np.float64), axis=0)
-    wanted = np.maximum(rule.rtol, rule.atol / np.where(norms > 0.0, norms, np.inf))
-    return min(float(np.min(np.where(norms > 0.0, wanted, 0.5))), 0.5)
+    least = np.maximum(rule.rtol, rule.atol / np.where(norms > 0.0, norms, 1.0))
+    return float(np.min(np.where(norms > 0.0, least, np.inf)))
 
 
 def run(method: Any, given: Problem) -> Solution:
     """One method, by itself."""
-    if isinstance(method, Direct):
+    if isinstance(method, Direct) and given.exact is None:
         return _run_direct(method, given.S, given.b, given.rule)
     if isinstance(method, MonteCarlo | Hybrid):
         return sample(method, [given])[0]
-    begun = _begin(given)
-    monitor = Monitor(begun.system, begun.rule)
-    method.iterate(begun.system, begun.x, begun.r, monitor)
-    best = begun.x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
+    light, guess, rule, unit = _uploaded(given)
+    if given.exact is None:
+        x, monitor = coefficients.iterate(method, given.S, light, guess, rule)
+    else:
+        x, monitor = refinement.iterate(method, given.S, given.exact, light, guess, rule)
     assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
     return Solution(
-        _in_units(best.get(), begun.unit),
+        units.restored(x.get(), unit),
         monitor.status,
         monitor.iterations,
-        begun.system.products,
+        monitor.system.products,
         tuple(monitor.residuals),
         0.0,
         method.name,
@@ -82,33 +90,23 @@ def sample(method: MonteCarlo | Hybrid, channels: Sequence[Problem]) -> list[Sol
     """A method that samples, on colour channels of one size at once; one solution a channel."""
     begun = [_begin(given) for given in channels]
     return [
-        sampled.solution(method, one, found, functools.partial(_in_units, unit=one.unit))
+        sampled.solution(method, one, found, functools.partial(units.restored, unit=one.unit))
         for one, found in zip(begun, method.estimate(begun), strict=True)
     ]
 
 
 def _begin(given: Problem) -> Channel:
-    unit, device = _unit(given.b), given.S.device
-    system = System(given.S, device.upload(given.b / unit))
+    light, guess, rule, unit = _uploaded(given)
+    system = System(given.S, light)
+    return Channel(system, *coefficients.start(system, guess), rule, unit)
+
+
+def _uploaded(given: Problem) -> tuple[Array, Array | None, Rule, np.ndarray]:
+    """b and the guess on the device and the rule, all in the unit of each column; the units."""
+    unit, device = units.of(given.b), given.S.device
+    guess = None if given.guess is None else device.upload(given.guess / unit)
     rule = dataclasses.replace(given.rule, atol=given.rule.atol / unit)
-    if given.guess is None:  # the residual of zero is b and costs no product
-        return Channel(
-            system, device.upload(np.zeros(given.b.shape, np.float32)), system.b.copy(), rule, unit
-        )
-    x = device.upload(given.guess / unit)
-    return Channel(system, x, system.residual(x, x.like()), rule, unit)
-
-
-def _unit(b: np.ndarray) -> np.ndarray:
-    """A power of two for each column, near its largest value: in such units norms stay inside float32."""
-    largest = np.max(np.abs(b, dtype=np.float64), axis=0)
-    return np.exp2(np.floor(np.log2(np.where(largest > 0.0, largest, 1.0))))
-
-
-def _in_units(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """x times its unit in float32, or in float64 where it is beyond float32."""
-    wide = x * unit
-    return wide if np.any(np.abs(wide) > np.finfo(np.float32).max) else wide.astype(np.float32)
+    return device.upload(given.b / unit), guess, rule, unit
 
 
 def _run_direct(method: Direct, S: Operator, b: np.ndarray, rule: Rule) -> Solution:

@@ -13,6 +13,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
+from ltcl.solvers import refinement
 from ltcl.solvers.bicgstab import BiCGStab
 from ltcl.solvers.block_gauss_seidel import BlockGaussSeidel
 from ltcl.solvers.cg import CG
@@ -26,7 +27,7 @@ from ltcl.solvers.monte_carlo import MonteCarlo
 from ltcl.solvers.neumann import Neumann
 from ltcl.solvers.result import Solution, Status, joined
 from ltcl.solvers.richardson import Richardson
-from ltcl.solvers.run import Problem, automatic, run, sample
+from ltcl.solvers.run import Problem, automatic, run, sample, wanted
 from ltcl.solvers.sor import SOR
 from ltcl.solvers.southwell import Southwell
 from ltcl.solvers.stopping import Rule
@@ -63,6 +64,7 @@ def solve(
     x0: Any = None,
     callback: Callable[[int, float], object] | None = None,
     throw: bool = True,
+    exact: Any = None,
     **options: Any,
 ) -> Solution:
     """Solve S x = b with products by S only.
@@ -90,6 +92,9 @@ def solve(
     throw : bool
         Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that sample,
         whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
+    exact : like S, optional
+        What a compressed S stands for: S then makes the steps, and the residual is that of `exact`, for a
+        tolerance that S alone cannot keep; see `ltcl.solvers.refinement`.
     **options
         Of the method, for instance ``spectrum=(0.5, 4.0)`` of chebyshev. An unknown one is an error.
 
@@ -100,7 +105,8 @@ def solve(
     Raises
     ------
     InputError, InputTypeError
-        Shapes that do not fit, NaN, a tolerance or option out of range.
+        Shapes that do not fit, NaN, a tolerance or option out of range, or below what a compressed S is
+        worth.
     ConvergenceError
         Divergence or ``maxiter``, with the best iterate in ``.solution``.
 
@@ -149,6 +155,7 @@ def solve(
     start = time.perf_counter()
     checks.one_of("method", method, METHODS)
     settings = {"rtol": rtol, "atol": atol, "maxiter": maxiter, "x0": x0, "callback": callback}
+    settings["exact"] = exact
     if _is_several(S):
         return joined(_in_colour(S, b, method, **settings, **options))
     chosen, given = _checked(S, b, method, **settings, **options)
@@ -160,14 +167,22 @@ def solve(
 
 
 def solve_each(
-    systems: Sequence[Operator], parts: Sequence[np.ndarray], method: str = "auto", **settings: Any
+    systems: Sequence[Operator],
+    parts: Sequence[np.ndarray],
+    method: str = "auto",
+    *,
+    exact: Sequence[Operator | None] = (),
+    **settings: Any,
 ) -> tuple[Solution, ...]:
     """One solution a colour channel, as `solve` gives; methods that sample take walks that all three share.
 
-    `parts` are b of each, (N,) or (N, k); `settings` those of `solve`, but for x0.
+    `parts` are b of each, (N,) or (N, k); `exact` is that of each, where there is one; `settings` are those
+    of `solve`, but for x0.
     """
-    if len(systems) == 1 or method not in SAMPLED:
-        return tuple(solve(S, b, method, **settings) for S, b in zip(systems, parts, strict=True))
+    judges = exact or [None] * len(systems)
+    if len(systems) == 1 or method not in SAMPLED or any(judge is not None for judge in judges):
+        each = zip(systems, parts, judges, strict=True)
+        return tuple(solve(S, b, method, exact=E, **settings) for S, b, E in each)
     settings.pop("throw", None)  # noise is no failure
     return _in_colour(systems, np.stack(parts), method, **settings)
 
@@ -211,6 +226,7 @@ def _checked(
     maxiter: int | None = None,
     x0: Any = None,
     callback: Any = None,
+    exact: Any = None,
     **options: Any,
 ) -> tuple[Any, Problem]:
     """The method, None of "auto", and what it is to solve; nothing was uploaded where it is refused."""
@@ -219,9 +235,16 @@ def _checked(
     rule = _rule(shape, b_host, rtol, atol, maxiter, callback)
     guess = _guess(x0, b_host)
     chosen = _method(method, options)
+    if exact is not None and method in SAMPLED:
+        raise InputTypeError(f"exact= corrects iterates, but method {method!r} samples; leave it out")
     if isinstance(chosen, MonteCarlo):
         chosen.check(shape[0])
-    return chosen, Problem(as_operator(S), b_host, guess, rule)
+    S = as_operator(S)
+    if exact is None:
+        refinement.refuse_beyond(S, rule, wanted(b_host, rule))
+    else:
+        exact = refinement.exact_operator(exact, S)
+    return chosen, Problem(S, b_host, guess, rule, exact)
 
 
 def _is_several(S: Any) -> bool:
