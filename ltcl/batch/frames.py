@@ -12,6 +12,7 @@ one does; "auto" may know more of S the second time.
 
 from __future__ import annotations
 
+import inspect
 import os
 import time
 from collections.abc import Callable
@@ -27,7 +28,7 @@ from ltcl.batch.output import BITS, Output
 from ltcl.batch.reading import Reader
 from ltcl.batch.result import CompensatedFrames
 from ltcl.batch.run import Run, staying
-from ltcl.compensation import inputs
+from ltcl.compensation import compensate, inputs
 from ltcl.errors import InputError
 from ltcl.files import as_path
 from ltcl.images.codes import Encoding
@@ -163,7 +164,10 @@ def _checked(T: Transport, gain: Any, loss: Any, options: dict[str, Any]) -> tup
 
 
 def _manifest(T: Transport, folder: Path, resume: bool, settings: dict[str, Any]) -> Manifest:
-    described = {name: identity.of_setting(value) for name, value in settings.items() if name != "callback"}
+    known = inspect.signature(compensate).parameters.values()
+    usual = {each.name: each.default for each in known if each.kind is each.KEYWORD_ONLY}
+    used = {name: value for name, value in {**usual, **settings}.items() if name != "callback"}
+    described = {name: identity.of_setting(value) for name, value in used.items()}
     kept = Manifest(folder / manifest.NAME, described, identity.of_transport(T))
     if resume:
         kept.take_up()
