@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,7 +88,7 @@ def test_pushed_through_T_the_patterns_give_the_frames(T, source, tmp_path, batc
 
 
 def test_png_patterns_are_those_of_exr_with_white_at_the_upper_bound(T, source, tmp_path):
-    common = {"bounds": (0.0, 2.0), "appearance": True, "gain": 0.5}
+    common: dict[str, Any] = {"bounds": (0.0, 2.0), "appearance": True, "gain": 0.5}
     png = compensate_frames(T, source, tmp_path / "png", **common)
     exr = compensate_frames(T, source, tmp_path / "exr", format="exr", **common)
     for coarse, exact in zip(patterns(png), patterns(exr), strict=True):
@@ -194,8 +195,9 @@ def test_background_and_weights_serve_all_frames(T, source, tmp_path):
     )
     np.testing.assert_allclose(np.stack(patterns(done)), LIGHT - 0.1 * LIGHT[0], rtol=2e-3)
     for name in ("background", "weights"):
+        options: dict[str, Any] = {name: np.ones((8, *GRID))}
         with pytest.raises(InputError, match=rf"{name} holds 8 frame\(s\); it must be one picture"):
-            compensate_frames(T, source, tmp_path / "more", **{name: np.ones((8, *GRID))})
+            compensate_frames(T, source, tmp_path / "more", **options)
 
 
 @pytest.mark.parametrize("suffix", [".mkv", ".avi"])
@@ -332,7 +334,7 @@ def test_an_earlier_run_is_not_begun_anew(T, source, tmp_path):
     ],
 )
 def test_other_settings_are_refused_by_their_name(T, source, tmp_path, changed, part):
-    common = {"batch": 4}
+    common: dict[str, Any] = {"batch": 4}
     compensate_frames(T, source, tmp_path / "out", frames=8, rtol=0.01, **common)  # which is usual
     before = everything(tmp_path / "out")
     with pytest.raises(InputError) as error:
@@ -493,7 +495,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(T, tmp_path):
     source, matrix = tmp_path / "in", tmp_path / "T.npy"
     np.save(matrix, SCENE.T)
     fill(source, seen(random.uniform(0.2, 0.9, (60, *GRID))))
-    common = {"batch": 2, "gain": "auto", "appearance": True}
+    common: dict[str, Any] = {"batch": 2, "gain": "auto", "appearance": True}
     compensate_frames(T, source, tmp_path / "whole", **common)
     wanted = everything(tmp_path / "whole")
     ended = 0
