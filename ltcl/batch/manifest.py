@@ -59,23 +59,16 @@ class Manifest:
     transport: dict[str, Any]
     gain: float | None = None
     records: dict[int, Record] = field(default_factory=dict)
+    _lines: dict[int, str] = field(default_factory=dict)  # all of them are written after every batch
 
     def add(self, records: Iterable[Record]) -> None:
         """Take these frames as done, on the disk, too."""
-        self.records |= {record.number: record for record in records}
-        head = {
-            "format": _FORMAT,
-            "versions": report.versions(),
-            "settings": self.settings,
-            "transport": self.transport,
-            "gain": self.gain,
-        }
-        lines = [json.dumps(dataclasses.asdict(self.records[number])) for number in sorted(self.records)]
-        text = (
-            report.dumps(head).removesuffix("\n}") + ',\n  "frames": [\n' + ",\n".join(lines) + "\n  ]\n}\n"
-        )
+        self._take(records)
+        known = {"settings": self.settings, "transport": self.transport, "gain": self.gain}
+        head = report.dumps({"format": _FORMAT, "versions": report.versions(), **known})
+        lines = ",\n".join(self._lines[number] for number in sorted(self._lines))
         with replace_file(self.path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+            temporary.write_text(f'{head[:-2]},\n  "frames": [\n{lines}\n  ]\n}}\n', encoding="utf-8")
 
     def take_up(self) -> None:
         """Go on with the run whose file is there, if one is.
@@ -101,7 +94,13 @@ class Manifest:
             raise OtherRun(
                 f"{self.path}: that run was with another T; give the same to go on with it, or another folder"
             )
-        self.gain, self.records = earlier["gain"], records
+        self.gain = earlier["gain"]
+        self._take(records)
+
+    def _take(self, records: Iterable[Record]) -> None:
+        for record in records:
+            self.records[record.number] = record
+            self._lines[record.number] = f"    {json.dumps(dataclasses.asdict(record))}"
 
 
 def refuse_earlier(path: Path) -> None:
@@ -114,13 +113,16 @@ def refuse_earlier(path: Path) -> None:
         )
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[int, Record]]:
+def _read(path: Path) -> tuple[dict[str, Any], list[Record]]:
     try:
         found = json.loads(input_file(path).read_text(encoding="utf-8"))
         if found["format"] != _FORMAT:
             raise ValueError(f"format {found['format']!r}")
-        records = {entry["number"]: Record(**entry) for entry in found["frames"]}
+        records = [Record(**entry) for entry in found["frames"]]
         head = {key: found[key] for key in ("settings", "transport", "gain")}
+        kinds = [*zip(head.values(), (dict, dict, float), strict=True), *((r.number, int) for r in records)]
+        if not all(isinstance(value, kind) for value, kind in kinds):
+            raise ValueError("values of other types")
     except FileError:
         raise
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:

@@ -23,6 +23,7 @@ from ltcl.images.frames import open_frames, write_video
 from tests.problems import lambertian
 
 GRID = (8, 8)
+LISTED = b'{"format": 1, "frames": [], "settings": [], "transport": {}, "gain": 1.0}'
 SCENE = lambertian(64, 0.8, seed=70)
 COUNT = 13
 random = np.random.default_rng(71)
@@ -382,7 +383,7 @@ def test_other_frames_are_refused_by_the_first(T, source, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b'{"format": 9}', b'{"format": 1, "frames": [{}]}', b"\xff"]
+    "content", [b"", b"{", b"[]", b'{"format": 9}', b'{"format": 1, "frames": [{}]}', LISTED, b"\xff"]
 )
 def test_a_damaged_list_is_refused(T, source, tmp_path, content):
     (tmp_path / "frames.json").write_bytes(content)
