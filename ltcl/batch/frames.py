@@ -3,7 +3,8 @@
 
 Every frame gets the same gain: one that followed the frames would make the scene flicker. gain="auto" is
 found once, on a sample of frames from all over the source, and kept. A frame that needs more light than the
-sample did is brought as near as the bounds allow, and its record tells how much of it is clipped.
+sample did is brought as near as the bounds allow, and its record tells how much of it is clipped. What a
+solve leaves, up to `rtol`, differs from frame to frame; where that is seen, a smaller one helps.
 
 Batches begin at the same frames in every run and share nothing but T, so that a run that was ended early and
 resumed gives what an uninterrupted one does: to the last bit where `method` takes the same way, as a named
@@ -18,8 +19,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ltcl import checks, layout
 from ltcl.batch import identity, manifest
@@ -130,6 +129,7 @@ def compensate_frames(
     if video is not None:
         check_video(video, T.grid)
     opened = open_frames(source, encoding=encoding)
+    _apart(opened.path, {"out": out, "video": video})
     kept = _manifest(
         T,
         as_path(out),
@@ -155,12 +155,19 @@ def _checked(T: Transport, gain: Any, loss: Any, options: dict[str, Any]) -> tup
     inputs.gain(gain, loss)
     for name in ("background", "weights"):
         value = options.get(name)
-        if value is None or np.ndim(value) == 0:
+        if value is None or checks.real(name, value).ndim == 0:
             continue
         count = layout.unpack(name, value, T.camera_grid, T.channels)[1].frames
         if count is not None:
             raise InputError(f"{name} holds {count} frame(s); it must be one picture, for all frames alike")
     return inputs.bounds(options.get("bounds", (0.0, 1.0)))
+
+
+def _apart(source: Path, targets: dict[str, Any]) -> None:
+    """Refuse to write where the frames come from."""
+    for name, target in targets.items():
+        if target is not None and as_path(target).resolve() == source.resolve():
+            raise InputError(f"{name} is {target}, where the frames are; it must be another place")
 
 
 def _manifest(T: Transport, folder: Path, resume: bool, settings: dict[str, Any]) -> Manifest:

@@ -53,7 +53,7 @@ def same_transport(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 def of_setting(value: Any) -> Any:
-    """A setting in the types of JSON: pictures by a digest, objects by their type.
+    """A setting in the types of JSON: pictures by a digest, objects by what they say of themselves.
 
     >>> of_setting((0.0, 1.0)), of_setting("auto"), of_setting(np.zeros((4, 5)))[:13]
     ([0.0, 1.0], 'auto', '4 x 5, sha256')
@@ -62,7 +62,8 @@ def of_setting(value: Any) -> Any:
         return value
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
-        return type(value).__name__
+        text = repr(value)
+        return type(value).__name__ if " at 0x" in text else text  # an address is of one run
     if array.size <= _FEW:
         return array.tolist()
     digest = hashlib.sha256()

@@ -30,8 +30,8 @@ class Reader:
     @property
     def count(self) -> int | None:
         """Of the frames, as far as the source tells."""
-        known = [count for count in (self.source.count, self.limit) if count is not None]
-        return min(known) if self.source.count is not None else None
+        count = self.source.count
+        return count if count is None or self.limit is None else min(count, self.limit)
 
     def frames(self) -> Iterator[Frame]:
         """From the first one on."""

@@ -421,6 +421,7 @@ def test_resuming_nothing_begins(T, source, tmp_path):
         ({"video": "a.gif"}, FileError, r"a\.gif: extension \.gif is unknown"),
         ({"nonsense": 1}, InputTypeError, "frames 1 to 8: unknown option 'nonsense'"),
         ({"encoding": "log"}, InputError, "encoding is 'log'"),
+        ({"weights": [[1.0], [1.0, 2.0]]}, InputError, "weights is ragged"),
         ({"background": np.ones((3, 3))}, InputError, r"background has shape \(3, 3\)"),
     ],
 )
@@ -438,6 +439,12 @@ def test_other_bad_arguments(T, source, tmp_path, device):
         compensate_frames(odd, source, tmp_path / "out", video="a.mkv")
     with pytest.raises(FileError, match="nowhere: no such file"):
         compensate_frames(T, tmp_path / "nowhere", tmp_path / "out")
+    with pytest.raises(InputError, match=r"out is .*, where the frames are; it must be another place"):
+        compensate_frames(T, source, source)
+    film = tmp_path / "film.mkv"
+    write_video(film, seen(LIGHT))
+    with pytest.raises(InputError, match=r"video is .*film\.mkv, where the frames are"):
+        compensate_frames(T, film, tmp_path / "out", video=film)
     (tmp_path / "file").write_text("mine")
     with pytest.raises(FileError):
         compensate_frames(T, source, tmp_path / "file")
