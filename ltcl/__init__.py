@@ -16,7 +16,7 @@ The house, from the ground up; imports point down only:
     exact, parts                    a compressed T beside the one it stands for; as the arrays of a file
     compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
     images, layout, report          pictures, pictures as right-hand sides, JSON
-    plots, demo, cli                what people look at
+    plots, batch, demo, cli         what people look at; many frames
 
 After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse Light Transport, IEEE PAMI
 2011; equation numbers in this package are that paper's. Importing ltcl touches no OpenCL driver.
@@ -38,7 +38,7 @@ from ltcl.store import load, save
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
-    from ltcl import images, operators, plots, scenes, solvers, theory
+    from ltcl import batch, images, operators, plots, scenes, solvers, theory
 
 __version__ = "0.1.0"
 __all__ = [
@@ -50,6 +50,7 @@ __all__ = [
     "Status",
     "Transport",
     "analyze",
+    "batch",
     "compensate",
     "errors",
     "images",
@@ -67,7 +68,7 @@ __all__ = [
     "theory",
 ]
 
-_LAZY = ("images", "plots", "scenes")  # they bring OpenCV or matplotlib, which not everybody needs
+_LAZY = ("batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib, which not everybody needs
 
 
 def __getattr__(name: str) -> Any:

@@ -221,3 +221,21 @@ def test_pictures_are_refused_before_anything_is_uploaded():
         if not {"method"} & set(change):  # those are the solver's
             with pytest.raises(error, match=says):
                 ltcl.compensate(T, **{"desired": FINE, **change})
+
+
+@pytest.mark.parametrize(("colours", "coloured"), [((), False), ((3,), False), ((3,), True)])
+def test_each_frame_has_an_error_and_a_share_of_its_own(T, RGB, colours, coloured):
+    T = RGB if coloured else T
+    scale = np.array([0.5, 1.0, 3.0]).reshape(3, 1, 1, *[1] * len(colours))
+    frames = scale * picture(random.uniform(0.3, 0.9, (3, *GRID, *colours)), coloured)
+    weights = random.uniform(0.5, 2.0, GRID)
+    together = ltcl.compensate(T, frames, weights=weights)
+    apart = [ltcl.compensate(T, frame, weights=weights) for frame in frames]
+    np.testing.assert_allclose(together.frame_errors, [c.error for c in apart], atol=0.02)
+    np.testing.assert_allclose(together.frame_clipped, [c.clipped for c in apart], atol=0.1)
+    assert together.frame_clipped[0] == 0.0 < together.frame_clipped[2]
+    assert together.clipped == pytest.approx(together.frame_clipped.mean())
+    counts = weights.reshape(*GRID, *[1] * len(colours))
+    squares = (np.square(counts * part) for part in (together.appearance - frames, frames))
+    off, size = (part.reshape(3, -1).sum(axis=1) for part in squares)
+    np.testing.assert_allclose(together.frame_errors, np.sqrt(off / size), rtol=1e-3, atol=1e-6)

@@ -8,12 +8,13 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from datetime import timedelta
 from typing import Any
 
 import typer
 from rich.cells import cell_len
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -21,6 +22,7 @@ from ltcl import report
 
 _GAP = "   "  # between columns
 _PATIENCE = 2.0  # seconds without a terminal before progress is worth a line
+_AGAIN = 10.0  # and before the next line on many frames
 
 
 def answer(value: Any) -> None:
@@ -142,6 +144,58 @@ class Steps:
             self._bar.update(self._task, completed=done, text=text)
 
         return step
+
+
+class Frames:
+    """Progress through many frames, on stderr: a `progress` for `ltcl.batch.compensate_frames`.
+
+    On a terminal a bar with frames a second and the time left; elsewhere the same as a line now and then. The
+    first call tells how many were done before.
+    """
+
+    def __init__(self) -> None:
+        console = Console(stderr=True)
+        self.done = 0
+        self._is_terminal = console.is_terminal
+        self._before, self._begun, self._said = 0, 0.0, 0.0
+        columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"))
+        self._bar = Progress(*columns, console=console, transient=True, disable=not self._is_terminal)
+        self._task = self._bar.add_task("", total=None, text="")
+
+    def __enter__(self) -> Frames:
+        if self._is_terminal:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_terminal:
+            self._bar.stop()
+
+    def __call__(self, done: int, total: int | None) -> None:
+        """Note that so many frames are done."""
+        now = time.monotonic()
+        if not self._begun:
+            self._before, self._begun = done, now
+            self._said = now + _PATIENCE - _AGAIN
+        self.done = done
+        text = _pace(done - self._before, now - self._begun, None if total is None else total - done)
+        self._bar.update(self._task, completed=done, total=total, text=text)
+        if not self._is_terminal and now >= self._said + _AGAIN:
+            self._said = now
+            note(f"{done}{'' if total is None else f' of {total}'} frames, {text}".rstrip(", "))
+
+
+def _pace(done: int, seconds: float, left: int | None) -> str:
+    """Frames a second, and the time for those that are left.
+
+    >>> _pace(30, 10.0, 200), _pace(0, 0.0, 5), _pace(1, 20.0, None)
+    ('3.0 a second, 0:01:06 left', '', '0.05 a second')
+    """
+    if not done or seconds <= 0:
+        return ""
+    rate = done / seconds
+    shown = f"{rate:.1f} a second" if rate >= 1 else f"{rate:.2g} a second"
+    return shown if left is None else f"{shown}, {timedelta(seconds=int(left / rate))} left"
 
 
 def _gained(residual: float, rtol: float) -> float:

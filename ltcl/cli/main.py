@@ -48,6 +48,8 @@ _WORDS = {
     "rtol and atol are both 0; one of them must be positive": "--rtol is 0; it must be above 0",
     "bounds[0] is": "--low is",
     "bounds[1] is": "--high is",
+    "resume=True": "--resume",
+    "resize=True": "--resize",
 }
 
 

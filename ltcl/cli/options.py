@@ -58,6 +58,13 @@ Matrices = Annotated[
 Pictures = Annotated[
     list[Path], typer.Argument(metavar="PICTURE...", help="Pictures: .png, .jpg, .tif, .bmp or .exr.")
 ]
+PicturesOrFrames = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="PICTURE...",
+        help="Pictures: .png, .jpg, .tif, .bmp or .exr; or one folder or one video of frames.",
+    ),
+]
 Patterns = Annotated[
     list[Path], typer.Argument(metavar="PATTERN...", help="Pictures: .png, .jpg, .tif, .bmp or .exr.")
 ]

@@ -82,7 +82,12 @@ class Problem:
 
     def norm(self, parts: list[np.ndarray]) -> float:
         """Of all parts together, weighted."""
-        return float(np.sqrt(sum(np.sum(np.square(p, dtype=np.float64)) for p in self.weighted(parts))))
+        return float(self.norms(parts, 1)[0])
+
+    def norms(self, parts: list[np.ndarray], frames: int) -> np.ndarray:
+        """The same of each frame, (frames,); its columns, one a colour, stand side by side."""
+        squares = (np.square(p, dtype=np.float64).reshape(len(p), frames, -1) for p in self.weighted(parts))
+        return np.sqrt(np.sum([np.sum(square, axis=(0, 2)) for square in squares], axis=0))
 
     def target(self, gain: float) -> list[np.ndarray]:
         """gain * desired - dark: what the projector has to add."""

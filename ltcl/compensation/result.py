@@ -37,6 +37,8 @@ class Compensation:
     gap : float
         What the error is above the least that the bounds allow, at most: no pattern within them has an error
         below error - gap. A bound that was computed for this result.
+    frame_errors, frame_clipped : (frames,) float64
+        `error` and `clipped` of each frame by itself; of a single picture, one value.
     solution : Solution or tuple of 3
         What the light would be without bounds, one per channel of the transport; of a T without S, `limited`.
     limited : tuple of Bounded
@@ -52,6 +54,8 @@ class Compensation:
     out_of_reach: np.ndarray
     error: float
     gap: float
+    frame_errors: np.ndarray
+    frame_clipped: np.ndarray
     solution: Solution | tuple[Solution, ...]
     limited: tuple[Bounded, ...]
 

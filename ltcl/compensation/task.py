@@ -146,8 +146,10 @@ def _result(
     missing = [wanted - found for wanted, found in zip(target, seen, strict=True)]
     solved = tuple(found for found in limited if found is not None)
     solutions = start.solutions or solved
-    size, clipped = problem.norm(target) or 1.0, _clipped(light, limited, problem.limits)
-    error = problem.norm(missing)
+    held, frames = _held(light, limited, problem.limits), shape.frames or 1
+    clipped = float(np.mean([part.mean() for part in held]))
+    size, error = problem.norm(target) or 1.0, problem.norm(missing)
+    sizes, errors = (problem.norms(parts, frames) for parts in (target, missing))
     least = np.sqrt(sum(float(np.sum(np.square(found.least))) for found in solved))  # of others 0
 
     def picture(columns: Columns, grid: tuple[int, int]) -> np.ndarray:
@@ -162,18 +164,19 @@ def _result(
         out_of_reach=picture(_beyond(problem, missing, target, clipped), T.camera_grid),
         error=error / size,
         gap=max(error - float(least), 0.0) / size,
+        frame_errors=errors / np.where(sizes > 0, sizes, 1.0),
+        frame_clipped=np.mean([p.reshape(len(p), frames, -1).mean(axis=(0, 2)) for p in held], axis=0),
         solution=solutions[0] if len(solutions) == 1 else solutions,
         limited=solved,
     )
 
 
-def _clipped(light: Columns, limited: list[Bounded | None], limits: Limits) -> float:
-    """The share of values at a bound that want to go beyond it, of pixels that are lit."""
-    shares = []
-    for p, found in zip(light, limited, strict=True):
-        held = np.zeros(p.shape, bool) if found is None else found.held & limits.touched(p)
-        shares.append(held[~limits.masked].mean())
-    return float(np.mean(shares))
+def _held(light: Columns, limited: list[Bounded | None], limits: Limits) -> Columns:
+    """Where values at a bound want to go beyond it, of pixels that are lit."""
+    return [
+        (np.zeros(p.shape, bool) if found is None else found.held & limits.touched(p))[~limits.masked]
+        for p, found in zip(light, limited, strict=True)
+    ]
 
 
 def _beyond(problem: Problem, missing: Columns, target: Columns, clipped: float) -> Columns:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +17,8 @@ from numpy.typing import ArrayLike
 from ltcl import checks
 from ltcl.errors import FileError, InputError, MemoryLimitError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.images import exr, raster
+from ltcl.images import codes, exr, raster
+from ltcl.images.codes import Encoding
 from ltcl.images.pictures import as_picture
 from ltcl.images.scaling import resize
 from ltcl.images.srgb import from_srgb, to_srgb
@@ -27,9 +27,6 @@ __all__ = ["BITS", "from_srgb", "read", "resize", "to_srgb", "write"]
 
 BITS: dict[str, tuple[int, ...]] = {**raster.BITS, ".exr": (32, 16)}
 """Known extensions and the bits per channel that each can be written with, the default first."""
-
-Encoding = Literal["auto", "srgb", "linear"]
-_ENCODINGS = ("auto", "srgb", "linear")
 
 
 def read(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> np.ndarray:
@@ -66,13 +63,13 @@ def read(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> np.nda
     array([[0.5, 0.5, 0.5],
            [0.5, 0.5, 0.5]], dtype=float32)
     """
-    checks.one_of("encoding", encoding, _ENCODINGS)
+    checks.one_of("encoding", encoding, codes.ENCODINGS)
     path = as_path(path)
     _bits(path)
     input_file(path)
     try:
         stored = exr.read(path) if path.suffix.lower() == ".exr" else raster.read(path)
-        return _linear(stored, encoding)
+        return codes.to_linear(stored, encoding)
     except MemoryLimitError as error:
         raise MemoryLimitError(f"{path}: {error}") from None
     except InputError as error:
@@ -110,7 +107,7 @@ def write(
     >>> import tempfile
     >>> write(Path(tempfile.mkdtemp()) / "pattern.png", np.zeros((4, 4, 3)), encoding="linear", bits=16)
     """
-    checks.one_of("encoding", encoding, _ENCODINGS)
+    checks.one_of("encoding", encoding, codes.ENCODINGS)
     path = as_path(path)
     possible = _bits(path)
     if bits is None:
@@ -119,7 +116,7 @@ def write(
         raise InputError(f"bits is {bits!r}; for {path.suffix} it must be {' or '.join(map(str, possible))}")
     picture = as_picture("image", image)
     is_exr = path.suffix.lower() == ".exr"
-    stored = _stored(picture, encoding, bits, is_float=is_exr or bits == 32)
+    stored = codes.from_linear(picture, encoding, bits, is_float=is_exr or bits == 32)
     with replace_file(path) as temporary:
         try:
             (exr if is_exr else raster).write(temporary, stored)
@@ -132,28 +129,3 @@ def _bits(path: Path) -> tuple[int, ...]:
         return BITS[path.suffix.lower()]
     except KeyError:
         raise FileError(f"{path}: {unknown_extension(path)}; pictures are {', '.join(BITS)}") from None
-
-
-def _linear(stored: np.ndarray, encoding: Encoding) -> np.ndarray:
-    is_integer = stored.dtype.kind == "u"
-    curve = encoding == "srgb" or (encoding == "auto" and is_integer)
-    if is_integer:
-        # A table in float64: exact, and the power is taken 256 or 65536 times instead of once per pixel.
-        table = np.linspace(0, 1, np.iinfo(stored.dtype).max + 1)
-        return (from_srgb(table) if curve else table).astype(np.float32)[stored]
-    with np.errstate(over="ignore"):
-        picture = checks.finite("the picture", stored.astype(np.float32, copy=False))
-    return from_srgb(picture) if curve else picture
-
-
-def _stored(picture: np.ndarray, encoding: Encoding, bits: int, *, is_float: bool) -> np.ndarray:
-    if encoding == "srgb" or (encoding == "auto" and not is_float):
-        picture = to_srgb(picture)
-    if not is_float:
-        most = (1 << bits) - 1
-        return np.rint(np.clip(picture, 0, 1) * most).astype(np.uint8 if bits == 8 else np.uint16)
-    with np.errstate(over="ignore"):
-        stored = picture.astype(np.float16 if bits == 16 else np.float32, copy=False)
-    if not np.all(np.isfinite(stored)):
-        raise InputError(f"image reaches {np.abs(picture).max():g}; half floats end at 65504, use bits=32")
-    return stored

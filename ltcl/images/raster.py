@@ -47,7 +47,7 @@ class _Silence:
                 cv2.utils.logging.setLogLevel(self._level)
 
 
-_silence = _Silence()
+silence = _Silence()
 
 
 def read(path: Path) -> np.ndarray:
@@ -68,7 +68,7 @@ def read(path: Path) -> np.ndarray:
         headers.check_png_chunks(data)
     stored = _decode(data)
     if data[:4] in headers.TIFF:
-        with _silence:
+        with silence:
             pages = cv2.imcount(str(path))
         if pages > 1:
             raise FileError(f"holds {pages} pages; it must hold one picture, so save each to a file")
@@ -105,7 +105,7 @@ def write(path: Path, codes: np.ndarray) -> None:
 
 def _decode(data: bytes) -> np.ndarray:
     try:
-        with _silence:
+        with silence:
             stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise FileError(f"cannot be decoded: {' '.join(error.err.split())}") from None

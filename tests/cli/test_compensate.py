@@ -9,7 +9,7 @@ import pytest
 
 import ltcl
 from ltcl import images, scenes, store
-from ltcl.cli import compensate
+from ltcl.cli import compensate_pictures
 
 from .conftest import Program
 
@@ -117,7 +117,7 @@ def test_clipping_comes_with_advice(program: Program, transport: Path, tmp_path:
     ("value", "shown"), [(0.6666, "0.66"), (0.999, "0.99"), (12.9, "12"), (0.5, "0.5"), (0.00129, "0.0012")]
 )
 def test_gains_are_rounded_down(value: float, shown: str) -> None:
-    assert compensate._rounded_down(value) == shown
+    assert compensate_pictures._rounded_down(value) == shown
 
 
 def test_a_background_brighter_than_the_picture_is_named(

@@ -90,3 +90,33 @@ def test_bar_tells_the_steps_of_a_method_that_samples() -> None:
     assert (task.completed, task.fields["text"]) == (0, "sampling, step 1")
     callback(1, 1e-3)
     assert (task.completed, task.fields["text"]) == (1, "residual 1.0e-03")
+
+
+def test_frames_on_a_terminal_are_a_bar_with_rate_and_time_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "100")
+    with console.Frames() as progress:
+        progress(8, 32)
+        progress(16, 32)
+        progress._bar.refresh()
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert progress.done == 16
+    assert "16/32" in err
+    assert " a second, " in err
+    assert " left" in err
+
+
+def test_frames_of_unknown_number(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "_PATIENCE", 0.0)
+    monkeypatch.setattr(console, "_AGAIN", 0.0)
+    clock = iter([1.0, 2.0])
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    with console.Frames() as progress:
+        progress(0, None)
+        progress(3, None)
+    assert capsys.readouterr().err.splitlines() == ["ltcl: 0 frames", "ltcl: 3 frames, 3.0 a second"]

@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Work on more frames than memory holds: read ahead, solved side by side, resumable after any end."""
+
+from __future__ import annotations
+
+from ltcl.batch.frames import compensate_frames
+from ltcl.batch.manifest import Record
+from ltcl.batch.result import CompensatedFrames
+
+__all__ = ["CompensatedFrames", "Record", "compensate_frames"]
