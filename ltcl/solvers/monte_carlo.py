@@ -27,18 +27,17 @@ from ltcl.device import Array
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import CSR, Dense
 from ltcl.operators.alias import SAMPLERS, tables, tables_of_columns
-from ltcl.operators.entrywise import rows_of_R, squares
+from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.walks import ESTIMATORS, Lengths, Sums, Walker, geometric, whole
-from ltcl.solvers import sampled
+from ltcl.solvers import noise, sampled
+from ltcl.solvers.noise import Noise
 from ltcl.solvers.polynomials import chebyshev_bias, chebyshev_coefficients, chebyshev_degree
 from ltcl.solvers.sampled import Estimate
 from ltcl.solvers.stopping import Rule, System
+from ltcl.solvers.target_error import MOST, Measured, Staged, sample_to
 from ltcl.theory.walks import chance_to_go_on, second_moment_radius
 
-_MOST = 1 << 20  # samples of a pixel with a target error
-_PILOT = 256  # samples that tell how many are needed
-_PILOT_STREAM = 1
-Measured = tuple[np.ndarray, np.ndarray]  # estimates and their standard errors
+_FEW = 0.1  # of the pixels lit: then walks from the light find more of it
 
 
 @dataclass(frozen=True)
@@ -113,10 +112,11 @@ class MonteCarlo:
         R, sign = rows_of_R(system.S, self.name)
         first, lengths, reason = self._lengths(system, R, sign, rule)
         pixels = np.arange(len(x)) if self.pixels is None else _pixels(self.pixels, len(x))
-        rest, error = self._walk(R, lengths, r, pixels, unit, rule)
-        x = _within_float32(x[pixels] + first * r.get()[pixels].astype(np.float64) + rest)
-        found = Estimate(x, error, whole=self.pixels is None, reason=reason)
-        return _gather(system, R, found) if self.gather else found
+        rest = self._walk(R, lengths, r, pixels, unit, rule)
+        x = _within_float32(x[pixels] + first * r.get()[pixels].astype(np.float64) + rest.mean)
+        found = Estimate(x, rest.standard_error, whole=self.pixels is None, reason=reason)
+        found = _gather(system, R, found) if self.gather else found
+        return self._told(found, rest, r, unit)
 
     def _lengths(self, system: System, R: CSR | Dense, sign: float, rule: Rule) -> tuple[float, Lengths, str]:
         """c_0, the terms that walks estimate, and both in words."""
@@ -133,30 +133,48 @@ class MonteCarlo:
 
     def _walk(
         self, R: CSR | Dense, lengths: Lengths, r: Array, pixels: np.ndarray, unit: np.ndarray, rule: Rule
-    ) -> Measured:
+    ) -> Staged:
         """Estimates of the terms k >= 1, and their standard errors."""
+        made = tables_of_columns(R) if self.adjoint else tables(R, self.sampler)
+        estimator = "endpoint" if self.adjoint else self.estimator or "collision"
+        measured = Noise(R, made, lengths, r, only_dark=estimator == "endpoint").errors
+        walker = Walker(made, lengths, estimator, self.seed, watch=sampled.watch(rule))
         if self.adjoint:
-            return self._from_light(R, lengths, r, rule)
-        watch = sampled.watch(rule)
-        made, estimator = tables(R, self.sampler), self.estimator or "collision"
-        walker = Walker(made, lengths, estimator, self.seed, watch=watch)
-        if self.error is None:
-            return _measured(walker.rows(r, pixels, 0, self.samples or self.usual))
-        pilot = walker.rows(r, pixels, 0, _PILOT, _PILOT_STREAM)
-        # Samples of the pilot do not count: chosen by their own spread, they would be biased.
-        wanted = _PILOT * (pilot.standard_error * unit / self.error) ** 2
-        counts = _rounded_up(wanted.reshape(len(pixels), -1).max(axis=1), self.samples or _MOST)
-        return _each(walker, r, pixels, counts)
+            return self._from_light(walker, r, measured)
+        if self.error is not None:
+            return sample_to(walker, r, pixels, self.error / unit, self.samples or MOST, measured)
+        sums = walker.rows(r, pixels, 0, self.samples or self.usual)
+        return Staged.fixed(sums, measured(sums, pixels))
 
-    def _from_light(self, R: CSR | Dense, lengths: Lengths, r: Array, rule: Rule) -> Measured:
-        made, host = tables_of_columns(R), r.get()
-        walker = Walker(made, lengths, "endpoint", self.seed, watch=sampled.watch(rule))
-        count = self._count(len(host))
-        mean, error = np.zeros((2, len(host), r.columns))
+    def _from_light(self, walker: Walker, r: Array, measured: Measured) -> Staged:
+        host = r.get()
+        total, squares = np.zeros((2, len(host), r.columns))
         for c, column in enumerate(host.reshape(len(host), -1).T):
-            made.append(r.device.upload(column))
-            mean[:, c], error[:, c] = _measured(walker.columns(0, count, stream=c))
-        return mean.reshape(host.shape), error.reshape(host.shape)
+            walker.tables.append(r.device.upload(column))
+            sums = walker.columns(0, self._count(len(host)), stream=c)
+            total[:, c], squares[:, c] = sums.total, sums.squares
+        sums = Sums(self._count(len(host)), total.reshape(host.shape), squares.reshape(host.shape))
+        return Staged.fixed(sums, measured(sums, np.arange(len(host))))
+
+    def _told(self, found: Estimate, rest: Staged, r: Array, unit: np.ndarray) -> Estimate:
+        """Whether the error is as small as wanted, what was spent on it, and what to try next."""
+        gather = "" if self.gather or self.pixels is not None else ", or gather=True"
+        if self.error is None:
+            return dataclasses.replace(found, advice=f"try more samples={gather}")
+        assert found.standard_error is not None  # noqa: S101 - Monte Carlo always tells it
+        within = found.standard_error * unit <= self.error
+        met = within.reshape(len(within), -1).all(axis=1) & (rest.met | self.gather)
+        what = rest.told(met, self.error, self.samples or MOST, "" if met.all() else self._instead(r))
+        advice = f"try a smaller error={gather}" if self.pixels is None else ""
+        reason = f"{found.reason}; {what}"
+        return dataclasses.replace(found, reason=reason, met=bool(met.all()), advice=advice)
+
+    def _instead(self, r: Array) -> str:
+        """What to try where the error was missed."""
+        lit = np.mean(r.get().reshape(r.shape[0], -1).any(axis=1))
+        if lit <= _FEW and self.pixels is None and (self.series, self.sampler) == ("neumann", "alias"):
+            return "adjoint=True suits few lights"
+        return "allow a larger error=" if self.samples is None else "allow more samples="
 
     def _count(self, n: int) -> int:
         return n * (self.samples or self.usual)
@@ -198,29 +216,7 @@ def _pixels(pixels: Any, n: int) -> np.ndarray:
     return array.astype(np.int64)
 
 
-def _rounded_up(wanted: np.ndarray, most: int) -> np.ndarray:
-    """Powers of two, so that pixels of like need share a launch, within 2 .. most."""
-    powers = 2.0 ** np.ceil(np.log2(np.clip(wanted, 2.0, most)))
-    return np.minimum(powers, most).astype(np.int64)
-
-
-def _each(walker: Walker, r: Array, pixels: np.ndarray, counts: np.ndarray) -> Measured:
-    """Pixels with counts of samples of their own."""
-    shape = (len(pixels), *r.shape[1:])
-    mean, error = np.zeros(shape), np.zeros(shape)
-    for count in np.unique(counts):
-        here = counts == count
-        mean[here], error[here] = _measured(walker.rows(r, pixels[here], 0, int(count)))
-    return mean, error
-
-
-def _measured(sums: Sums) -> Measured:
-    return sums.mean, sums.standard_error
-
-
 def _gather(system: System, R: CSR | Dense, found: Estimate) -> Estimate:
-    """Errors of the pixels are independent: their variances pass through the squares of R."""
-    error = found.standard_error
-    assert error is not None  # noqa: S101 - Monte Carlo always tells it
-    x = sampled.gathered(system, found.x)
-    return dataclasses.replace(found, x=x, standard_error=np.sqrt(np.asarray(squares(R) @ error**2)))
+    assert found.standard_error is not None  # noqa: S101 - Monte Carlo always tells it
+    x, error = sampled.gathered(system, found.x), noise.gathered(R, found.standard_error)
+    return dataclasses.replace(found, x=x, standard_error=error)

@@ -27,10 +27,7 @@ class Status(enum.Enum):
         "the method has no next step here, not even started anew; "
         "try method='gmres', 'cg' with normal=True, or 'direct'"
     )
-    SAMPLED = (
-        "the samples are spent, what is left is noise, told by .standard_error; try more "
-        "samples=, or gather=True"
-    )
+    SAMPLED = "the samples are spent, what is left is noise"
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
@@ -59,7 +56,8 @@ class Solution:
     Attributes
     ----------
     x : (N,) or (N, k) float32 (float64 of method "direct", and of values beyond float32)
-        The solution; where `converged` is False, the iterate with the smallest residual.
+        The solution; where `converged` is False, the iterate with the smallest residual, or what was sampled.
+        Of `pixels=` (P,) or (P, k), in their order.
     status : Status
     iterations : int
     products : int
@@ -77,7 +75,10 @@ class Solution:
         Residual of the best iterate; the least of `residuals` when not given. Residuals that gmres foresees
         are no iterate's.
     standard_error : like x, optional
-        Of a method that samples, where it knows it.
+        Of "monte_carlo": of the noise, without the bias of a polynomial. 0 only where there is none for
+        certain; NaN where it is unknown, since no walk has found light, or all scored alike. It is itself an
+        estimate, good from some 30 samples on: of 2 it covers x as seldom as 73 times in 100 where 95 are
+        meant, of 8 91 times.
     """
 
     x: np.ndarray
@@ -98,7 +99,7 @@ class Solution:
 
     @property
     def residual(self) -> float:
-        """The relative residual of `x`."""
+        """The relative residual of `x`; infinite of some pixels alone, which have none."""
         finite = [value for value in self.residuals if np.isfinite(value)]
         if self.converged or not finite:
             return finite[-1] if finite else float("inf")
@@ -109,9 +110,12 @@ class Solution:
         residual = f"{best:.2g}"
         if np.isnan(last) and self.status is Status.SAMPLED:
             residual = "unknown of some pixels alone"
-        if last > best:
+        elif last > best:
             residual += f" at best and {last:.2g} at the end"
+        why = _advice(self.status, self.method)
+        if self.status is Status.SAMPLED and self.reason:
+            why += f": {self.reason}"
         return (
             f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, "
-            f"{self.products} products, relative residual {residual}: {_advice(self.status, self.method)}"
+            f"{self.products} products, relative residual {residual}: {why}"
         )

@@ -26,7 +26,7 @@ class Estimate:
     """What a method found, in the units of `system.b`, float64; standard errors where it knows them.
 
     `x` is (N,) or (N, k), or (P,) or (P, k) where it is of some pixels only and has no residual. `reason`
-    tells what was sampled.
+    tells what was sampled, `met` whether the error that was asked for is, `advice` what else to try.
     """
 
     x: np.ndarray
@@ -34,6 +34,8 @@ class Estimate:
     iterations: int = 1
     whole: bool = True
     reason: str = ""
+    met: bool = True
+    advice: str = ""
 
 
 def solution(
@@ -45,16 +47,18 @@ def solution(
         relative, met = _residual(system, gathered(system, found.x, add=False), rule)
     if rule.callback is not None and found.whole:
         rule.callback(found.iterations, relative)
-    error = found.standard_error
+    error, converged = found.standard_error, met and found.met
+    advice = found.advice if found.met and not converged else ""
     return Solution(
         in_units(found.x),
-        Status.CONVERGED if met else Status.SAMPLED,
+        Status.CONVERGED if converged else Status.SAMPLED,
         found.iterations,
         system.products,
         (1.0, relative) if found.whole else (np.nan,),
         0.0,
         method.name,
-        found.reason,
+        "; ".join(filter(None, (found.reason, advice))),
+        lowest=relative if np.isfinite(relative) else np.inf,  # of x, be it worse than the start
         standard_error=None if error is None else in_units(error),
     )
 

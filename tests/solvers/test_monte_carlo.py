@@ -72,7 +72,8 @@ def test_the_mean_of_many_runs_is_the_solution(device, name, variant):
     exact = np.linalg.solve(dense, b.astype(float))
     runs = [ltcl.solve(S, b, "monte_carlo", samples=256, seed=s, **VARIANTS[variant]) for s in range(24)]
     x = np.stack([run.x for run in runs]).astype(float)
-    error = np.sqrt(np.mean([error_of(run) ** 2 for run in runs], axis=0))
+    # Of all runs together, one that has found no light counts as without spread.
+    error = np.sqrt(np.mean([np.nan_to_num(error_of(run), nan=0.0) ** 2 for run in runs], axis=0))
     slack = 1e-5 * np.abs(exact).max()  # float32
     assert np.all(np.abs(x.mean(axis=0) - exact) <= 4 * error / 24**0.5 + slack)
     noisy = error > slack
@@ -198,7 +199,7 @@ def test_a_target_error_is_reached(device, scale):
     found = ltcl.solve(S, b, "monte_carlo", error=0.004 * scale)
     exact = np.linalg.solve(dense, b / scale)
     error = error_of(found) / scale
-    assert np.max(error) < 0.004 * 1.15  # a pilot knows the spread to a few per cent
+    assert np.max(error) <= 0.004
     assert np.median(error[:, 0]) > 0.002  # not by drowning it in samples
     z = (found.x.astype(float) / scale - exact) / error
     assert np.abs(z).max() < 4.5
