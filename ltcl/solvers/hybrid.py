@@ -5,7 +5,8 @@
 
 Each iteration draws fresh columns, so that noise of one is damped by those after it as light is. It costs
 `samples` loads a pixel in place of a row, and leaves the noise of the last product; final gather makes that
-product exactly. It converges in the mean where rho(R) < 1, as Jacobi does.
+product exactly. It converges in the mean where rho(R) < 1, as Jacobi does. Its noise stays bounded with enough
+samples (`ltcl.theory.sampled_products`); with fewer it is refused. It has no standard error of its own.
 """
 
 from __future__ import annotations
@@ -20,12 +21,14 @@ from ltcl import checks, theory
 from ltcl.device import Array
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Dense
-from ltcl.operators.alias import SAMPLERS, tables
+from ltcl.operators.alias import SAMPLERS, Tables, tables
 from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.walks import Walker, whole
 from ltcl.solvers import sampled
 from ltcl.solvers.sampled import Estimate
 from ltcl.solvers.stopping import Rule, System
+from ltcl.theory.sampled_products import least_samples
+from ltcl.theory.walks import SecondMoments, second_moment_radius
 
 
 @dataclass(frozen=True)
@@ -66,15 +69,35 @@ class Hybrid:
         R, sign = rows_of_R(system.S, self.name)
         made = tables(R, self.sampler)  # rows that overflow have no spectral radius either
         count = self._iterations(R, rule)
+        self._check_noise(R, made)
         walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed)
         pixels, start = np.arange(len(x)), r.get().astype(np.float64)
         l, watch = start, sampled.watch(rule)
         for k in range(count):
             product = walker.rows(system.S.device.upload(l), pixels, 0, self.samples, stream=k)
-            l = start + product.mean
+            l = sampled.within_float32(start + product.mean)
             watch()
         x = x + l
-        return Estimate(sampled.gathered(system, x) if self.gather else x, iterations=count)
+        x = sampled.gathered(system, x) if self.gather else x
+        reason = f"Jacobi, {self.samples} columns of each row drawn in each of {count} iterations"
+        advice = "try more samples=" + ("" if self.gather else ", or gather=True")
+        return Estimate(x, iterations=count, reason=reason, advice=advice)
+
+    def _check_noise(self, R: CSR | Dense, made: Tables) -> None:
+        """Refuse as few samples as let noise grow from product to product."""
+        if second_moment_radius(R, made) < 1.0:
+            return
+        key = f"least samples, {self.sampler}"
+        if key not in R.tables:
+            R.tables[key] = least_samples(R, SecondMoments(R, made))
+        if not self.samples >= R.tables[key]:
+            least = (
+                f"{R.tables[key]:.0f} at least" if math.isfinite(R.tables[key]) else "more than can be told"
+            )
+            raise InputError(
+                f"samples is {self.samples}; over this R noise grows from one product to the next then: "
+                f"samples= must be {least}, or use method='chebyshev'"
+            )
 
     def _iterations(self, R: CSR | Dense, rule: Rule) -> int:
         key = "spectral radius"

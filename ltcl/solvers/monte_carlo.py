@@ -113,7 +113,7 @@ class MonteCarlo:
         first, lengths, reason = self._lengths(system, R, sign, rule)
         pixels = np.arange(len(x)) if self.pixels is None else _pixels(self.pixels, len(x))
         rest = self._walk(R, lengths, r, pixels, unit, rule)
-        x = _within_float32(x[pixels] + first * r.get()[pixels].astype(np.float64) + rest.mean)
+        x = sampled.within_float32(x[pixels] + first * r.get()[pixels].astype(np.float64) + rest.mean)
         found = Estimate(x, rest.standard_error, whole=self.pixels is None, reason=reason)
         found = _gather(system, R, found) if self.gather else found
         return self._told(found, rest, r, unit)
@@ -123,7 +123,7 @@ class MonteCarlo:
         if self.series == "chebyshev":
             bounds = theory.free_bounds(system.S)
             degree = max(1, chebyshev_degree(rule.rtol, bounds)) if self.degree is None else self.degree
-            c = _within_float32(chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1))
+            c = chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1)
             bias = chebyshev_bias(degree, bounds)
             reason = f"Chebyshev series of degree {degree}, which leaves {bias:.2g} of the residual"
             return float(c[0]), whole(c[1:]), reason
@@ -195,15 +195,6 @@ class MonteCarlo:
             raise InputTypeError("adjoint=True estimates whole pictures; leave pixels= and error= out")
         if self.estimator == "collision" or self.sampler != "alias":
             raise InputTypeError("adjoint=True has estimator='endpoint' and sampler='alias'; leave them out")
-
-
-def _within_float32(values: np.ndarray) -> np.ndarray:
-    """Coefficients or estimates of a polynomial of too high a degree are infinite, or NaN."""
-    if not np.all(np.abs(values) <= np.finfo(np.float32).max):
-        raise InputError(
-            "the terms of this series are beyond float32; lower degree=, or use method='chebyshev'"
-        )
-    return values
 
 
 def _pixels(pixels: Any, n: int) -> np.ndarray:

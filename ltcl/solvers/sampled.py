@@ -85,6 +85,13 @@ def _residual(system: System, r: np.ndarray, rule: Rule) -> tuple[float, bool]:
     return relative, bool(np.all(left <= np.maximum(rule.rtol * norms, rule.atol)))
 
 
+def within_float32(estimates: np.ndarray) -> np.ndarray:
+    """Return what was sampled; refuse what has grown beyond float32, or is NaN."""
+    if not np.all(np.abs(estimates) <= np.finfo(np.float32).max):
+        raise InputError("what was sampled has grown beyond float32; use method='chebyshev'")
+    return estimates
+
+
 def check_whole(options: dict[str, Any]) -> None:
     """Refuse, where a task needs whole pictures, to estimate some pixels only."""
     if "pixels" in options:
