@@ -5,8 +5,8 @@
 
 Each iteration draws fresh columns, so that noise of one is damped by those after it as light is. It costs
 `samples` loads a pixel in place of a row, and leaves the noise of the last product; final gather makes that
-product exactly. It converges in the mean where rho(R) < 1, as Jacobi does. Its noise stays bounded with enough
-samples (`ltcl.theory.sampled_products`); with fewer it is refused. It has no standard error of its own.
+product exactly. It converges in the mean where rho(R) < 1, as Jacobi does. Its noise stays bounded with
+enough samples (`ltcl.theory.sampled_products`); with fewer it is refused. It has no standard error.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ class Hybrid:
         if self.iterations is not None:
             checks.count("iterations", self.iterations)
         checks.one_of("sampler", self.sampler, SAMPLERS)
+        checks.flag("gather", self.gather)
 
     def estimate(self, system: System, x: np.ndarray, r: Array, rule: Rule, unit: np.ndarray) -> Estimate:
         """`x` plus what the iterations make of its residual r, started from zero."""

@@ -17,6 +17,7 @@ coefficients alternate and grow, and with them the noise, which the standard err
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -31,12 +32,14 @@ from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.walks import ESTIMATORS, Lengths, Sums, Walker, geometric, whole
 from ltcl.solvers import noise, sampled
 from ltcl.solvers.noise import Noise
-from ltcl.solvers.polynomials import chebyshev_bias, chebyshev_coefficients, chebyshev_degree
+from ltcl.solvers.polynomials import bias_in_words, chebyshev_coefficients, chebyshev_degree
 from ltcl.solvers.sampled import Estimate
 from ltcl.solvers.stopping import Rule, System
 from ltcl.solvers.target_error import MOST, Measured, Staged, sample_to
-from ltcl.theory.walks import chance_to_go_on, second_moment_radius
+from ltcl.theory.walks import chance_to_go_on, noise_of_terms, second_moment_radius
 
+_HIGHEST = 10_000  # degree: walks are as long
+_LOUDEST = 2.0**63  # noise of a sample whose square float32 still holds
 _FEW = 0.1  # of the pixels lit: then walks from the light find more of it
 
 
@@ -93,10 +96,12 @@ class MonteCarlo:
             checks.one_of("estimator", self.estimator, ESTIMATORS)
         checks.one_of("sampler", self.sampler, SAMPLERS)
         checks.one_of("series", self.series, ("neumann", "chebyshev"))
+        checks.flag("adjoint", self.adjoint)
+        checks.flag("gather", self.gather)
         if self.albedo is not None:
             chance_to_go_on(0.0, self.albedo)
         if self.degree is not None:
-            checks.count("degree", self.degree)
+            checks.count("degree", self.degree, most=_HIGHEST)
         self._refuse_together()
 
     def check(self, n: int) -> None:
@@ -120,16 +125,44 @@ class MonteCarlo:
 
     def _lengths(self, system: System, R: CSR | Dense, sign: float, rule: Rule) -> tuple[float, Lengths, str]:
         """c_0, the terms that walks estimate, and both in words."""
-        if self.series == "chebyshev":
-            bounds = theory.free_bounds(system.S)
-            degree = max(1, chebyshev_degree(rule.rtol, bounds)) if self.degree is None else self.degree
-            c = chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1)
-            bias = chebyshev_bias(degree, bounds)
-            reason = f"Chebyshev series of degree {degree}, which leaves {bias:.2g} of the residual"
-            return float(c[0]), whole(c[1:]), reason
         made = tables_of_columns(R) if self.adjoint else tables(R, self.sampler)
-        q = chance_to_go_on(second_moment_radius(R, made, self.adjoint), self.albedo)
+        moments = second_moment_radius(R, made, self.adjoint)
+        if self.series == "chebyshev":
+            return self._polynomial(theory.free_bounds(system.S), sign, rule.rtol, moments)
+        if self.sampler == "uniform" and moments >= 1.0 > second_moment_radius(R, tables(R)):
+            raise InputError(
+                "walks by sampler='uniform' have no finite variance over this R: the second moments of their "
+                f"weights grow by {moments:.3g} a step, which must be below 1; use sampler='alias'"
+            )
+        q = chance_to_go_on(moments, self.albedo)
         return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}"
+
+    def _polynomial(
+        self, bounds: tuple[float, float], sign: float, rtol: float, moments: float
+    ) -> tuple[float, Lengths, str]:
+        """That of Chebyshev, to the degree given, or to that of rtol where noise leaves anything of it."""
+        degree = max(1, chebyshev_degree(rtol, bounds)) if self.degree is None else self.degree
+        if degree > _HIGHEST:
+            raise InputError(
+                f"rtol is {rtol:g}, which takes a degree of {degree}; degree= must be at most {_HIGHEST}"
+            )
+        c = chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1)
+        most = self.samples or (self.usual if self.error is None else MOST)
+        noise = noise_of_terms(c, moments) / math.sqrt(most)
+        if self.degree is None and not noise < 1.0:
+            instead = "or use series='neumann'" if moments < 1.0 else "or use method='chebyshev'"
+            raise InputError(
+                f"samples is {most}; of the polynomial of degree {degree} that rtol={rtol:g} asks for they "
+                f"leave noise of about {noise:.2g} times b: give a lower degree=, more samples=, {instead}"
+            )
+        if not noise * math.sqrt(most) <= _LOUDEST:
+            raise InputError(
+                f"degree is {degree}; its terms over this R are beyond float32: lower degree=, or use "
+                "method='chebyshev'"
+            )
+        reason = f"Chebyshev series of degree {degree}, which leaves {bias_in_words(degree, bounds)}"
+        noisy = f"and noise of about {noise:.2g} times b with {most} samples"
+        return float(c[0]), whole(c[1:]), f"{reason}, {noisy}"
 
     def _walk(
         self, R: CSR | Dense, lengths: Lengths, r: Array, pixels: np.ndarray, unit: np.ndarray, rule: Rule
@@ -198,8 +231,10 @@ class MonteCarlo:
 
 
 def _pixels(pixels: Any, n: int) -> np.ndarray:
-    array = np.asarray(pixels)
-    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "iu":
+    array = checks.real("pixels", pixels)
+    if array.size == 0:
+        raise InputError("pixels is empty; it must hold at least one, or be left out for all")
+    if array.ndim != 1 or array.dtype.kind not in "iu":
         raise InputError(f"pixels has shape {array.shape} of {array.dtype}; it must be (P,) whole numbers")
     worst = int(array.min() if array.min() < 0 else array.max())
     if not 0 <= worst < n:

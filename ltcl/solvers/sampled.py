@@ -63,6 +63,12 @@ def solution(
     )
 
 
+def numbered(callback: Callable[[int, float], object] | None) -> Callable[[int, float], object] | None:
+    """A callback that is told of its calls in order, 0, 1, ...: of steps, and of what they made."""
+    calls = itertools.count()
+    return None if callback is None else lambda _, residual: callback(next(calls), residual)
+
+
 def watch(rule: Rule) -> Callable[[], object]:
     """Tell the callback of a rule that sampling begins; what comes back tells it of each step, as NaN."""
     callback, steps = rule.callback, itertools.count(1)
@@ -88,7 +94,7 @@ def _residual(system: System, r: np.ndarray, rule: Rule) -> tuple[float, bool]:
 def within_float32(estimates: np.ndarray) -> np.ndarray:
     """Return what was sampled; refuse what has grown beyond float32, or is NaN."""
     if not np.all(np.abs(estimates) <= np.finfo(np.float32).max):
-        raise InputError("what was sampled has grown beyond float32; use method='chebyshev'")
+        raise InputError("what was sampled has grown beyond float32; rescale, or use method='chebyshev'")
     return estimates
 
 

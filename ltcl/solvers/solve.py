@@ -247,6 +247,7 @@ def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule
     rule = dataclasses.replace(rule, atol=rule.atol / unit)
     x, r = _start(system, None if guess is None else guess / unit)
     if isinstance(method, MonteCarlo | Hybrid):
+        rule = dataclasses.replace(rule, callback=sampled.numbered(rule.callback))
         found = method.estimate(system, x.get().astype(np.float64), r, rule, unit)
         return sampled.solution(method, system, found, rule, functools.partial(_in_units, unit=unit))
     monitor = Monitor(system, rule)

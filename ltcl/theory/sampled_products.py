@@ -5,8 +5,8 @@ With s samples of each row, C the covariance of l and m its mean, an iteration m
 
     C' = R C R^T + diag(Q p - diag(R C R^T) - (R m)^2) / s,    p = diag C + m^2
 
-since rows are drawn on their own; Q as in `ltcl.theory.walks`, q = 1. Where rho(R) < 1, the part R C R^T makes
-of noise with variances d the variances W d, W the sum over k >= 0 of the squared entries of R^k. Each
+since rows are drawn on their own; Q as in `ltcl.theory.walks`, q = 1. Where rho(R) < 1, the part R C R^T
+makes of noise with variances d the variances W d, W the sum over k >= 0 of the squared entries of R^k. Each
 part keeps covariances positive semidefinite, hence (as for a regular splitting of an M-matrix: Varga, Matrix
 Iterative Analysis, section 3.6) the noise stays bounded if and only if
 
