@@ -71,13 +71,12 @@ class Hybrid:
         made = tables(R, self.sampler)  # rows that overflow have no spectral radius either
         count = self._iterations(R, rule)
         self._check_noise(R, made)
-        walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed)
+        walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed, watch=sampled.watch(rule))
         pixels, start = np.arange(len(x)), r.get().astype(np.float64)
-        l, watch = start, sampled.watch(rule)
+        l = start
         for k in range(count):
             product = walker.rows(system.S.device.upload(l), pixels, 0, self.samples, stream=k)
             l = sampled.within_float32(start + product.mean)
-            watch()
         x = x + l
         x = sampled.gathered(system, x) if self.gather else x
         reason = f"Jacobi, {self.samples} columns of each row drawn in each of {count} iterations"

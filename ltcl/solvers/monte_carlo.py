@@ -11,7 +11,7 @@ colour have tables and walks of their own.
 
 The series needs rho(|R|) < 1, and a finite variance some more (`ltcl.theory.walks`); elsewhere it is refused.
 ``series="chebyshev"`` samples a polynomial of finite degree instead, which converges for every albedo; its
-coefficients alternate and grow, and with them the noise, which the standard error tells.
+coefficients alternate and grow, and with them the noise, which `reason` foretells.
 """
 
 from __future__ import annotations
@@ -50,14 +50,15 @@ class MonteCarlo:
     Parameters
     ----------
     samples : int, optional
-        Of each pixel; 256 when not given. With `error` the most a pixel gets, 2^20 when not given. With
-        `adjoint` the mean of all pixels.
+        Of each pixel; 256 when not given. With `error` the most of a pixel in its last stage, 2^20 when not
+        given; the stages before take up to as many together. With `adjoint` the mean of all pixels.
     seed : int
         Below 2^64. The same seed gives the same bits on every device.
     pixels : (P,) integers, optional
         The pixels to estimate; x and its standard error are then (P,) or (P, k), in their order.
     error : float, optional
-        Standard error wanted of every value of x, in its units. As many samples as it needs, by a pilot.
+        Standard error wanted of every value of x, absolute, in its units; with `gather` of those before. As
+        many samples as it needs, see `ltcl.solvers.target_error`. How many pixels missed it is in `reason`.
     estimator : str, optional
         "collision": walks score at every step. "endpoint": where they end (eq. 26, the paper's).
     sampler : str
@@ -65,7 +66,8 @@ class MonteCarlo:
     albedo : float, optional
         m of eq. 24, in (0, 1/2); by default such that walks are as long as their variance asks for.
     adjoint : bool
-        Walks from b instead of from each pixel, for whole pictures with few lights: the end-point estimator.
+        Walks from b instead of from each pixel, for whole pictures with few lights: the end-point estimator
+        and alias tables, without `pixels` and `error`.
     gather : bool
         Final gather: one exact product at the end, b - R x.
     series : str
