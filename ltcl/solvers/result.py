@@ -77,8 +77,8 @@ class Solution:
     standard_error : like x, optional
         Of "monte_carlo": of the noise, without the bias of a polynomial. 0 only where there is none for
         certain; NaN where it is unknown, since no walk has found light, or all scored alike. It is itself an
-        estimate, good from some 30 samples on: of 2 it covers x as seldom as 73 times in 100 where 95 are
-        meant, of 8 91 times.
+        estimate, good from some 30 samples on: x is within 1.96 of it 95 times in 100 then, of 8 samples
+        about 91 times, of 2 about 70.
     """
 
     x: np.ndarray
