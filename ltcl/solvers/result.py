@@ -27,7 +27,7 @@ class Status(enum.Enum):
         "the method has no next step here, not even started anew; "
         "try method='gmres', 'cg' with normal=True, or 'direct'"
     )
-    SAMPLED = "the samples are spent, what is left is noise"
+    SAMPLED = "the samples are spent, what is left is noise; .reason tells what to try next"
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
@@ -114,7 +114,7 @@ class Solution:
             residual += f" at best and {last:.2g} at the end"
         why = _advice(self.status, self.method)
         if self.status is Status.SAMPLED and self.reason:
-            why += f": {self.reason}"
+            why = f"{why.partition(';')[0]}: {self.reason}"
         return (
             f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, "
             f"{self.products} products, relative residual {residual}: {why}"
