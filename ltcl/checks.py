@@ -91,11 +91,20 @@ def number(
     return float(value)
 
 
-def count(name: str, value: Any, *, least: int = 1) -> int:
-    """Return `value` as an integer of at least `least`."""
+def count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
+    """Return `value` as an integer of at least `least` and at most `most`."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise InputError(f"{name} is {value!r}; it must be a whole number of at least {least}")
+    if most is not None and value > most:
+        raise InputError(f"{name} is {value}; it must be at most {most}")
     return int(value)
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return `value` if it is True or False."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputTypeError(f"{name} is {value!r}; it must be True or False")
+    return bool(value)
 
 
 def one_of(name: str, value: Any, allowed: Iterable[str]) -> str:

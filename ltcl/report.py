@@ -70,10 +70,12 @@ def solution(solved: Solution | tuple[Solution, ...]) -> list[dict[str, Any]]:
 
 
 def _spread(error: np.ndarray | None) -> dict[str, float] | None:
-    """Of the standard errors of pixels, where the method knows them."""
+    """Of the standard errors of pixels that the method knows, and how many it does not."""
     if error is None:
         return None
-    return {"largest": float(np.max(error)), "median": float(np.median(error))}
+    known = error[~np.isnan(error)]
+    largest, median = (np.max(known), np.median(known)) if known.size else (np.nan, np.nan)
+    return {"largest": float(largest), "median": float(median), "unknown": error.size - known.size}
 
 
 def device(opened: Device) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 from ltcl.cli.main import main
 
@@ -24,6 +25,9 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     exec(block(r"```python\n(.*?)```"), names)  # noqa: S102 - our own README
     assert Path("corner.png").is_file()
     assert "0.0% of the pattern clipped" in capsys.readouterr().out
+    exec(block(r"```py\n(.*?)```"), names)  # noqa: S102
+    few: Any = names["few"]
+    assert (few.standard_error <= 1e-3).all()
     commands = block(r"on the files these lines have made:\s+```\n(.*?)```").splitlines()
     assert len(commands) > 5
     for command in commands:

@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from ltcl import report
-from ltcl.cli import console, pictures, results
+from ltcl.cli import console, options, pictures, results
 from ltcl.compensation import Compensation
 from ltcl.errors import InputError
 from ltcl.transport import Transport
@@ -47,7 +47,8 @@ def run(
 
     entries = text["pictures"] = []
     dark, (low, high) = settings["background"], settings["bounds"]
-    with console.Steps(len(desired), T.channels) as steps, results.fill(out, text) as folder:
+    solves = options.solves(settings["method"], T.channels)
+    with console.Steps(len(desired), solves) as steps, results.fill(out, text) as folder:
         for (name, wanted), file in zip(desired.items(), files, strict=True):
             steps.item(file.name)
             with _named({"desired": file, "gain": file, **names}):

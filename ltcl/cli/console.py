@@ -23,6 +23,7 @@ from ltcl import report
 _GAP = "   "  # between columns
 _PATIENCE = 2.0  # seconds without a terminal before progress is worth a line
 _AGAIN = 10.0  # and before the next line on many frames
+_OFTEN = 1.0  # seconds between lines of a long solve
 
 
 def answer(value: Any) -> None:
@@ -88,7 +89,7 @@ class Steps:
     """Progress through several items and the solves in each, on stderr.
 
     On a terminal a bar; elsewhere a line an item, by default once the whole has taken longer than two
-    seconds.
+    seconds, and then one about every second of a long solve.
 
     Parameters
     ----------
@@ -102,6 +103,7 @@ class Steps:
     def __init__(self, items: int, solves: int = 1, *, patient: bool = True) -> None:
         self._items, self._solves = items, solves
         self._item = self._solve = 0
+        self._name, self._said = "", 0.0
         self._quiet_until = time.monotonic() + _PATIENCE if patient else 0.0
         console = Console(stderr=True)
         self._is_terminal = console.is_terminal
@@ -129,8 +131,8 @@ class Steps:
         counted = f"{self._item}/{self._items} {name}" if self._items > 1 else name
         done = (self._item - 1) * self._solves
         self._bar.update(self._task, description=counted, completed=done, text="")
-        if not self._is_terminal and time.monotonic() >= self._quiet_until:
-            note(counted)
+        self._name = counted
+        self._say(counted, 0.0)
 
     def solve(self, rtol: float) -> Callable[[int, float], None]:
         """A `callback` for the solves of this item: moves the bar by the digits gained."""
@@ -142,8 +144,16 @@ class Steps:
             )
             text = f"sampling, step {iteration}" if math.isnan(residual) else f"residual {residual:.1e}"
             self._bar.update(self._task, completed=done, text=text)
+            self._say(f"{self._name}: {text}", _OFTEN)
 
         return step
+
+    def _say(self, text: str, again: float) -> None:
+        """A line, unless it is too early for any, or less than `again` seconds after the last."""
+        now = time.monotonic()
+        if not self._is_terminal and now >= max(self._quiet_until, self._said + again):
+            note(text)
+            self._said = now
 
 
 class Frames:

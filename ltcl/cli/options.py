@@ -51,6 +51,15 @@ def sampling(method: str, samples: int | None, seed: int | None) -> dict[str, in
     return {}
 
 
+def solves(method: str, channels: int) -> int:
+    """How often a callback hears numbers begin: of methods that sample once, whatever the channels.
+
+    >>> solves("cg", 3), solves("hybrid", 3)
+    (3, 1)
+    """
+    return 1 if method in SAMPLED else channels
+
+
 Matrix = Annotated[Path, typer.Argument(metavar="TRANSPORT", help="Light transport: .npz, .npy or .mtx.")]
 Matrices = Annotated[
     list[Path], typer.Argument(metavar="FILE...", help="Light transports: .npz, .npy or .mtx.")

@@ -60,7 +60,8 @@ def run(
         device=device,
     )
     entries = text["pictures"] = []
-    with console.Steps(len(seen), T.channels * (bounces + 1)) as steps, results.fill(out, text) as folder:
+    solves = options.solves(method, T.channels) * (bounces + 1)
+    with console.Steps(len(seen), solves) as steps, results.fill(out, text) as folder:
         for (name, image), file in zip(seen.items(), picture, strict=True):
             steps.item(file.name)
             settings = {"method": method, "rtol": rtol, **drawn}

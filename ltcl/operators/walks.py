@@ -25,6 +25,8 @@ _CERTAIN = 1 << 22  # chances to go on, of as many
 _NEVER = 64  # walks of a length whose chance is below 2^-64 are cut: nobody will see one
 _UNITS = 1 << 18  # chunks of one launch at most
 _RECORDS = 1 << 22  # samples of one launch of the adjoint at most
+_STEPS = 1 << 23  # steps of one launch for each compute unit, in the mean: half a second
+_ALIKE = 2.0**-20  # spread over sum of squares, which float32 rounds
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,16 @@ class Lengths:
         # Of a step that is never scored nothing is read.
         worth = np.divide(self.coefficients, scored, out=np.zeros_like(scored), where=scored > 0.0)
         return np.stack([worth.astype(np.float32).view(np.uint32), self.chances], axis=1)
+
+    @property
+    def are_one(self) -> bool:
+        """Whether all walks are of the same length."""
+        return bool(np.all(self.chances[:-1] == _CERTAIN))
+
+    @property
+    def mean(self) -> float:
+        """Steps of a walk in the mean, where no row is empty."""
+        return 1.0 + float(np.sum(np.cumprod(self.chances[:-1] / _CERTAIN)))
 
     def after_start(self) -> Lengths:
         """The same for walks whose first step goes from the row of b to where they start."""
@@ -80,11 +92,15 @@ def whole(coefficients: np.ndarray) -> Lengths:
 
 @dataclass(frozen=True)
 class Sums:
-    """Of `samples` samples of each pixel: their sum and that of their squares, (P,) or (P, k) float64."""
+    """Of `samples` samples of each pixel: their sum and that of their squares, (P,) or (P, k) float64.
+
+    `fourths` sums the squares of what each chunk of `CHUNK` samples adds to `squares`.
+    """
 
     samples: int
     total: np.ndarray
     squares: np.ndarray
+    fourths: np.ndarray | None = None
 
     @property
     def mean(self) -> np.ndarray:
@@ -96,10 +112,30 @@ class Sums:
         """Of the mean; infinite of a single sample, which tells nothing about it."""
         if self.samples < 2:
             return np.full_like(self.total, np.inf)
+        return np.sqrt(self._spread() / (self.samples * (self.samples - 1.0)))
+
+    @property
+    def alike(self) -> np.ndarray:
+        """Where all samples scored the same up to rounding: they do not tell how others would differ."""
+        return self._spread() <= _ALIKE * self.squares
+
+    @property
+    def doubt(self) -> np.ndarray:
+        """Relative standard error of `squares`, by how chunks differ; infinite where that cannot be told.
+
+        Where few samples carry the squares it is near 1, and the standard error of the mean worth little.
+        """
+        chunks = -(-self.samples // CHUNK)
+        if self.fourths is None or chunks < 2:
+            return np.full_like(self.total, np.inf)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            share = self.fourths / self.squares**2  # 1 over the chunks that carry them
+            return np.nan_to_num(np.sqrt(np.maximum(chunks * share - 1.0, 0.0) / (chunks - 1.0)), nan=np.inf)
+
+    def _spread(self) -> np.ndarray:
         with np.errstate(invalid="ignore", over="ignore"):
             spread = np.maximum(self.squares - self.total**2 / self.samples, 0.0)
-        spread = np.where(np.isnan(spread), np.inf, spread)  # of scores whose squares are beyond float32
-        return np.sqrt(spread / (self.samples * (self.samples - 1.0)))
+        return np.where(np.isnan(spread), np.inf, spread)  # of scores whose squares are beyond float32
 
 
 @dataclass(frozen=True)
@@ -157,19 +193,21 @@ class Walker:
         """
         steps = self.tables.device.upload(self.lengths.steps(self.estimator), np.uint32)
         shape = (len(pixels), b.columns)
-        total, squares = np.zeros(shape), np.zeros(shape)
-        for some in _pieces(len(pixels), max(1, _UNITS // -(-samples // CHUNK))):
+        total, squares, fourths = np.zeros((3, *shape))
+        units = max(1, min(_UNITS, self._walks() // CHUNK))
+        for some in _pieces(len(pixels), max(1, units // -(-samples // CHUNK))):
             place = self.tables.device.upload(pixels[some], np.uint32)
-            for part in _pieces(samples, _UNITS * CHUNK // place.size):
+            for part in _pieces(samples, max(CHUNK, units * CHUNK // place.size)):
                 bounds = (first + part.start, first + part.stop)
                 for offset, width in self._widths(b):
                     found = self._row_sums(b, place, bounds, stream, steps, offset, width)
                     here = (some, slice(offset, offset + width))
                     total[here] = _added(total[here], found[..., 0], found[..., 1])
                     squares[here] = _added(squares[here], found[..., 2], found[..., 3])
+                    fourths[here] = _added(fourths[here], _squared(found[..., 2:].sum(axis=-1)), 0.0)
                     self.watch()
         shape = (len(pixels), *b.shape[1:])
-        return Sums(samples, total.reshape(shape), squares.reshape(shape))
+        return Sums(samples, *(found.reshape(shape) for found in (total, squares, fourths)))
 
     def _widths(self, b: Array) -> list[tuple[int, int]]:
         """Launches of as many right-hand sides of each channel: (offset, width) pairs."""
@@ -204,7 +242,7 @@ class Walker:
         steps = device.upload(self.lengths.after_start().steps("endpoint"), np.uint32)
         total, squares = np.zeros(n), np.zeros(n)
         source = device.upload(np.array([n]), np.uint32)
-        for part in _pieces(samples, _RECORDS):
+        for part in _pieces(samples, max(1, min(_RECORDS, self._walks()))):
             count = part.stop - part.start
             ends, scores = device.empty((count,), np.uint32), device.empty((count,))
             tables = (source, self.tables.records, self.tables.entries, steps)
@@ -216,6 +254,10 @@ class Walker:
             squares += np.bincount(where, score**2, n)
             self.watch()
         return Sums(samples, total, squares)
+
+    def _walks(self) -> int:
+        """Of one launch, so that none takes long: whoever waits wants to hear that there is progress."""
+        return int(_STEPS * self.tables.device.compute_units / self.lengths.mean)
 
     def _launch(self, name: str, estimator: str, width: int, units: int, *arguments: object) -> None:
         how = self.launching or Launching.best(self.tables.device, units)
@@ -232,7 +274,12 @@ class Walker:
         kernel(-(-units // how.walks), how.group, units, *arguments)
 
 
-def _added(start: np.ndarray, sums: np.ndarray, low: np.ndarray) -> np.ndarray:
+def _squared(sums: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return sums.astype(np.float64) ** 2
+
+
+def _added(start: np.ndarray, sums: np.ndarray, low: np.ndarray | float) -> np.ndarray:
     """start + all chunks, (pixels, chunks, width), one after the other, so that no split changes a bit."""
     parts = sums.astype(np.float64) + low
     return np.add.accumulate(np.concatenate([start[:, None], parts], axis=1), axis=1)[:, -1]

@@ -5,8 +5,10 @@
 
 Each iteration draws fresh columns, so that noise of one is damped by those after it as light is. It costs
 `samples` loads a pixel in place of a row, and leaves the noise of the last product; final gather makes that
-product exactly. It converges in the mean where rho(R) < 1, as Jacobi does. The three S of a transport in
-colour draw the same columns (`ltcl.operators.links`).
+product exactly. It converges in the mean where rho(R) < 1, as Jacobi does. Its noise stays bounded with
+enough samples (`ltcl.theory.sampled_products`); with fewer it is refused. It has no standard error. The three
+S of a transport in colour draw the same columns (`ltcl.operators.links`), where the samples are enough for
+that: where they are not, or memory is not, each draws its own, and the reason is told.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ from ltcl.operators.walks import Walker, whole
 from ltcl.solvers import sampled
 from ltcl.solvers.sampled import Channel, Estimate
 from ltcl.solvers.stopping import System
+from ltcl.theory.sampled_products import least_samples
+from ltcl.theory.walks import second_moment_radius, second_moments
 
 
 @dataclass(frozen=True)
@@ -60,33 +64,52 @@ class Hybrid:
         if self.iterations is not None:
             checks.count("iterations", self.iterations)
         checks.one_of("sampler", self.sampler, SAMPLERS)
+        checks.flag("gather", self.gather)
 
     def estimate(self, channels: Sequence[Channel]) -> list[Estimate]:
         """The start plus what the iterations make of its residual r, begun at zero; columns are shared."""
         try:  # rows that overflow have no spectral radius either
             made, sign = sampled.tables_of(channels, self)
-        except MemoryLimitError as error:
+            count = max(self._iterations(one) for one in channels)
+            self._check_noise(channels, made)
+        except (InputError, MemoryLimitError) as error:
             if len(channels) == 1:
                 raise
-            why = str(error)
+            why = sampled.cause(error)
         else:
-            return self._iterate(channels, made, sign)
+            return self._iterate(channels, made, sign, count)
         return sampled.each_alone(self, channels, why)
 
-    def _iterate(self, channels: Sequence[Channel], made: Tables, sign: float) -> list[Estimate]:
-        count = max(self._iterations(one) for one in channels)
-        walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed)
-        start = sampled.side_by_side([one.r.get().astype(np.float64) for one in channels])
-        l, watch = start, sampled.watch(channels)
+    def _iterate(self, channels: Sequence[Channel], made: Tables, sign: float, count: int) -> list[Estimate]:
+        watch = sampled.watch(channels)
+        walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed, watch=watch)
+        l = start = sampled.side_by_side([one.r.get().astype(np.float64) for one in channels])
         for k in range(count):
             product = walker.rows(made.device.upload(l), np.arange(len(l)), 0, self.samples, stream=k)
-            l = start + product.mean
-            watch()
+            l = sampled.within_float32(start + product.mean)
         found = zip(channels, sampled.each(l, channels), strict=True)
         return [self._estimate(one.system, one.x.get() + l, count) for one, l in found]
 
-    def _estimate(self, system: System, x: np.ndarray, iterations: int) -> Estimate:
-        return Estimate(sampled.gathered(system, x) if self.gather else x, iterations=iterations)
+    def _check_noise(self, channels: Sequence[Channel], made: Tables) -> None:
+        """Refuse as few samples as let noise of a channel grow from product to product."""
+        Rs = [rows_of_R(one.system.S, self.name)[0] for one in channels]
+        if second_moment_radius(Rs[0], made) < 1.0:
+            return
+        if made.least is None:
+            each = zip(Rs, second_moments(Rs[0], made), strict=True)
+            made.least = max(least_samples(R, Q) for R, Q in each)
+        if not self.samples >= made.least:
+            least = f"{made.least:.0f} at least" if math.isfinite(made.least) else "more than can be told"
+            raise InputError(
+                f"samples is {self.samples}; over this R noise grows from one product to the next then: "
+                f"samples= must be {least}, or use method='chebyshev'"
+            )
+
+    def _estimate(self, system: System, x: np.ndarray, count: int) -> Estimate:
+        x = sampled.gathered(system, x) if self.gather else x
+        reason = f"Jacobi, {self.samples} columns of each row drawn in each of {count} iterations"
+        advice = "try more samples=" + ("" if self.gather else ", or gather=True")
+        return Estimate(x, iterations=count, reason=reason, advice=advice)
 
     def _iterations(self, channel: Channel) -> int:
         (R, _), rule = rows_of_R(channel.system.S, self.name), channel.rule

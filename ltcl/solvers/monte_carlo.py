@@ -12,12 +12,13 @@ adjoint form, each has walks of its own, and the reason is told.
 
 The series needs rho(|R|) < 1, and a finite variance some more (`ltcl.theory.walks`); elsewhere it is refused.
 ``series="chebyshev"`` samples a polynomial of finite degree instead, which converges for every albedo; its
-coefficients alternate and grow, and with them the noise, which the standard error tells.
+coefficients alternate and grow, and with them the noise, which `reason` foretells.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -25,21 +26,21 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ltcl import checks, theory
-from ltcl.device import Array
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.operators.alias import SAMPLERS, Tables, tables_of_columns
-from ltcl.operators.entrywise import rows_of_R, squares
+from ltcl.operators.alias import SAMPLERS, Tables, tables, tables_of_columns
+from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.walks import ESTIMATORS, Lengths, Sums, Walker, geometric, whole
-from ltcl.solvers import sampled
-from ltcl.solvers.polynomials import chebyshev_bias, chebyshev_coefficients, chebyshev_degree
+from ltcl.solvers import noise, sampled
+from ltcl.solvers.noise import Noise
+from ltcl.solvers.polynomials import bias_in_words, chebyshev_coefficients, chebyshev_degree
 from ltcl.solvers.sampled import Channel, Estimate
 from ltcl.solvers.stopping import System
-from ltcl.theory.walks import chance_to_go_on, second_moment_radius
+from ltcl.solvers.target_error import MOST, Measured, Staged, sample_to
+from ltcl.theory.walks import chance_to_go_on, noise_of_terms, second_moment_radius
 
-_MOST = 1 << 20  # samples of a pixel with a target error
-_PILOT = 256  # samples that tell how many are needed
-_PILOT_STREAM = 1
-Measured = tuple[np.ndarray, np.ndarray]  # estimates and their standard errors
+_HIGHEST = 10_000  # degree: walks are as long
+_LOUDEST = 2.0**63  # noise of a sample whose square float32 still holds
+_FEW = 0.1  # of the pixels lit: then walks from the light find more of it
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,15 @@ class MonteCarlo:
     Parameters
     ----------
     samples : int, optional
-        Of each pixel; 256 when not given. With `error` the most a pixel gets, 2^20 when not given. With
-        `adjoint` the mean of all pixels.
+        Of each pixel; 256 when not given. With `error` the most of a pixel in its last stage, 2^20 when not
+        given; the stages before take up to as many together. With `adjoint` the mean of all pixels.
     seed : int
         Below 2^64. The same seed gives the same bits on every device.
     pixels : (P,) integers, optional
         The pixels to estimate; x and its standard error are then (P,) or (P, k), in their order.
     error : float, optional
-        Standard error wanted of every value of x, in its units. As many samples as it needs, by a pilot.
+        Standard error wanted of every value of x, absolute, in its units; with `gather` of those before. As
+        many samples as it needs, see `ltcl.solvers.target_error`. How many pixels missed it is in `reason`.
     estimator : str, optional
         "collision": walks score at every step. "endpoint": where they end (eq. 26, the paper's).
     sampler : str
@@ -64,7 +66,8 @@ class MonteCarlo:
     albedo : float, optional
         m of eq. 24, in (0, 1/2); by default such that walks are as long as their variance asks for.
     adjoint : bool
-        Walks from b instead of from each pixel, for whole pictures with few lights: the end-point estimator.
+        Walks from b instead of from each pixel, for whole pictures with few lights: the end-point estimator
+        and alias tables, without `pixels` and `error`.
     gather : bool
         Final gather: one exact product at the end, b - R x.
     series : str
@@ -95,10 +98,12 @@ class MonteCarlo:
             checks.one_of("estimator", self.estimator, ESTIMATORS)
         checks.one_of("sampler", self.sampler, SAMPLERS)
         checks.one_of("series", self.series, ("neumann", "chebyshev"))
+        checks.flag("adjoint", self.adjoint)
+        checks.flag("gather", self.gather)
         if self.albedo is not None:
             chance_to_go_on(0.0, self.albedo)
         if self.degree is not None:
-            checks.count("degree", self.degree)
+            checks.count("degree", self.degree, most=_HIGHEST)
         self._refuse_together()
 
     def check(self, n: int) -> None:
@@ -119,11 +124,15 @@ class MonteCarlo:
         except (InputError, MemoryLimitError) as error:
             if len(channels) == 1:
                 raise
-            why = str(error).partition(";")[0]
+            why = sampled.cause(error)
         else:
-            rest, error = self._walk(channels, made, lengths)
-            found = zip(channels, sampled.each(rest, channels), sampled.each(error, channels), strict=True)
-            return [self._estimate(one, first, mean, error, reason) for one, mean, error in found]
+            rest = self._walk(channels, made, lengths)
+            parts = (sampled.each(values, channels) for values in (rest.mean, rest.standard_error))
+            found = [
+                self._estimate(one, first, mean, error, reason)
+                for one, mean, error in zip(channels, *parts, strict=True)
+            ]
+            return self._told(found, rest, channels)
         return sampled.each_alone(self, channels, why)
 
     def _tables(self, channels: Sequence[Channel]) -> tuple[Tables, float]:
@@ -140,7 +149,7 @@ class MonteCarlo:
         pixels = self._which(channel)
         x, r = (array.get()[pixels].astype(np.float64) for array in (channel.x, channel.r))
         found = Estimate(
-            _within_float32(x + first * r + rest), error, whole=self.pixels is None, reason=reason
+            sampled.within_float32(x + first * r + rest), error, whole=self.pixels is None, reason=reason
         )
         return self._gathered(channel.system, found) if self.gather else found
 
@@ -150,47 +159,103 @@ class MonteCarlo:
 
     def _lengths(self, channels: Sequence[Channel], made: Tables, sign: float) -> tuple[float, Lengths, str]:
         """c_0, the terms that walks estimate, and both in words."""
+        Rs = [rows_of_R(one.system.S, self.name)[0] for one in channels]
+        moments = second_moment_radius(Rs[0], made, self.adjoint)
         if self.series == "chebyshev":
             lowest, largest = zip(*(theory.free_bounds(one.system.S) for one in channels), strict=True)
-            bounds, rule = (min(lowest), max(largest)), channels[0].rule
-            degree = max(1, chebyshev_degree(rule.rtol, bounds)) if self.degree is None else self.degree
-            c = _within_float32(chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1))
-            bias = chebyshev_bias(degree, bounds)
-            reason = f"Chebyshev series of degree {degree}, which leaves {bias:.2g} of the residual"
-            return float(c[0]), whole(c[1:]), reason
-        R, _ = rows_of_R(channels[0].system.S, self.name)
-        q = chance_to_go_on(second_moment_radius(R, made, self.adjoint), self.albedo)
+            return self._polynomial((min(lowest), max(largest)), sign, channels[0].rule.rtol, moments)
+        own = self.sampler == "uniform" and len(Rs) == 1  # of walks that are shared each is tried next
+        if own and moments >= 1.0 > second_moment_radius(Rs[0], tables(Rs[0])):
+            raise InputError(
+                "walks by sampler='uniform' have no finite variance over this R: the second moments of their "
+                f"weights grow by {moments:.3g} a step, which must be below 1; use sampler='alias'"
+            )
+        q = chance_to_go_on(moments, self.albedo)
         return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}"
 
-    def _walk(self, channels: Sequence[Channel], made: Tables, lengths: Lengths) -> Measured:
-        """Estimates of the terms k >= 1 of channels side by side, and their standard errors."""
-        watch, pixels = sampled.watch(channels), self._which(channels[0])
-        host = sampled.side_by_side([one.r.get() for one in channels])
-        if self.adjoint:
-            return self._from_light(Walker(made, lengths, "endpoint", self.seed, watch=watch), host)
-        walker = Walker(made, lengths, self.estimator or "collision", self.seed, watch=watch)
-        r = made.device.upload(host)
-        if self.error is None:
-            return _measured(walker.rows(r, pixels, 0, self.samples or self.usual))
-        pilot = walker.rows(r, pixels, 0, _PILOT, _PILOT_STREAM)
-        # Samples of the pilot do not count: chosen by their own spread, they would be biased.
-        unit = np.stack([one.unit for one in channels], axis=-1).ravel()
-        wanted = _PILOT * (pilot.standard_error * unit / self.error) ** 2
-        return _each(walker, r, pixels, _rounded_up(wanted.max(axis=1), self.samples or _MOST))
+    def _polynomial(
+        self, bounds: tuple[float, float], sign: float, rtol: float, moments: float
+    ) -> tuple[float, Lengths, str]:
+        """That of Chebyshev, to the degree given, or to that of rtol where noise leaves anything of it."""
+        degree = max(1, chebyshev_degree(rtol, bounds)) if self.degree is None else self.degree
+        if degree > _HIGHEST:
+            raise InputError(
+                f"rtol is {rtol:g}, which takes a degree of {degree}; degree= must be at most {_HIGHEST}"
+            )
+        c = chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1)
+        most = self.samples or (self.usual if self.error is None else MOST)
+        noise = noise_of_terms(c, moments) / math.sqrt(most)
+        if self.degree is None and not noise < 1.0:
+            instead = "or use series='neumann'" if moments < 1.0 else "or use method='chebyshev'"
+            raise InputError(
+                f"samples is {most}; of the polynomial of degree {degree} that rtol={rtol:g} asks for they "
+                f"leave noise of about {noise:.2g} times b: give a lower degree=, more samples=, {instead}"
+            )
+        if not noise * math.sqrt(most) <= _LOUDEST:
+            raise InputError(
+                f"degree is {degree}; its terms over this R are beyond float32: lower degree=, or use "
+                "method='chebyshev'"
+            )
+        reason = f"Chebyshev series of degree {degree}, which leaves {bias_in_words(degree, bounds)}"
+        noisy = f"and noise of about {noise:.2g} times b with {most} samples"
+        return float(c[0]), whole(c[1:]), f"{reason}, {noisy}"
 
-    def _from_light(self, walker: Walker, r: np.ndarray) -> Measured:
-        mean, error = np.zeros(r.shape), np.zeros(r.shape)
+    def _walk(self, channels: Sequence[Channel], made: Tables, lengths: Lengths) -> Staged:
+        """Estimates of the terms k >= 1 of channels side by side, and their standard errors."""
+        pixels, light = self._which(channels[0]), [one.r.get() for one in channels]
+        estimator = "endpoint" if self.adjoint else self.estimator or "collision"
+        lit = [(rows_of_R(c.system.S, self.name)[0], r) for c, r in zip(channels, light, strict=True)]
+        measured = Noise(lit, made, lengths, only_dark=estimator == "endpoint").errors
+        walker = Walker(made, lengths, estimator, self.seed, watch=sampled.watch(channels))
+        host = sampled.side_by_side(light)
+        if self.adjoint:
+            return self._from_light(walker, host, measured)
+        r = made.device.upload(host)
+        if self.error is not None:
+            unit = np.stack([one.unit for one in channels], axis=-1).ravel()
+            return sample_to(walker, r, pixels, self.error / unit, self.samples or MOST, measured)
+        sums = walker.rows(r, pixels, 0, self.samples or self.usual)
+        return Staged.fixed(sums, measured(sums, pixels))
+
+    def _from_light(self, walker: Walker, r: np.ndarray, measured: Measured) -> Staged:
+        total, squares = np.zeros(r.shape), np.zeros(r.shape)
         for c, column in enumerate(r.T):
             walker.tables.append(walker.tables.device.upload(column))
-            mean[:, c], error[:, c] = _measured(walker.columns(0, self._count(len(r)), stream=c))
-        return mean, error
+            sums = walker.columns(0, self._count(len(r)), stream=c)
+            total[:, c], squares[:, c] = sums.total, sums.squares
+        sums = Sums(self._count(len(r)), total, squares)
+        return Staged.fixed(sums, measured(sums, np.arange(len(r))))
+
+    def _told(self, found: list[Estimate], rest: Staged, channels: Sequence[Channel]) -> list[Estimate]:
+        """Whether the error is as small as wanted, what was spent on it, and what to try next."""
+        gather = "" if self.gather or self.pixels is not None else ", or gather=True"
+        if self.error is None:
+            return [dataclasses.replace(one, advice=f"try more samples={gather}") for one in found]
+        met = rest.met | self.gather
+        for one, channel in zip(found, channels, strict=True):
+            assert one.standard_error is not None  # noqa: S101 - Monte Carlo always tells it
+            within = one.standard_error * channel.unit <= self.error
+            met = met & within.reshape(len(within), -1).all(axis=1)
+        what = rest.told(met, self.error, self.samples or MOST, "" if met.all() else self._instead(channels))
+        advice = f"try a smaller error={gather}" if self.pixels is None else ""
+        return [
+            dataclasses.replace(one, reason=f"{one.reason}; {what}", met=bool(met.all()), advice=advice)
+            for one in found
+        ]
 
     def _gathered(self, system: System, found: Estimate) -> Estimate:
         """Errors of the pixels are independent: their variances pass through the squares of R."""
         error, (R, _) = found.standard_error, rows_of_R(system.S, self.name)
         assert error is not None  # noqa: S101 - Monte Carlo always tells it
         x = sampled.gathered(system, found.x)
-        return dataclasses.replace(found, x=x, standard_error=np.sqrt(np.asarray(squares(R) @ error**2)))
+        return dataclasses.replace(found, x=x, standard_error=noise.gathered(R, error))
+
+    def _instead(self, channels: Sequence[Channel]) -> str:
+        """What to try where the error was missed."""
+        lit = np.mean(sampled.side_by_side([one.r.get() for one in channels]).any(axis=1))
+        if lit <= _FEW and self.pixels is None and (self.series, self.sampler) == ("neumann", "alias"):
+            return "adjoint=True suits few lights"
+        return "allow a larger error=" if self.samples is None else "allow more samples="
 
     def _count(self, n: int) -> int:
         return n * (self.samples or self.usual)
@@ -213,39 +278,13 @@ class MonteCarlo:
             raise InputTypeError("adjoint=True has estimator='endpoint' and sampler='alias'; leave them out")
 
 
-def _within_float32(values: np.ndarray) -> np.ndarray:
-    """Coefficients or estimates of a polynomial of too high a degree are infinite, or NaN."""
-    if not np.all(np.abs(values) <= np.finfo(np.float32).max):
-        raise InputError(
-            "the terms of this series are beyond float32; lower degree=, or use method='chebyshev'"
-        )
-    return values
-
-
 def _pixels(pixels: Any, n: int) -> np.ndarray:
-    array = np.asarray(pixels)
-    if array.ndim != 1 or array.size == 0 or array.dtype.kind not in "iu":
+    array = checks.real("pixels", pixels)
+    if array.size == 0:
+        raise InputError("pixels is empty; it must hold at least one, or be left out for all")
+    if array.ndim != 1 or array.dtype.kind not in "iu":
         raise InputError(f"pixels has shape {array.shape} of {array.dtype}; it must be (P,) whole numbers")
     worst = int(array.min() if array.min() < 0 else array.max())
     if not 0 <= worst < n:
         raise InputError(f"pixels holds {worst}; they must be in 0..{n - 1}")
     return array.astype(np.int64)
-
-
-def _rounded_up(wanted: np.ndarray, most: int) -> np.ndarray:
-    """Powers of two, so that pixels of like need share a launch, within 2 .. most."""
-    powers = 2.0 ** np.ceil(np.log2(np.clip(wanted, 2.0, most)))
-    return np.minimum(powers, most).astype(np.int64)
-
-
-def _each(walker: Walker, r: Array, pixels: np.ndarray, counts: np.ndarray) -> Measured:
-    """Pixels with counts of samples of their own."""
-    mean, error = np.zeros((2, len(pixels), r.columns))
-    for count in np.unique(counts):
-        here = counts == count
-        mean[here], error[here] = _measured(walker.rows(r, pixels[here], 0, int(count)))
-    return mean, error
-
-
-def _measured(sums: Sums) -> Measured:
-    return sums.mean, sums.standard_error

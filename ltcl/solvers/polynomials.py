@@ -7,36 +7,44 @@ import math
 
 import numpy as np
 
+from ltcl.errors import InputError
+
 
 def chebyshev_coefficients(degree: int, bounds: tuple[float, float]) -> np.ndarray:
     """c_0 .. c_degree of p(R) = sum c_k R^k near (I + R)^-1 for a spectrum of S = I + R within `bounds`.
 
     It is the iterate after degree + 1 steps from zero: Saad, Iterative Methods for Sparse Linear Systems, 2nd
-    ed., algorithm 12.1, carried out on the coefficients.
+    ed., algorithm 12.1, carried out on the coefficients. Refused as soon as one is beyond float32.
 
     >>> chebyshev_coefficients(0, (0.5, 1.5)).tolist()
     [1.0]
     """
     centre, radius, sigma = _interval(bounds)
-    x, r = np.zeros(degree + 1), np.zeros(degree + 2)
-    r[0], rho = 1.0, 1.0 / sigma
-    d = r[:-1] / centre
-    for _ in range(degree + 1):
-        x += d
+    x, rho = np.zeros(0), 1.0 / sigma
+    d = np.array([1.0 / centre])
+    for k in range(degree + 1):
+        x = np.append(x, 0.0) + d
+        if not np.all(np.abs(x) <= np.finfo(np.float32).max):
+            raise InputError(
+                f"degree is {degree}; over a spectrum within {_shown(bounds)} coefficients are beyond "
+                f"float32 from degree {k} on: lower degree=, or use method='chebyshev'"
+            )
         r = -np.append(x, 0.0) - np.append(0.0, x)  # 1 - (1 + R) x
         r[0] += 1.0
         previous, rho = rho, 1.0 / (2.0 * sigma - rho)
-        d = 2.0 * rho / radius * r[:-1] + rho * previous * d
+        d = 2.0 * rho / radius * r + rho * previous * np.append(d, 0.0)
     return x
 
 
 def chebyshev_bias(degree: int, bounds: tuple[float, float]) -> float:
     """The largest relative residual p leaves, 1 / T_(degree + 1)(centre / radius), where S is self-adjoint.
 
+    Of any other S it is the largest share that p leaves of an eigenvector, if its spectrum is real.
+
     >>> round(chebyshev_bias(0, (0.5, 1.5)), 9)
     0.5
     """
-    return 1.0 / math.cosh((degree + 1) * math.acosh(_interval(bounds)[2]))
+    return 1.0 / math.cosh(min((degree + 1) * math.acosh(_interval(bounds)[2]), 700.0))
 
 
 def chebyshev_degree(rtol: float, bounds: tuple[float, float]) -> int:
@@ -54,4 +62,19 @@ def _interval(bounds: tuple[float, float]) -> tuple[float, float, float]:
     lower, upper = bounds
     centre = (upper + lower) / 2.0
     radius = max((upper - lower) / 2.0, 1e-6 * centre)
-    return centre, radius, centre / radius
+    sigma = centre / radius if math.isfinite(centre) else 1.0
+    if not sigma > 1.0:
+        raise InputError(
+            f"the spectrum of S is bounded by {_shown(bounds)}, too wide for a polynomial; rescale S"
+        )
+    return centre, radius, sigma
+
+
+def bias_in_words(degree: int, bounds: tuple[float, float]) -> str:
+    """What p leaves, and on what that rests."""
+    bias = chebyshev_bias(degree, bounds)
+    return f"{bias:.2g} of a residual, if the spectrum of S is real and within {_shown(bounds)}"
+
+
+def _shown(bounds: tuple[float, float]) -> str:
+    return f"[{bounds[0]:.3g}, {bounds[1]:.3g}]"

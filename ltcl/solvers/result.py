@@ -29,10 +29,7 @@ class Status(enum.Enum):
         "the method has no next step here, not even started anew; "
         "try method='gmres', 'cg' with normal=True, or 'direct'"
     )
-    SAMPLED = (
-        "the samples are spent, what is left is noise, told by .standard_error; try more "
-        "samples=, or gather=True"
-    )
+    SAMPLED = "the samples are spent, what is left is noise; .reason tells what to try next"
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
@@ -61,7 +58,8 @@ class Solution:
     Attributes
     ----------
     x : like b, float32 (float64 of method "direct", and of values beyond float32)
-        The solution; where `converged` is False, the iterate with the smallest residual.
+        The solution; where `converged` is False, the iterate with the smallest residual, or what was sampled.
+        Of `pixels=` (P,) or (P, k), in their order; of three S (3, P) or (3, P, k).
     status : Status
     iterations : int
     products : int
@@ -79,7 +77,10 @@ class Solution:
         Residual of the best iterate; the least of `residuals` when not given. Residuals that gmres foresees
         are no iterate's.
     standard_error : like x, optional
-        Of a method that samples, where it knows it.
+        Of "monte_carlo": of the noise, without the bias of a polynomial. 0 only where there is none for
+        certain; NaN where it is unknown, since no walk has found light, or all scored alike. It is itself an
+        estimate, good from some 30 samples on: x is within 1.96 of it 95 times in 100 then, of 8 samples
+        about 91 times, of 2 about 70.
     """
 
     x: np.ndarray
@@ -100,7 +101,7 @@ class Solution:
 
     @property
     def residual(self) -> float:
-        """The relative residual of `x`."""
+        """The relative residual of `x`; infinite of some pixels alone, which have none."""
         finite = [value for value in self.residuals if np.isfinite(value)]
         if self.converged or not finite:
             return finite[-1] if finite else float("inf")
@@ -111,17 +112,20 @@ class Solution:
         residual = f"{best:.2g}"
         if np.isnan(last) and self.status is Status.SAMPLED:
             residual = "unknown of some pixels alone"
-        if last > best:
+        elif last > best:
             residual += f" at best and {last:.2g} at the end"
+        why = _advice(self.status, self.method)
+        if self.status is Status.SAMPLED and self.reason:
+            why = f"{why.partition(';')[0]}: {self.reason}"
         return (
             f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, "
-            f"{self.products} products, relative residual {residual}: {_advice(self.status, self.method)}"
+            f"{self.products} products, relative residual {residual}: {why}"
         )
 
 
 def joined(channels: Sequence[Solution]) -> Solution:
     """One solution of what was sampled together, x (3, N) or (3, N, k)."""
-    first = channels[0]
+    first, reasons = channels[0], [part for one in channels for part in one.reason.split("; ")]
     errors = [one.standard_error for one in channels if one.standard_error is not None]
     return dataclasses.replace(
         first,
@@ -129,6 +133,7 @@ def joined(channels: Sequence[Solution]) -> Solution:
         status=Status.CONVERGED if all(one.converged for one in channels) else Status.SAMPLED,
         products=sum(one.products for one in channels),
         residuals=tuple(map(max, zip(*(one.residuals for one in channels), strict=True))),
-        reason="; ".join(dict.fromkeys(one.reason for one in channels if one.reason)),
+        reason="; ".join(dict.fromkeys(filter(None, reasons))),  # what all have in common once
+        lowest=max(one.residual for one in channels),
         standard_error=np.stack(errors) if errors else None,
     )

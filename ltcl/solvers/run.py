@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -87,17 +87,21 @@ def run(method: Any, given: Problem) -> Solution:
 
 
 def sample(method: MonteCarlo | Hybrid, channels: Sequence[Problem]) -> list[Solution]:
-    """A method that samples, on colour channels of one size at once; one solution a channel."""
-    begun = [_begin(given) for given in channels]
+    """A method that samples, on colour channels of one size at once; one solution a channel.
+
+    The numbers that the callback hears ascend through all of them.
+    """
+    told = sampled.numbered(channels[0].rule.callback)
+    begun = [_begin(given, told) for given in channels]
     return [
         sampled.solution(method, one, found, functools.partial(units.restored, unit=one.unit))
         for one, found in zip(begun, method.estimate(begun), strict=True)
     ]
 
 
-def _begin(given: Problem) -> Channel:
+def _begin(given: Problem, callback: Callable[[int, float], object] | None) -> Channel:
     light, guess, rule, unit = _uploaded(given)
-    system = System(given.S, light)
+    system, rule = System(given.S, light), dataclasses.replace(rule, callback=callback)
     return Channel(system, *coefficients.start(system, guess), rule, unit)
 
 

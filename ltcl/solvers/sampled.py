@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, vectors
-from ltcl.errors import InputError, InputTypeError
+from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.operators.alias import Tables, tables
 from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.links import links
@@ -45,7 +46,7 @@ class Estimate:
     """What a method found, in the units of `system.b`, float64; standard errors where it knows them.
 
     `x` is (N,) or (N, k), or (P,) or (P, k) where it is of some pixels only and has no residual. `reason`
-    tells what was sampled.
+    tells what was sampled, `met` whether the error that was asked for is, `advice` what else to try.
     """
 
     x: np.ndarray
@@ -53,6 +54,8 @@ class Estimate:
     iterations: int = 1
     whole: bool = True
     reason: str = ""
+    met: bool = True
+    advice: str = ""
 
 
 def solution(
@@ -65,16 +68,18 @@ def solution(
         relative, met = _residual(system, gathered(system, found.x, add=False), rule)
     if rule.callback is not None and found.whole:
         rule.callback(found.iterations, relative)
-    error = found.standard_error
+    error, converged = found.standard_error, met and found.met
+    advice = found.advice if found.met and not converged else ""
     return Solution(
         in_units(found.x),
-        Status.CONVERGED if met else Status.SAMPLED,
+        Status.CONVERGED if converged else Status.SAMPLED,
         found.iterations,
         system.products,
         (1.0, relative) if found.whole else (np.nan,),
         0.0,
         method.name,
-        found.reason,
+        "; ".join(filter(None, (found.reason, advice))),
+        lowest=relative if np.isfinite(relative) else np.inf,  # of x, be it worse than the start
         standard_error=None if error is None else in_units(error),
     )
 
@@ -95,6 +100,18 @@ def each_alone(method: Any, channels: Sequence[Channel], why: str) -> list[Estim
     return [dataclasses.replace(one, reason="; ".join(filter(None, (one.reason, why)))) for one in found]
 
 
+def cause(error: LtclError) -> str:
+    """Why walks were refused, without the advice behind the last semicolon.
+
+    >>> cause(InputError("albedo is 0.45; their variance is infinite; leave albedo out"))
+    'albedo is 0.45; their variance is infinite'
+    >>> cause(InputError("samples is 3; noise grows: samples= must be 5 at least"))
+    'samples is 3; noise grows: samples= must be 5 at least'
+    """
+    *said, _ = str(error).split("; ")
+    return "; ".join(said) if said and not re.fullmatch(r"\w+ is \S+", said[-1]) else str(error)
+
+
 def side_by_side(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """(N,) or (N, k) of each channel as the right-hand sides of walks that they share.
 
@@ -108,6 +125,12 @@ def each(found: np.ndarray, channels: Sequence[Channel]) -> list[np.ndarray]:
     """What was `side_by_side`, of some pixels, one array a channel."""
     columns = channels[0].r.shape[1:]
     return list(np.moveaxis(found.reshape(len(found), *columns, len(channels)), -1, 0))
+
+
+def numbered(callback: Callable[[int, float], object] | None) -> Callable[[int, float], object] | None:
+    """A callback that is told of its calls in order, 0, 1, ...: of steps, and of what they made."""
+    calls = itertools.count()
+    return None if callback is None else lambda _, residual: callback(next(calls), residual)
 
 
 def watch(channels: Sequence[Channel]) -> Callable[[], object]:
@@ -131,6 +154,13 @@ def _residual(system: System, r: np.ndarray, rule: Rule) -> tuple[float, bool]:
     norms, left = vectors.norm(system.b), np.linalg.norm(r, axis=0)
     relative = float(np.max(left / np.where(norms > 0, norms, 1.0)))
     return relative, bool(np.all(left <= np.maximum(rule.rtol * norms, rule.atol)))
+
+
+def within_float32(estimates: np.ndarray) -> np.ndarray:
+    """Return what was sampled; refuse what has grown beyond float32, or is NaN."""
+    if not np.all(np.abs(estimates) <= np.finfo(np.float32).max):
+        raise InputError("what was sampled has grown beyond float32; rescale, or use method='chebyshev'")
+    return estimates
 
 
 def check_whole(options: dict[str, Any]) -> None:

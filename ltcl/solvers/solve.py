@@ -101,6 +101,7 @@ def solve(
     Returns
     -------
     Solution
+        x is like b; of ``pixels=`` (P,) or (P, k), with an infinite `residual`, which nobody knows then.
 
     Raises
     ------
@@ -135,15 +136,19 @@ def solve(
     gmres                 restart: directions of a cycle; 20
     bicgstab              none
     monte_carlo           samples: walks of each pixel; 256. seed: below 2^64; 0
-    |                     pixels: (P,) of them to estimate; all. error: standard error wanted
+    |                     pixels: (P,) of them to estimate; all. error: standard error wanted,
+    |                     in units of x; the last samples of a pixel are then at most 2^20
     |                     estimator: "collision" or "endpoint". sampler: "alias", "uniform", "cdf"
-    |                     albedo: m of eq. 24. adjoint: walks from b; False
+    |                     albedo: m of eq. 24. adjoint: walks from b, without pixels, error,
+    |                     sampler and estimator="collision"; False
     |                     gather: one exact product at the end; False
     |                     series: "neumann" or "chebyshev". degree: of the latter
     hybrid                samples: columns of each row; 32. seed, sampler, gather: as above
     |                     iterations: of Jacobi; those that rtol asks for
     direct, auto          none
     ====================  =======================================================================
+
+    Right-hand sides share the random walks of monte_carlo; hybrid has no standard error.
 
     Examples
     --------

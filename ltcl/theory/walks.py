@@ -14,6 +14,7 @@ and the mean exists: by Cauchy and Schwarz rho(|R|)^2 <= q rho(Q).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -67,9 +68,13 @@ def second_moment_radius(R: CSR | Dense, made: Tables, columns: bool = False) ->
     0.25
     """
     if made.radius is None:
-        moments = made.second_moments() if isinstance(made, Links) else [SecondMoments(R, made, columns)]
-        made.radius = float(np.max([spectral_radius(Q).value for Q in moments]))
+        made.radius = float(np.max([spectral_radius(Q).value for Q in second_moments(R, made, columns)]))
     return made.radius
+
+
+def second_moments(R: CSR | Dense, made: Tables, columns: bool = False) -> Iterable[Operator]:
+    """q Q, of `Links` that of each channel, for which R is not looked at. See `SecondMoments`."""
+    return made.second_moments() if isinstance(made, Links) else [SecondMoments(R, made, columns)]
 
 
 def chance_to_go_on(radius: float, albedo: float | None) -> float:
@@ -97,21 +102,39 @@ def chance_to_go_on(radius: float, albedo: float | None) -> float:
         q = max(math.sqrt(radius), _SHORTEST)
         if not q < _LONGEST:  # NaN neither, where moments overflow
             raise InputError(
-                "walks over R have no finite variance: the second moments of their weights grow by "
-                f"{radius:.3g} a step, which must be below 1; use series='chebyshev' or method='chebyshev'"
+                "walks over R have no finite variance: the second moments of their weights "
+                f"{_growth(radius)}, which must be below 1; use series='chebyshev' or method='chebyshev'"
             )
         return q
     m = checks.number("albedo", albedo, above=0.0)
     if m >= 0.5 or m / (1.0 - m) > _LONGEST:
         raise InputError(
-            f"albedo is {m:g}; walks go on with chance m / (1 - m) (eq. 24), so they need m below 1/2: "
-            "from there on use series='chebyshev' or method='chebyshev'"
+            f"albedo is {m:.12g}; walks go on with chance m / (1 - m) (eq. 24), so they need m below 1/2, at "
+            f"most {_LONGEST / (1.0 + _LONGEST):.6g}: beyond use series='chebyshev' or method='chebyshev'"
         )
     q = m / (1.0 - m)
     if not radius < q:
         least = f"below {radius / (1.0 + radius):.3g}" if radius < 1.0 else "whatever it is"
         raise InputError(
             f"albedo is {m:g}; over this R the variance of walks is infinite {least}: the second moments of "
-            f"weights grow by {radius / q:.3g} a step; leave albedo out, or use series='chebyshev'"
+            f"weights {_growth(radius / q)}; leave albedo out, or use series='chebyshev'"
         )
     return q
+
+
+def _growth(radius: float) -> str:
+    return f"grow by {radius:.3g} a step" if math.isfinite(radius) else "overflow float32 in one step"
+
+
+def noise_of_terms(coefficients: np.ndarray, radius: float) -> float:
+    """About the noise of one sample of sum c_k R^k b, k >= 1, all walks of one length, in units of b.
+
+    The root of the sum of c_k^2 Q^k, as if what a walk meets at its steps were independent.
+
+    >>> noise_of_terms(np.array([1.0, 3.0, 4.0]), 1.0)
+    5.0
+    """
+    k = np.arange(1, len(coefficients))
+    with np.errstate(over="ignore", invalid="ignore"):
+        squares = np.asarray(coefficients[1:], np.float64) ** 2 * radius**k
+        return float(np.sqrt(np.sum(squares)))

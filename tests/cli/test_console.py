@@ -120,3 +120,19 @@ def test_frames_of_unknown_number(
         progress(0, None)
         progress(3, None)
     assert capsys.readouterr().err.splitlines() == ["ltcl: 0 frames", "ltcl: 3 frames, 3.0 a second"]
+
+
+def test_without_a_terminal_long_solves_say_how_far_they_are(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    with console.Steps(1) as steps:
+        steps.item("a.png")
+        step = steps.solve(1e-2)
+        for iteration in range(80):
+            step(iteration, float("nan"))
+            clock[0] += 0.125
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "ltcl: a.png: sampling, step 16"
+    assert lines[1:] == [f"ltcl: a.png: sampling, step {n}" for n in range(24, 80, 8)]

@@ -127,3 +127,11 @@ def test_colours_share_their_walks(device, monkeypatch, mixing, gain):
 def test_some_pixels_alone_are_no_picture(T, task):
     with pytest.raises(InputTypeError, match=r"pixels= gives some pixels alone; a picture needs all"):
         task(T, np.ones(GRID), method="monte_carlo", pixels=[1, 2])
+
+
+@pytest.mark.parametrize("option", ["samples", "seed"])
+def test_methods_that_do_not_sample_say_so(T, option):
+    says = f"unknown option '{option}': method 'jacobi' does not sample; monte_carlo and hybrid do"
+    given: dict[str, Any] = {option: 3}
+    with pytest.raises(InputTypeError, match=says):
+        ltcl.compensate(T, np.full(T.grid, 0.2), method="jacobi", **given)

@@ -246,3 +246,40 @@ def test_no_digits_are_lost_in_ten_million_samples(device):
     assert found.mean[0] == pytest.approx(float(R[0, 0]), rel=1e-13)
     # Squares are rounded to float32: a spread below sqrt(2^-24) of the mean looks as large as that.
     assert found.standard_error[0] <= 2.0**-12 * 0.1 / 10_000_000**0.5
+
+
+@pytest.mark.parametrize("m", [0.2, 0.4999])
+def test_no_launch_is_long(device, monkeypatch, m):
+    """By steps of its walks in the mean, for each compute unit, whatever the samples or their length."""
+    R = gallery.bounces(5, 0.1)
+    lengths, launched = geometric(m / (1 - m), -1.0), []
+    assert lengths.mean == pytest.approx((1 - m) / (1 - 2 * m), rel=1e-3)
+    monkeypatch.setattr("ltcl.operators.walks._STEPS", 1 << 12)
+    walker = Walker(tables(Dense(device, R)), lengths, "collision", SEED)
+    wanted = walker.rows(device.upload(np.ones(5)), np.arange(5), 0, 640)
+    monkeypatch.setattr(Walker, "_launch", _counting(launched, Walker._launch))
+    same(walker.rows(device.upload(np.ones(5)), np.arange(5), 0, 640), wanted.total, wanted.squares)
+    longest = max(launched) * CHUNK * lengths.mean
+    assert longest <= max((1 << 12) * device.compute_units, CHUNK * lengths.mean)
+    assert sum(launched) == 50
+
+
+def _counting(launched, launch):
+    def spy(self, name, estimator, width, units, *rest):
+        launched.append(units)
+        launch(self, name, estimator, width, units, *rest)
+
+    return spy
+
+
+def test_doubt_is_how_far_the_sum_of_squares_is_off(device):
+    """Relative standard deviation of it over many runs, of skewed scores."""
+    R = gallery.bounces(17, 0.6)
+    b = np.where(np.arange(17) == 3, 1.0, 0.0)
+    walks = [Walker(tables(Dense(device, R)), geometric(0.6, -1.0), "collision", s) for s in range(60)]
+    found = [walk.rows(device.upload(b), np.arange(17), 0, 64 * CHUNK) for walk in walks]
+    sums = np.stack([one.squares for one in found])
+    spread = sums.std(axis=0, ddof=1) / sums.mean(axis=0)
+    told = np.sqrt(np.mean([one.doubt**2 for one in found], axis=0))
+    assert np.sqrt(np.mean((told / spread) ** 2)) == pytest.approx(1.0, abs=0.25)
+    assert np.isinf(walks[0].rows(device.upload(b), np.arange(17), 0, CHUNK).doubt).all()

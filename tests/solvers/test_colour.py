@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,14 @@ def _apart() -> list[np.ndarray]:
     for c, R in enumerate(found):
         R[[c, 9 + c, 42]] = 0
     return found
+
+
+def _lit_apart(row: float) -> list[np.ndarray]:
+    """Channels lit from places of their own: of shared steps the second moments are three times as large."""
+    Rs = [np.zeros((N, N)) for _ in range(3)]
+    for c, R in enumerate(Rs):
+        R[:, 10 * c : 10 * c + 10] = row / 10
+    return Rs
 
 
 # R of S = I + sign R.
@@ -197,7 +206,8 @@ def test_the_callback_hears_of_three_beginnings_and_ends(device, method):
     S, _ = systems(device, "scenes")
     seen: list[tuple[int, float]] = []
     found = ltcl.solve(S, pictures(), method, samples=16, callback=lambda *step: seen.append(step))
-    assert seen[:3] == [(0, 1.0)] * 3
+    assert seen[:3] == [(0, 1.0), (1, 1.0), (2, 1.0)]
+    assert [number for number, _ in seen] == list(range(len(seen)))
     assert all(np.isnan(value) for _, value in seen[3:-3])
     assert len(seen) == 6 + found.iterations
     assert max(value for _, value in seen[-3:]) == found.residual
@@ -227,12 +237,8 @@ def test_hybrid_converges_to_every_channel(device):
 
 
 def test_where_shared_walks_have_no_variance_channels_have_their_own(device, launched):
-    """Channels lit from places of their own: row sums of 0.8, moments of up to three times their square."""
-    Rs = []
-    for c in range(3):
-        R = np.zeros((N, N))
-        R[:, 10 * c : 10 * c + 10] = 0.08
-        Rs.append(R)
+    """Row sums of 0.8, moments of up to three times their square."""
+    Rs = _lit_apart(0.8)
     S, b = tuple(IdentityPlus(Dense(device, R)) for R in Rs), pictures()
     found = ltcl.solve(S, b, "monte_carlo", samples=4000)
     assert [columns for _, columns, _ in launched] == [1, 1, 1]
@@ -257,6 +263,97 @@ def test_walks_from_b_are_of_one_channel(device, launched):
     found = ltcl.solve(S, pictures(), "monte_carlo", samples=64, adjoint=True)
     assert [name for name, _, _ in launched] == ["walk_columns"] * 3
     assert "channels share no walks: those from b are of one channel" in found.reason
+
+
+def test_certain_is_what_a_channel_has_no_noise_of(device):
+    """Of two rooms one is lit, and green alone passes the wall: walks go through it, red and blue do not."""
+    rooms = np.zeros((40, 40))
+    rooms[:20, :20] = rooms[20:, 20:] = lambertian(20, 0.5).R
+    S = tuple(np.eye(40) + R for R in (rooms, lambertian(40, 0.5).R, 0.5 * rooms))
+    b = np.stack([np.where(np.arange(40) < 20, 1.0, 0.0)] * 3)
+    S = tuple(IdentityPlus(Dense(device, one - np.eye(40))) for one in S)
+    tried: list[dict[str, Any]] = [{}, {"error": 0.01}, {"estimator": "endpoint"}, {"gather": True}]
+    for options in [*tried, {"series": "chebyshev", "degree": 4}]:
+        found = ltcl.solve(S, b, "monte_carlo", **options)
+        assert "share no walks" not in found.reason
+        assert not error_of(found)[[0, 2], 20:].any()
+        assert not found.x[[0, 2], 20:].any()
+        assert np.all(error_of(found)[[0, 2], :20] > 0)
+        assert np.all(error_of(found)[1] > 0)
+
+
+def test_the_choices_of_shared_rows_are_noise_of_a_channel_that_has_none_alone(device):
+    Rs = np.zeros((3, 3, 3))
+    Rs[0, 0, 1] = Rs[1, 0, 2] = 0.5
+    Rs[1, 1, 2] = 0.5
+    S = tuple(IdentityPlus(CSR(device, scipy.sparse.csr_array(R))) for R in Rs)
+    found = ltcl.solve(S, np.ones((3, 3)), "monte_carlo", samples=4000)
+    noisy = np.array([[True, False, False], [True, False, False], [False, False, False]])
+    np.testing.assert_array_equal(error_of(found) > 0, noisy)
+    exact = np.array([[0.5, 1, 1], [0.5, 0.5, 1], [1, 1, 1]])
+    assert np.all(np.abs(found.x - exact) <= 4 * error_of(found))
+    alone = ltcl.solve(S[0], np.ones(3), "monte_carlo", samples=4000)
+    assert not error_of(alone).any()
+
+
+def test_an_error_is_met_where_each_channel_has_one_light(device):
+    """By all of x of a pixel: the channel that finds its light last asks for the samples."""
+    S, dense = systems(device, "scenes")
+    b = np.zeros((3, N))
+    b[[0, 1, 2], [4, 17, 30]] = 1.0
+    found = ltcl.solve(S, b, "monte_carlo", error=2e-3)
+    off = np.abs(found.x - solved(dense, b))
+    assert np.all((error_of(found) > 0) & (error_of(found) <= 2e-3))
+    assert off.max() <= 5 * 2e-3
+    assert np.mean(off <= 1.96 * error_of(found)) > 0.88
+    assert found.reason.count("error=0.002 met by ") == 1
+    missed = ltcl.solve(S, b, "monte_carlo", error=1e-9, samples=600, rtol=0.9)
+    assert missed.status is Status.SAMPLED
+    assert missed.reason.count("43 of 43 pixels missed error=1e-09 within 600 samples") == 1
+    unknown = error_of(ltcl.solve(S, b, "monte_carlo", samples=2))
+    assert np.isnan(unknown).any()
+    assert not np.any(unknown == 0.0)
+
+
+def test_the_residual_is_the_largest_even_where_noise_exceeds_b(device):
+    strengths = (0.5, -0.999, 0.3)
+    S = tuple(IdentityPlus(Dense(device, np.full((4, 4), strength / 4))) for strength in strengths)
+    found = ltcl.solve(S, np.ones((3, 4)), "monte_carlo")
+    dense = [np.eye(4) + strength / 4 for strength in strengths]
+    largest = max(residual(*one) for one in zip(dense, found.x, np.ones((3, 4)), strict=True))
+    assert found.residual == pytest.approx(largest, rel=1e-3)
+    assert found.residual == found.residuals[-1] > 1.0
+    assert "at best" not in str(found)
+
+
+def test_where_noise_of_shared_walks_drowns_a_polynomial_channels_have_their_own(device):
+    S, b = tuple(IdentityPlus(Dense(device, R)) for R in _lit_apart(0.9)), pictures()
+    options: dict[str, Any] = {"series": "chebyshev", "rtol": 0.05, "samples": 12}
+    found = ltcl.solve(S, b, "monte_carlo", **options)
+    assert "channels share no walks: samples is 12; of the polynomial of degree" in found.reason
+    np.testing.assert_array_equal(found.x[1], ltcl.solve(S[1], b[1], "monte_carlo", **options).x)
+
+
+def test_where_samples_are_too_few_for_shared_columns_channels_draw_their_own(device):
+    """Signed light: noise of shared columns grows with a few samples more than that of a channel's own."""
+    Rs = [np.random.default_rng(seed).standard_normal((N, N)) for seed in range(3)]
+    Rs = [R * (0.75 / np.abs(np.linalg.eigvals(R)).max()) for R in Rs]
+    S, b = tuple(IdentityPlus(Dense(device, R)) for R in Rs), pictures()
+    alone = []
+    for one, light in zip(S, b, strict=True):
+        with pytest.raises(InputError, match="noise grows") as caught:
+            ltcl.solve(one, light, "hybrid", samples=1)
+        alone.append(int(re.findall(r"samples= must be (\d+) at least", str(caught.value))[0]))
+    found = ltcl.solve(S, b, "hybrid", samples=max(alone))
+    why = re.search(
+        rf"channels share no walks: samples is {max(alone)}; .* samples= must be (\d+) at", found.reason
+    )
+    assert why is not None
+    own = ltcl.solve(S[2], b[2], "hybrid", samples=max(alone))
+    np.testing.assert_array_equal(found.x[2], own.x)
+    shared = ltcl.solve(S, b, "hybrid", samples=int(why[1]), iterations=200)
+    assert "share no walks" not in shared.reason
+    assert np.isfinite(shared.x).all()
 
 
 def test_what_no_channel_can_do_alone_is_refused(device):

@@ -10,7 +10,7 @@ import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl.errors import InputError
+from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import CSR, Dense, IdentityPlus
 from ltcl.solvers import Status
 from tests import gallery
@@ -95,7 +95,7 @@ def test_iterations_are_those_of_jacobi_and_never_above_maxiter(device):
 def test_iterations_tell_the_callback(device):
     seen: list[tuple[int, float]] = []
     found = ltcl.solve(SCENE.S, np.ones(43), "hybrid", iterations=2, callback=lambda *step: seen.append(step))
-    np.testing.assert_array_equal(seen, [(0, 1.0), (1, np.nan), (2, np.nan), (2, found.residual)])
+    np.testing.assert_array_equal(seen, [(0, 1.0), (1, np.nan), (2, np.nan), (3, found.residual)])
 
 
 @pytest.mark.parametrize(
@@ -106,10 +106,11 @@ def test_iterations_tell_the_callback(device):
         ({"seed": 1 << 64}, "it must be below 2"),
         ({"iterations": 0}, "iterations is 0"),
         ({"sampler": "none"}, "sampler is 'none'"),
+        ({"gather": 1}, "gather is 1; it must be True or False"),
     ],
 )
 def test_bad_options_are_refused_in_one_line(device, options, says):
-    with pytest.raises(InputError, match=says) as caught:
+    with pytest.raises((InputError, InputTypeError), match=says) as caught:
         ltcl.solve(SCENE.S, np.ones(43), "hybrid", **options)
     assert "\n" not in str(caught.value)
 

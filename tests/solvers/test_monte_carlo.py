@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,8 @@ def test_the_mean_of_many_runs_is_the_solution(device, name, variant):
     exact = np.linalg.solve(dense, b.astype(float))
     runs = [ltcl.solve(S, b, "monte_carlo", samples=256, seed=s, **VARIANTS[variant]) for s in range(24)]
     x = np.stack([run.x for run in runs]).astype(float)
-    error = np.sqrt(np.mean([error_of(run) ** 2 for run in runs], axis=0))
+    # Of all runs together, one that has found no light counts as without spread.
+    error = np.sqrt(np.mean([np.nan_to_num(error_of(run), nan=0.0) ** 2 for run in runs], axis=0))
     slack = 1e-5 * np.abs(exact).max()  # float32
     assert np.all(np.abs(x.mean(axis=0) - exact) <= 4 * error / 24**0.5 + slack)
     noisy = error > slack
@@ -198,7 +200,7 @@ def test_a_target_error_is_reached(device, scale):
     found = ltcl.solve(S, b, "monte_carlo", error=0.004 * scale)
     exact = np.linalg.solve(dense, b / scale)
     error = error_of(found) / scale
-    assert np.max(error) < 0.004 * 1.15  # a pilot knows the spread to a few per cent
+    assert np.max(error) <= 0.004
     assert np.median(error[:, 0]) > 0.002  # not by drowning it in samples
     z = (found.x.astype(float) / scale - exact) / error
     assert np.abs(z).max() < 4.5
@@ -255,7 +257,7 @@ def test_launches_tell_the_callback(device, monkeypatch):
     S, _ = system(device, "a scene")
     seen: list[tuple[int, float]] = []
     found = ltcl.solve(S, np.ones(43), "monte_carlo", samples=192, callback=lambda *step: seen.append(step))
-    assert [step for step, _ in seen] == [0, 1, 2, 3, 4, 1]
+    assert [step for step, _ in seen] == [0, 1, 2, 3, 4, 5]
     np.testing.assert_array_equal([value for _, value in seen], [1.0, *[np.nan] * 4, found.residual])
 
 
@@ -277,7 +279,18 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "no error": ({"error": 0.0}, InputError, "error is 0.0; it must be a finite number above 0"),
     "pixel beyond": ({"pixels": [0, 43]}, InputError, r"pixels holds 43; they must be in 0\.\.42"),
     "pixel below": ({"pixels": [-1, 5]}, InputError, "pixels holds -1"),
-    "no pixels": ({"pixels": []}, InputError, r"pixels has shape \(0,\)"),
+    "no pixels": ({"pixels": []}, InputError, "pixels is empty; it must hold at least one"),
+    "ragged pixels": ({"pixels": [[1], [2, 3]]}, InputError, "pixels is ragged"),
+    "pixel names": ({"pixels": ["a"]}, InputTypeError, "pixels holds <U1; it must hold real numbers"),
+    "gather in words": ({"gather": "no"}, InputTypeError, "gather is 'no'; it must be True or False"),
+    "three gathers": ({"gather": 3}, InputTypeError, "gather is 3; it must be True or False"),
+    "adjoint in words": ({"adjoint": "yes"}, InputTypeError, "adjoint is 'yes'; it must be True or False"),
+    "almost 1/2": ({"albedo": 0.4999999}, InputError, "albedo is 0.4999999; .* at most 0.499975"),
+    "a million": (
+        {"series": "chebyshev", "degree": 10**6},
+        InputError,
+        "degree is 1000000; .* at most 10000",
+    ),
     "pixel fractions": ({"pixels": [0.5]}, InputError, "pixels has shape .* whole numbers"),
     "estimator": (
         {"estimator": "track"},
@@ -337,7 +350,7 @@ def test_walks_from_b_have_a_variance_of_their_own(device):
 @pytest.mark.parametrize("degree", [60, 500])
 def test_a_degree_that_float32_cannot_hold_is_refused(device, degree):
     S = IdentityPlus(Dense(device, lambertian(20, 9.0).R))
-    with pytest.raises(InputError, match=r"beyond float32; lower degree=, or use method='chebyshev'"):
+    with pytest.raises(InputError, match=r"beyond float32.*: lower degree=, or use method='chebyshev'"):
         ltcl.solve(S, np.ones(20), "monte_carlo", series="chebyshev", degree=degree)
 
 
@@ -352,3 +365,80 @@ def test_operators_without_rows_are_refused(device):
     S = IdentityPlus(Host(device, scipy.sparse.linalg.aslinearoperator(SCENE.R)))
     with pytest.raises(InputError, match="method='monte_carlo' reads S row by row, which Host does"):
         ltcl.solve(S, np.ones(43), "monte_carlo")
+
+
+def test_the_residual_is_that_of_x_even_where_noise_exceeds_b(device):
+    S = np.eye(4) - 0.999 * np.ones((4, 4)) / 4
+    found = ltcl.solve(S, np.ones(4), "monte_carlo")
+    assert found.residual == pytest.approx(residual(S, found.x, np.ones(4)), rel=1e-3)
+    assert found.residual == found.residuals[-1] > 1.0
+    assert "at best" not in str(found)
+
+
+@pytest.mark.parametrize(
+    ("options", "advice"),
+    [
+        ({}, "try more samples=, or gather=True"),
+        ({"gather": True}, "try more samples="),
+        ({"pixels": [1]}, "try more samples="),
+        ({"error": 0.05}, "try a smaller error=, or gather=True"),
+        ({"error": 0.05, "pixels": [1]}, "in all"),
+    ],
+)
+def test_advice_fits_the_options(device, options, advice):
+    S, _ = system(device, "a scene")
+    found = ltcl.solve(S, np.ones(43), "monte_carlo", rtol=1e-5, **({"samples": 9} | options))
+    if "error" in options:
+        found = ltcl.solve(S, np.ones(43), "monte_carlo", rtol=1e-5, **options)
+    assert found.status is Status.SAMPLED
+    assert str(found).endswith(advice)
+
+
+def test_what_a_polynomial_leaves_is_said_with_what_it_rests_on(device):
+    """Of an S that is not symmetric it may leave more."""
+    S = IdentityPlus(Dense(device, SCENE.R))
+    reason = ltcl.solve(S, np.ones(43), "monte_carlo", series="chebyshev", degree=3).reason
+    assert re.search(r"of a residual, if the spectrum of S is real and within \[0.5, [\d.]+\]", reason)
+
+
+def test_noise_that_drowns_a_polynomial_is_refused_and_told(device):
+    """As large as it is: the root mean square of many runs, within a factor of three."""
+    S, b = IdentityPlus(Dense(device, lambertian(43, 4.0).R)), np.random.default_rng(0).random(43)
+    with pytest.raises(
+        InputError, match=r"samples is 256; .* noise of about \d+ times b: give a lower degree="
+    ):
+        ltcl.solve(S, b, "monte_carlo", series="chebyshev")
+    found = ltcl.solve(S, b, "monte_carlo", series="chebyshev", degree=9)
+    told = re.search(r"noise of about ([\d.]+) times b with 256 samples", found.reason)
+    assert told is not None
+    noise = np.sqrt(np.mean(error_of(found) ** 2)) / np.sqrt(np.mean(b**2))
+    assert noise / 3 < float(told[1]) < 3 * noise
+    assert ltcl.solve(S, b, "monte_carlo", series="chebyshev", rtol=0.3).converged
+
+
+def test_where_the_series_would_do_better_than_a_polynomial_it_is_said(device):
+    """Forward, with row sums of A above 1: the free bounds begin at 0.001."""
+    A = np.abs(np.random.default_rng(2).standard_normal((60, 60)) ** 5)
+    A *= 0.6 / np.abs(np.linalg.eigvals(A)).max()
+    assert A.sum(axis=1).max() > 1
+    with pytest.raises(InputError, match="or use series='neumann'"):
+        ltcl.solve(np.eye(60) - A, np.ones(60), "monte_carlo", series="chebyshev", rtol=0.3)
+
+
+def test_uniform_walks_that_are_refused_are_told_of_those_that_are_not(device):
+    R = np.abs(np.random.default_rng(2).standard_normal((60, 60)) ** 5)
+    R *= 0.4 / np.abs(np.linalg.eigvals(R)).max()
+    S = IdentityPlus(Dense(device, R))
+    with pytest.raises(InputError, match=r"sampler='uniform' have no finite variance .* use sampler='alias'"):
+        ltcl.solve(S, np.ones(60), "monte_carlo", sampler="uniform")
+    assert ltcl.solve(S, np.ones(60), "monte_carlo", samples=4000, rtol=0.1).converged
+
+
+@pytest.mark.parametrize("options", [{"series": "chebyshev"}, {"adjoint": True}, {}])
+def test_stored_rows_that_overflow_are_refused_in_one_line(device, options):
+    S = np.eye(8)
+    S[0, 1:] = 3e38
+    with pytest.raises(InputError, match="float32") as caught:
+        ltcl.solve(scipy.sparse.csr_array(S), np.ones(8), "monte_carlo", **options)
+    assert "\n" not in str(caught.value)
+    assert "nan" not in str(caught.value)

@@ -12,7 +12,7 @@ from ltcl.operators import CSR, Dense
 from ltcl.operators.alias import tables, tables_of_columns
 from ltcl.operators.links import links
 from ltcl.operators.walks import Walker, geometric
-from ltcl.theory.walks import chance_to_go_on, second_moment_radius
+from ltcl.theory.walks import chance_to_go_on, noise_of_terms, second_moment_radius
 from tests import gallery
 
 SIGNED = gallery.sparse(37, 37, 0.4, seed=4).toarray() / 8
@@ -90,3 +90,11 @@ def test_an_albedo_too_low_for_R_is_refused_with_the_least():
 
 def test_walks_are_never_so_short_that_terms_are_left_out():
     assert chance_to_go_on(0.0, None) > 0.01
+
+
+def test_the_noise_of_terms_is_that_of_independent_steps():
+    """Walks of one length over one row that all share, b = -1 or 1 at random: steps are independent."""
+    rng, c, rho = np.random.default_rng(0), np.array([1.0, -0.5, 2.0, 0.25]), 0.8
+    scores = sum(c[k] * rho**k * rng.choice((-1, 1), 100_000) for k in (1, 2, 3))
+    assert noise_of_terms(c, rho**2) == pytest.approx(np.std(scores), rel=0.02)
+    assert noise_of_terms(np.full(900, 1e30), 1e6) == np.inf
