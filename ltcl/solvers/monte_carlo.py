@@ -7,8 +7,8 @@ A walk samples one path, its entries in proportion to |R_ij| (eq. 25), its lengt
 (eq. 22) is the same on I - A. A pixel costs the same whether others are asked for or not: it is for a few
 pixels and for previews, not for a whole picture to 1 %, where any iteration is faster. All right-hand
 sides share their walks: frames and colours of one S cost one walk a sample. The three S of a transport in
-colour share them, too, where that leaves a finite variance (`ltcl.operators.links`); otherwise, and in the
-adjoint form, each has walks of its own, and the reason is told.
+colour share them, too, where that leaves a finite variance (`ltcl.operators.links`), and of a polynomial
+little noise; otherwise, and in the adjoint form, each has walks of its own, and the reason is told.
 
 The series needs rho(|R|) < 1, and a finite variance some more (`ltcl.theory.walks`); elsewhere it is refused.
 ``series="chebyshev"`` samples a polynomial of finite degree instead, which converges for every albedo; its

@@ -131,6 +131,7 @@ def joined(channels: Sequence[Solution]) -> Solution:
         first,
         x=np.stack([one.x for one in channels]),
         status=Status.CONVERGED if all(one.converged for one in channels) else Status.SAMPLED,
+        iterations=max(one.iterations for one in channels),
         products=sum(one.products for one in channels),
         residuals=tuple(map(max, zip(*(one.residuals for one in channels), strict=True))),
         reason="; ".join(dict.fromkeys(filter(None, reasons))),  # what all have in common once

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from ltcl.cli import console
+from ltcl.cli import console, options
 
 
 def test_table_shows_names_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
@@ -90,6 +90,16 @@ def test_bar_tells_the_steps_of_a_method_that_samples() -> None:
     assert (task.completed, task.fields["text"]) == (0, "sampling, step 1")
     callback(1, 1e-3)
     assert (task.completed, task.fields["text"]) == (1, "residual 1.0e-03")
+
+
+def test_bar_is_full_when_three_channels_that_were_sampled_at_once_are_done() -> None:
+    steps = console.Steps(items=2, solves=options.solves("monte_carlo", 3))
+    (task,) = steps._bar.tasks
+    steps.item("a.png")
+    callback = steps.solve(1e-2)
+    for number, residual in enumerate((1.0, 1.0, 1.0, float("nan"), 1e-3, 1e-3, 1e-3)):
+        callback(number, residual)
+        assert task.completed == (number > 3)
 
 
 def test_frames_on_a_terminal_are_a_bar_with_rate_and_time_left(
