@@ -47,8 +47,11 @@
 #ifndef ESTIMATOR
 #error "walk.cl needs -DESTIMATOR=<0 end-point, 1 collision>"
 #endif
-#if !defined(CHANNELS) || K % CHANNELS
-#error "walk.cl needs -DCHANNELS=<1, or 3 that share walks>, which divides K"
+#ifndef CHANNELS
+#error "walk.cl needs -DCHANNELS=<1, or 3 that share walks>"
+#endif
+#if K % CHANNELS
+#error "walk.cl needs a K that CHANNELS divides"
 #endif
 #define ENDPOINT 0
 #define COLLISION 1
