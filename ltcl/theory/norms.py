@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The 2-norm of an operator, or of what two differ by, with an upper bound of stated confidence.
 
-Golub-Kahan steps A v_j = b_(j-1) u_(j-1) + a_j u_j, A^T u_j = a_j v_j + b_j v_(j+1) from a random unit vector
-v_1 give orthonormal v_(j+1) = p_j(A^T A) v_1, p_j of degree j. With s the norm, x the right singular vector of
-it and g = <x, v_1>, the parts <x, v_(j+1)> = p_j(s^2) g have squares that sum to at most one:
+Golub-Kahan steps A v_j = b_(j-1) u_(j-1) + a_j u_j, A^T u_j = a_j v_j + b_j v_(j+1) from a random unit
+vector v_1 give orthonormal v_(j+1) = p_j(A^T A) v_1, p_j of degree j. With s the norm, x the right singular
+vector of it and g = <x, v_1>, the parts <x, v_(j+1)> = p_j(s^2) g have squares that sum to at most one:
 
     g^2 (p_0^2 + p_1^2 + ... + p_k^2)(s^2) <= 1
 
-Beyond the largest Ritz value the sum grows, so that g^2 >= d^2 bounds s from above. How likely g^2 is below d^2
-is a Beta distribution, whatever A is; of several independent starts one at least has g^2 >= d^2 but for
+Beyond the largest Ritz value the sum grows, so that g^2 >= d^2 bounds s from above. How likely g^2 is below
+d^2 is a Beta distribution, whatever A is; of several independent starts one at least has g^2 >= d^2 but for
 the product of these probabilities. The largest of their bounds then holds, after any number of steps.
 
-For one start and p_k alone this is the bound of van Dorsselaer, Hochstenbach and van der Vorst, SIAM J. Matrix
-Anal. Appl. 22 (2000); in the worst case over all A it grows into that of Kuczynski and Wozniakowski, ibid. 13
-(1992): relative error e of the largest eigenvalue, with probability 1.648 sqrt(N) exp(-sqrt(e) (2k - 1)).
+For one start and p_k alone this is the bound of van Dorsselaer, Hochstenbach and van der Vorst, SIAM J.
+Matrix Anal. Appl. 22 (2000). It adapts to A; that of Kuczynski and Wozniakowski, ibid. 13 (1992), holds for
+all A alike and so asks for more steps: after k of them the largest eigenvalue is too small by more than its
+share e with probability 1.648 sqrt(N) exp(-sqrt(e) (2k - 1)) at most.
 """
 
 from __future__ import annotations
