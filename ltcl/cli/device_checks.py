@@ -71,7 +71,7 @@ def on_device(device: Device) -> dict[str, Callable[[], str]]:
 
 def _compile(device: Device, file: str) -> str:
     """Build a kernel file with every value of the defines it requires."""
-    values = {"K": WIDTHS, "LANES": (8 if device.is_cpu else 1,)}
+    values = {"K": WIDTHS, "LANES": (8 if device.is_cpu else 1,), "TAPS": (2, 4, 8)}
     names = sorted(set(_GUARD.findall(sources.load(file).text)))
     choices = [values.get(name, (1,)) for name in names]
     built = [
