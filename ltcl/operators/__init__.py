@@ -15,6 +15,8 @@ from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.packing import smallest
+from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
 
 __all__ = [
@@ -31,10 +33,12 @@ __all__ = [
     "Pattern",
     "ScaledColumns",
     "Shifted",
+    "Tiles",
     "Transposed",
     "Wavelet",
     "as_operator",
     "interreflections",
+    "smallest",
 ]
 
 
