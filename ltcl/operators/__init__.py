@@ -11,6 +11,7 @@ from ltcl.device import Device, open_device
 from ltcl.operators.base import Norms, Operator, Transposed
 from ltcl.operators.bases import Basis, Chained, Ordered
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators.compressed import Compressed, Sum
 from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
@@ -23,6 +24,7 @@ __all__ = [
     "CSR",
     "Basis",
     "Chained",
+    "Compressed",
     "Coupled",
     "Dense",
     "Host",
@@ -33,6 +35,7 @@ __all__ = [
     "Pattern",
     "ScaledColumns",
     "Shifted",
+    "Sum",
     "Tiles",
     "Transposed",
     "Wavelet",
