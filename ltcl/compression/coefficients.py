@@ -17,9 +17,11 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
+from ltcl.compression.magnitudes import Magnitudes
 from ltcl.compression.sources import COLUMNS, RowSource, at_once, cut
 
 Transform = Callable[[np.ndarray], np.ndarray]  # (N, k) float32 -> (M, k) float32, k a multiple of COLUMNS
+_SHARE = 8  # one of so many numbers is looked at for a threshold
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,10 @@ def coefficients(
     R: RowSource,
     out: Transform | None,
     into: Transform | None,
-    threshold: float,
+    threshold: float | None = None,
     *,
+    drop: float = 0.0,
+    most: int | None = None,
     first: float = 0.0,
     memory: int | None = None,
     progress: Callable[[float], object] | None = None,
@@ -74,11 +78,15 @@ def coefficients(
     R : RowSource, (M, N)
     out, into : callable (N, k) -> (M', k), or None for pixels
         W_out of (M, k), W_in of (N, k); orthonormal.
-    threshold, first : float
-        What is smaller is dropped at the end, and between the passes. With 0 nothing is dropped between, and
-        all M x N' numbers lie in memory there; else those that are left, with 8 bytes each.
+    threshold : float, optional
+        What is smaller is dropped at the end. When not given, an eighth of the numbers is looked at for one
+        that drops about the Frobenius norm `drop`, or more where about `most` are kept with it.
+    first : float
+        What is smaller is dropped between the passes. With 0 nothing is, and all M x N' numbers lie in
+        memory there; else those that are left, with 8 bytes each.
     memory : int, optional
-        Bytes for a block; as `sources.at_once`. The result has the same bits for any, without `first`.
+        Bytes for a block; as `sources.at_once`. The result has the same bits for any, with a threshold and
+        without `first`.
     progress : callable, optional
         Called with the share that is done.
 
@@ -94,18 +102,97 @@ def coefficients(
     """
     done = progress or (lambda share: None)
     if out is None:
-        return _in_one_pass(R, into, threshold, memory, done)
-    between = _first_pass(R, into, first, memory, lambda share: done(share / 2))
-    rows, columns = R.shape[0], between.columns
+        last: _Rows | _Columns = _Rows(R, into)
+    else:
+        last = _Columns(_first_pass(R, into, first, memory, lambda share: done(share / 2)), out)
+    if threshold is None:
+        threshold = last.sample().threshold_for(drop, math.inf if most is None else most)
     pieces, squares = [], []
-    for start, stop in cut(columns, at_once(rows, memory)):
-        block = _transformed(out, _dense(between.matrix[:, start:stop]))
-        kept, lost = _chosen(block, threshold)
+    for start, stop in cut(last.count, at_once(last.height, memory)):
+        kept, lost = _chosen(last.block(np.arange(start, stop)), threshold)
         pieces.append(kept)
         squares += lost
-        done(0.5 + 0.5 * stop / columns)
-    core = scipy.sparse.csr_array(scipy.sparse.hstack(pieces, format="csc"))
-    return Coefficients(core, between.dropped, math.sqrt(math.fsum(squares)), threshold)
+        done(stop / last.count if out is None else 0.5 + 0.5 * stop / last.count)
+    core = scipy.sparse.hstack(pieces, format="csc")
+    core = scipy.sparse.csr_array(core if out is not None else core.T)
+    return Coefficients(core, last.dropped, math.sqrt(math.fsum(squares)), threshold)
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """Magnitudes of a `share` of all numbers."""
+
+    magnitudes: Magnitudes
+    share: float
+
+    def threshold_for(self, drop: float, most: float) -> float:
+        threshold = self.magnitudes.threshold(drop * math.sqrt(self.share))
+        if math.isinf(most):
+            return threshold
+        return max(threshold, self.magnitudes.at_most(int(most * self.share)))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """C^T = W_in R^T, a column for each row of R."""
+
+    R: RowSource
+    into: Transform | None
+    dropped = 0.0
+
+    @property
+    def count(self) -> int:
+        return self.R.shape[0]
+
+    @property
+    def height(self) -> int:
+        return self.R.shape[1]
+
+    def block(self, which: np.ndarray) -> np.ndarray:
+        rows = np.asarray(self.R.rows(int(which[0]), int(which[-1]) + 1), np.float32)
+        return _transformed(self.into, rows.T)
+
+    def sample(self) -> _Sample:
+        starts = np.arange(0, self.count, COLUMNS)
+        chosen = np.sort(np.random.default_rng(0).choice(starts, -(-len(starts) // _SHARE), replace=False))
+        blocks = [np.arange(start, min(start + COLUMNS, self.count)) for start in chosen]
+        return _sampled(self, blocks)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """C = W_out (R W_in^T), a column for each of R W_in^T."""
+
+    between: _Between
+    out: Transform
+
+    @property
+    def count(self) -> int:
+        return self.between.columns
+
+    @property
+    def height(self) -> int:
+        return self.between.rows
+
+    @property
+    def dropped(self) -> float:
+        return self.between.dropped
+
+    def block(self, which: np.ndarray) -> np.ndarray:
+        part = self.between.matrix[:, which]
+        return _transformed(self.out, part if isinstance(part, np.ndarray) else part.toarray())
+
+    def sample(self) -> _Sample:
+        # Single columns: those of large numbers lie side by side, and blocks would hit or miss them all.
+        chosen = np.random.default_rng(0).permutation(self.count)[: -(-self.count // _SHARE)]
+        return _sampled(self, [chosen[start:stop] for start, stop in cut(len(chosen), 4 * COLUMNS)])
+
+
+def _sampled(last: _Rows | _Columns, blocks: list[np.ndarray]) -> _Sample:
+    found = [Magnitudes.of(last.block(which)) for which in blocks]
+    counts, squares = sum(m.counts for m in found), sum(m.squares for m in found)
+    share = sum(map(len, blocks)) / last.count
+    return _Sample(Magnitudes(np.asarray(counts), np.asarray(squares)), share)
 
 
 @dataclass(frozen=True)
@@ -113,21 +200,9 @@ class _Between:
     """R W_in^T: dense, or sparse by columns where something was dropped."""
 
     matrix: np.ndarray | scipy.sparse.csc_array
+    rows: int
     columns: int
     dropped: float
-
-
-def _in_one_pass(
-    R: RowSource, into: Transform | None, threshold: float, memory: int | None, done: Callable
-) -> Coefficients:
-    pieces, squares = [], []
-    for stop, block in _blocks(R, into, memory):  # (N', m): columns are rows of R
-        kept, lost = _chosen(block, threshold)
-        pieces.append(kept)
-        squares += lost
-        done(stop / R.shape[0])
-    core = scipy.sparse.hstack(pieces, format="csc").T
-    return Coefficients(scipy.sparse.csr_array(core), 0.0, math.sqrt(math.fsum(squares)), threshold)
 
 
 def _first_pass(
@@ -145,9 +220,9 @@ def _first_pass(
             dense[stop - block.shape[1] : stop] = block.T
         done(stop / R.shape[0])
     if dense is not None:
-        return _Between(dense, dense.shape[1], 0.0)
+        return _Between(dense, len(dense), dense.shape[1], 0.0)
     turned = scipy.sparse.csc_array(scipy.sparse.hstack(pieces, format="csc").T)
-    return _Between(turned, len(turned.indptr) - 1, math.sqrt(math.fsum(squares)))
+    return _Between(turned, R.shape[0], len(turned.indptr) - 1, math.sqrt(math.fsum(squares)))
 
 
 def _room(rows: int, columns: int) -> np.ndarray:
@@ -170,10 +245,6 @@ def _transformed(transform: Transform | None, block: np.ndarray) -> np.ndarray:
     padded = np.zeros((len(block), -(-count // COLUMNS) * COLUMNS), np.float32)
     padded[:, :count] = block
     return transform(padded)[:, :count]
-
-
-def _dense(part: np.ndarray | scipy.sparse.csc_array) -> np.ndarray:
-    return part if isinstance(part, np.ndarray) else part.toarray()
 
 
 def _chosen(block: np.ndarray, threshold: float) -> tuple[scipy.sparse.csc_array, list[float]]:
