@@ -227,15 +227,7 @@ class Transport:
 
     def to_light(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 at masked pixels."""
-        light = [
-            np.divide(l_d, F[:, None], out=np.zeros(l_d.shape), where=F[:, None] > 0)
-            for l_d, F in zip(columns, self._require_first_bounce(), strict=True)
-        ]
-        return (
-            light
-            if self.mixing is None
-            else list(np.einsum("ij,jnk->ink", np.linalg.inv(self.mixing), light))
-        )
+        return first_bounces.undone(columns, self._require_first_bounce(), self.mixing)
 
     def _find_first_bounce(self, wanted: Any, probes: int, seed: int) -> np.ndarray:
         checks.count("probes", probes, least=2)
