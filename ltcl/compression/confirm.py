@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The whole R in the chosen basis, its threshold set anew until the bound on solutions is within the tolerance.
+"""The whole R in the chosen basis, its threshold set anew until solutions are within the tolerance.
 
 Both norms are measured on what is handed out, rounding and all, with random starts that no choice has seen.
 """
@@ -100,7 +100,7 @@ def confirm(
         found, fitted = made.best.found, made.best.fit
     else:
         found, fitted = _whole(problem, kind, made, progress)
-    loosened = False
+    loosened, result = False, None
     for _ in range(_TRIES):
         core = cores.best(problem.device, fitted.coefficients.core, choice.ROUNDING * goal, budget)
         if core.nbytes > budget:
@@ -115,11 +115,12 @@ def confirm(
         if found.dropped > choice.DROPPING * goal:
             found = fit.gather(problem, kind, choice.GATHER * choice.DROPPING * goal, progress=progress)
         fitted = fit.fit(problem, kind, found, choice.DROPPING * goal, start)
+    assert result is not None  # noqa: S101 - there was an attempt
     if result.solution_error <= rtol:
         return result
     raise InputError(
-        f"rtol is {rtol:g}, but the solution may be off by {result.solution_error:.2g} after {_TRIES} attempts; "
-        "give a larger one"
+        f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by {result.solution_error:.2g}; "
+        "it must be larger"
     )
 
 
@@ -128,7 +129,7 @@ def _whole(
 ) -> tuple[Coefficients, Fit]:
     """Coefficients of the whole, begun where the window ended: the same is dropped of each row."""
     window, dropping = made.best.fit.coefficients, choice.DROPPING * made.goal
-    pixels = window.core.shape[0]
+    pixels = len(window.core.indptr) - 1
     start = window.dropped * math.sqrt(problem.pixels / pixels)
     most = _MORE * math.ceil(window.core.nnz / pixels) * problem.pixels
     found = fit.gather(problem, kind, choice.GATHER * max(start, dropping), most, progress)

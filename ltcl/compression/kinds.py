@@ -10,7 +10,8 @@ import numpy as np
 
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import Basis, Ordered, Wavelet, wavelets
+from ltcl.operators import Basis, basis
+from ltcl.operators.wavelets import filters
 
 PIXELS, HILBERT, ROWS = "pixels", "hilbert", " rows"
 KINDS = ("db2", "haar", "db4", "db2 rows", "haar rows", PIXELS, HILBERT)  # in the order they are tried
@@ -36,7 +37,7 @@ def check(name: str) -> str:
         raise InputTypeError(f"basis is {name!r}; it must be a name, such as {', '.join(KINDS)}")
     if name not in (PIXELS, HILBERT):
         try:
-            wavelets.filters(name.removesuffix(ROWS))
+            filters(name.removesuffix(ROWS))
         except InputError as error:
             raise InputError(
                 f"basis is {name!r}; it must be pixels, hilbert, or an orthonormal wavelet such as haar, db2 "
@@ -52,13 +53,7 @@ def kind(device: Device, grid: tuple[int, int], name: str) -> Kind:
     >>> kind(ltcl.open_device(), (4, 6), "db2 rows").into.shape
     (24, 24)
     """
-    check(name)
-    if name == PIXELS:
-        return Kind(name, None, None)
-    if name == HILBERT:
-        W: Basis = Ordered(device, grid, hilbert(grid), HILBERT)
-        return Kind(name, W, W)
-    W = Wavelet(device, grid, name.removesuffix(ROWS))
+    W = basis(device, grid, check(name).removesuffix(ROWS))
     return Kind(name, None if name.endswith(ROWS) else W, W)
 
 

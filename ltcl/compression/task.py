@@ -2,7 +2,8 @@
 """`compress`: a transport on compressed operators, with a bound on what a solution loses.
 
 R of every channel is written between bases in which it is sparse, and what is small is dropped: R~ = R + E.
-Solutions of S~ = I + R~ are within ||S~^-1|| ||E|| of those of S, whatever the picture; both norms are measured.
+Solutions of S~ = I + R~ are within ||S~^-1|| ||E|| of those of S, whatever the picture; both norms are
+measured.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ def compress(
     budget : int, optional
         Bytes that the cores of all channels may take on the device.
     basis : str or sequence of str, optional
-        "pixels", "hilbert" (pixels in that order), a wavelet ("haar", "db2", "db4", ... on both sides), or one
-        for rows alone ("db2 rows", the paper's). When not given, all of these are tried.
+        "pixels", "hilbert" (pixels in that order), a wavelet ("haar", "db2", "db4", ... on both sides), or
+        one for rows alone ("db2 rows", the paper's). When not given, all of these are tried.
     grid : (h, w)
         Of rows. A Transport has its own, and its first bounce.
     first_bounce : (N,) or (3, N), optional
@@ -65,8 +66,8 @@ def compress(
     device : Device or str, optional
         Of rows.
     memory : int, optional
-        Bytes of host memory for a block of rows. What lies between the passes over rows and over columns takes
-        half of what is free, and something is dropped there only where that is too little.
+        Bytes of host memory for a block of rows. What lies between the passes over rows and over columns
+        takes half of what is free; something is dropped there only where that is too little.
     progress : callable(text, share), optional
         Called as the work goes on.
 
@@ -81,8 +82,8 @@ def compress(
     ------
     InputError
         A T that is not square, compressed already, or does not fit the grid; rtol not between 0 and 1; a
-        basis that is not orthonormal; a budget that is too small: the message has the tolerance that fits into
-        it, and what this one needs.
+        basis that is not orthonormal; a budget that is too small: the message has the tolerance that fits
+        into it, and what this one needs.
 
     Notes
     -----
@@ -181,7 +182,9 @@ def _of_transport(T: Transport, memory: int | None, given: dict[str, Any]) -> li
             raise InputError(f"{name} is given, but T is a Transport, which has its own; leave it out")
     require(T)
     if any(made_with(matrix) is not None for matrix in T.matrices):
-        raise InputError(f"T is compressed already, with an error of {T.error:.2g}; compress what it came from")
+        raise InputError(
+            f"T is compressed already, with an error of {T.error:.2g}; compress what it came from"
+        )
     F = np.atleast_2d(T.first_bounce)
     rows = [Interreflection(source("T", matrix), f) for matrix, f in zip(T.matrices, F, strict=True)]
     try:
@@ -210,9 +213,7 @@ def _of_rows(
     return [Problem(R, Streamed(chosen, R, memory), shape, memory) for R in rows], F, shape
 
 
-def _first_bounce(
-    parts: Sequence[RowSource], given: Any, device: Device, memory: int | None
-) -> np.ndarray:
+def _first_bounce(parts: Sequence[RowSource], given: Any, device: Device, memory: int | None) -> np.ndarray:
     n = parts[0].shape[0]
     if given is None:
         F = np.stack([Streamed(device, part, memory).diagonal() for part in parts])
