@@ -29,10 +29,11 @@ from typing import TYPE_CHECKING, Any
 from ltcl import errors
 from ltcl.analysis import Analysis, analyze
 from ltcl.compensation import Compensation, compensate
+from ltcl.compression import invert
 from ltcl.device import Device, list_devices, open_device
 from ltcl.relighting import relight
 from ltcl.separation import Separation, separate
-from ltcl.solvers import Solution, Status, solve
+from ltcl.solvers import Inverse, Solution, Status, solve
 from ltcl.store import load, save
 from ltcl.transport import Transport
 
@@ -44,6 +45,7 @@ __all__ = [
     "Analysis",
     "Compensation",
     "Device",
+    "Inverse",
     "Separation",
     "Solution",
     "Status",
@@ -52,6 +54,7 @@ __all__ = [
     "compensate",
     "errors",
     "images",
+    "invert",
     "list_devices",
     "load",
     "open_device",
