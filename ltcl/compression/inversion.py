@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.compression import cores
+from ltcl.compression import cores, kinds
 from ltcl.compression.iteration import invert_coefficients
 from ltcl.compression.residual import Residual, certify
 from ltcl.compression.task import compress
@@ -94,7 +94,10 @@ def invert(
             f"rtol is {rtol:g}, but T is compressed and its solutions may be off by "
             f"{checks.upwards(T.error)}; ask for more than that, or invert what T was compressed from"
         )
-    C = T if compressed else compress(T, _SHARE * rtol, basis=_names(basis), progress=_part(note, 0.0, 0.5))
+    names = _names(basis)
+    C = T
+    if not compressed and names != [kinds.PIXELS]:  # in pixels T has its numbers itself
+        C = compress(T, _SHARE * rtol, basis=names, progress=lambda text, share: note(text, share / 2))
     found, own = [], functools.cache(_anew)
     for channel, S in enumerate(C.systems):
         found.append(_invert(S, rtol, method, own))
@@ -186,8 +189,3 @@ def _names(basis: Any) -> list[str]:
         if isinstance(name, str) and name.endswith(" rows"):
             raise InputError(f"basis is {name!r}; an inverse needs one basis on both sides, such as 'db2'")
     return names
-
-
-def _part(note: Note, start: float, stop: float) -> Note:
-    """`note` of what is a part of the work."""
-    return lambda text, share: note(text, start + (stop - start) * share)
