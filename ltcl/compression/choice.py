@@ -117,7 +117,7 @@ class _Survey:
     def add(self, name: str) -> None:
         kind, dropping = self.find(name), DROPPING * self.goal
         found = fit.gather(self.problem, kind, GATHER * dropping, self.most)
-        if self._candidate_is_hopeless(found):
+        if self._is_hopeless(found):
             self._leave(name, found, f"over {_WORSE} times as many numbers")
             return
         fitted = fit.fit(self.problem, kind, found, dropping)
@@ -137,15 +137,14 @@ class _Survey:
         self.candidates.append(candidate)
         self.trials.append(candidate.trial(self.problem.pixels))
 
-    def _candidate_is_hopeless(self, found: Coefficients) -> bool:
+    def _is_hopeless(self, found: Coefficients) -> bool:
         """By what is left where as much is dropped as Frobenius norms of the goal allow twice."""
         sizes = Magnitudes.of(found.core.data)
         norm = 2.0 * DROPPING * self.goal
         kept = sizes.kept(sizes.threshold(math.sqrt(max(norm**2 - found.dropped**2, 0.0))))
-        hopeless = kept > _WORSE * self._least
-        return hopeless
+        return kept > _WORSE * self._least
 
-    def _leave(self, name: str, found: Coefficients, why: str, error: float = math.nan) -> None:
+    def _leave(self, name: str, found: Coefficients, why: str, error: float | None = None) -> None:
         kept, nbytes = found.core.nnz / self.problem.pixels, 8 * found.core.nnz
         self.trials.append(Trial(name, "csr", 1, "float32", kept, nbytes, error, None, why))
 
