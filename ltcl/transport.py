@@ -62,6 +62,8 @@ class Transport:
         Projector pixels dropped by ``on_dark="mask"``, in any channel.
     first_bounce_error : array like first_bounce, or None
         Standard error of an estimated first bounce.
+    compression : ltcl.Compression or None
+        How `ltcl.compress` made it.
 
     Raises
     ------
@@ -102,6 +104,7 @@ class Transport:
         self._device: Device | None = device_of(self.blocks or [self.matrices], device)
         self._systems: tuple[IdentityPlus, ...] | None = None
         self._forward: tuple[Operator, ...] | None = None
+        self.compression: Any = None
         self.masked: np.ndarray = np.zeros(self.shape[1], bool)
         self._first_bounce: np.ndarray | None = None
         self.first_bounce_error: np.ndarray | None = None

@@ -28,7 +28,8 @@ from ltcl.operators import CSR, IdentityPlus
 DROPPING, ROUNDING = 0.9, 0.05  # of the goal, for what is dropped and for the rounding of the core
 GATHER = 0.7  # of the goal: Frobenius norm of what need not even be looked at
 _MOST = 512  # numbers a row, beyond which a basis is no use unless all are
-_WORSE = 3  # times the numbers of the best: not measured further
+_ALIKE = 2.0  # of the goal: a Frobenius norm at which bases are compared before more is measured
+_WORSE = 3  # times the numbers of the best then: left
 Find = Callable[[str], Kind]  # a kind by its name, on the grid of the problem
 
 
@@ -110,16 +111,19 @@ class _Survey:
         self.problem, self.find, self.rtol, self.budget, self.most = problem, find, rtol, budget, most
         self.goal = 0.5 * rtol
         self._known = False
-        self._least = math.inf  # numbers that the best kind keeps
+        self._least = math.inf  # numbers that the best basis keeps then
         self.candidates: list[Candidate] = []
         self.trials: list[Trial] = []
 
     def add(self, name: str) -> None:
         kind, dropping = self.find(name), DROPPING * self.goal
         found = fit.gather(self.problem, kind, GATHER * dropping, self.most)
-        if self._candidate_is_hopeless(found):
-            self._leave(name, found, f"over {_WORSE} times as many numbers")
+        alike = _kept(found, _ALIKE * self.goal)
+        if alike > _WORSE * self._least:
+            why = f"{alike / self._least:.1f} times as many numbers at one Frobenius norm"
+            self._leave(name, alike, why)
             return
+        self._least = min(self._least, alike)
         fitted = fit.fit(self.problem, kind, found, dropping)
         if not self._known:
             self.goal, self._known = self.rtol / inverse_bound(self.problem, fitted), True
@@ -129,25 +133,22 @@ class _Survey:
             start = fitted.coefficients.dropped * dropping / max(fitted.norm.upper, 1e-30)
             fitted = fit.fit(self.problem, kind, found, dropping, start)
         if fitted.norm.upper > dropping:
-            self._leave(name, found, "no fewer numbers are enough", fitted.norm.upper)
+            self._leave(name, found.core.nnz, "so many numbers are too few", fitted.norm.upper)
             return
-        self._least = min(self._least, fitted.coefficients.core.nnz)
         core = cores.best(self.problem.device, fitted.coefficients.core, ROUNDING * self.goal, self.budget)
         candidate = Candidate(fitted, core, _seconds(fitted, core), found)
         self.candidates.append(candidate)
         self.trials.append(candidate.trial(self.problem.pixels))
 
-    def _candidate_is_hopeless(self, found: Coefficients) -> bool:
-        """By what is left where as much is dropped as Frobenius norms of the goal allow twice."""
-        sizes = Magnitudes.of(found.core.data)
-        norm = 2.0 * DROPPING * self.goal
-        kept = sizes.kept(sizes.threshold(math.sqrt(max(norm**2 - found.dropped**2, 0.0))))
-        hopeless = kept > _WORSE * self._least
-        return hopeless
+    def _leave(self, name: str, count: int, why: str, error: float | None = None) -> None:
+        kept = count / self.problem.pixels
+        self.trials.append(Trial(name, "csr", 1, "float32", kept, 8 * count, error, None, why))
 
-    def _leave(self, name: str, found: Coefficients, why: str, error: float = math.nan) -> None:
-        kept, nbytes = found.core.nnz / self.problem.pixels, 8 * found.core.nnz
-        self.trials.append(Trial(name, "csr", 1, "float32", kept, nbytes, error, None, why))
+
+def _kept(found: Coefficients, frobenius: float) -> int:
+    """Numbers that are left where this Frobenius norm is dropped."""
+    sizes = Magnitudes.of(found.core.data)
+    return sizes.kept(sizes.threshold(math.sqrt(max(frobenius**2 - found.dropped**2, 0.0))))
 
 
 def inverse_bound(problem: Problem, fitted: Fit) -> float:

@@ -25,7 +25,7 @@ from ltcl.theory import TwoNorm, two_norm
 
 _TRIES = 6
 _AIM = 0.96  # of the tolerance
-_LOOSE = 0.7  # of it: so far below, a larger threshold is tried once
+_LOOSE = 0.8  # of it: so far below, a larger threshold is tried once
 _FRESH = 1  # seed of the random starts
 _MORE = 4  # times the numbers kept on the window, which the whole may need
 

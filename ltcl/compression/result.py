@@ -22,8 +22,8 @@ class Trial:
         Numbers in a row.
     nbytes : int
         Of the core.
-    error : float
-        Upper bound on the 2-norm of R~ - R, before rounding of the core.
+    error : float or None
+        Upper bound on the 2-norm of R~ - R, before rounding of the core; None where it was left before.
     seconds : float or None
         A product in a solve took; None where nothing was timed.
     left : str
@@ -36,7 +36,7 @@ class Trial:
     precision: str
     kept: float
     nbytes: int
-    error: float
+    error: float | None
     seconds: float | None
     left: str = ""
 
