@@ -223,3 +223,14 @@ def widths(columns: int) -> list[tuple[int, int]]:
         pieces.append((offset, width))
         offset += width
     return pieces
+
+
+def lanes_of(run: int) -> int:
+    """Neighbouring values that a work-item takes together, of a stretch of `run`; one of `WIDTHS`."""
+    return next(width for width in WIDTHS if width <= run)
+
+
+def group_of(pieces: int) -> tuple[int, int]:
+    """A work-group of 64: side by side as many as there are pieces, the others one below the other."""
+    across = min(64, 1 << (pieces - 1).bit_length())
+    return across, 64 // across

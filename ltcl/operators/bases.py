@@ -13,7 +13,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import InputError
-from ltcl.operators.base import Operator
+from ltcl.operators.base import Operator, group_of, lanes_of
 
 
 class Basis(Operator):
@@ -88,9 +88,13 @@ class Ordered(Basis):
         return {**super().to_arrays(), "order": self.order}
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        kernel = self.device.kernel("ordered", "ordered_gather")
         rows, k = x.shape[0], x.columns
-        across, group = (1, (1, 64)) if self.device.is_cpu else (k, (min(k, 8), 8))
+        if k == 0:
+            return
+        lanes = lanes_of(k)
+        kernel = self.device.kernel("ordered", "ordered_gather", K=lanes)
+        pieces = -(-k // lanes)
+        across, group = (1, (1, 64)) if self.device.is_cpu else (pieces, group_of(pieces))
         adds, added = (0, out) if add is None else (1, add)
         kernel((across, rows), group, rows, k, scale, adds, self._orders[transpose], x, added, out)
 

@@ -21,7 +21,7 @@ import pywt
 from ltcl import checks
 from ltcl.device import Array, Device, vectors
 from ltcl.errors import InputError
-from ltcl.operators.base import widths
+from ltcl.operators.base import group_of, lanes_of, widths
 from ltcl.operators.bases import Basis
 
 _pywt: Any = pywt  # compiled, so that no type checker knows its names
@@ -161,23 +161,23 @@ class _Task:
         return self.W.device.kernel("wavelet", f"wavelet_{name}", K=lanes, **self.W._defines)
 
     def _rows(self, name: str, h: int, w: int, *arguments) -> None:
-        lanes = _lanes(self.k)
+        lanes = lanes_of(self.k)
         kernel = self._kernel(f"{name}_rows", lanes)
         pieces, pairs = -(-self.k // lanes), -(-w // 2)
         if self.W.device.is_cpu:
             kernel((1, min(pairs, -(-_ITEMS // h)), h), (1, 1, 1), *arguments)
         else:
-            group = _group(pieces)
+            group = group_of(pieces)
             kernel((pieces, pairs, h), (*group, 1), *arguments)
 
     def _columns(self, name: str, h: int, run: int, split_at: int, *arguments) -> None:
-        lanes = _lanes(min(part for part in (split_at, run - split_at) if part))
+        lanes = lanes_of(min(part for part in (split_at, run - split_at) if part))
         kernel = self._kernel(f"{name}_columns", lanes)
         pieces, pairs = -(-split_at // lanes) + -(-(run - split_at) // lanes), -(-h // 2)
         if self.W.device.is_cpu:
             kernel((min(pieces, -(-_ITEMS // pairs)), pairs), (1, 1), *arguments)
         else:
-            kernel((pieces, pairs), _group(pieces), *arguments)
+            kernel((pieces, pairs), group_of(pieces), *arguments)
 
     def _all(self, name: str, scaled: tuple[float, int], source: Array, add: Array, out: Array) -> None:
         first, last = self.large, self.W.levels
@@ -234,17 +234,6 @@ def _levels(grid: tuple[int, int], levels: int | None) -> int:
     if checks.count("levels", levels, least=0) > most:
         raise InputError(f"levels is {levels}; it must be at most {most} on a {grid[0]} x {grid[1]} grid")
     return int(levels)
-
-
-def _lanes(run: int) -> int:
-    """Neighbouring values that an item takes together, of stretches of `run`."""
-    return 8 if run >= 8 else min(run, 4)
-
-
-def _group(pieces: int) -> tuple[int, int]:
-    """A work-group of 64: as many side by side as there are pieces, the others on other pairs."""
-    across = min(64, 1 << (pieces - 1).bit_length())
-    return across, 64 // across
 
 
 def _pieces(k: int) -> list[tuple[int, int, int]]:

@@ -12,7 +12,9 @@ import scipy.sparse
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import CSR, Tiles, smallest
-from ltcl.operators.narrow import PRECISIONS
+from ltcl.operators.covers import cover
+from ltcl.operators.narrow import PRECISIONS, Narrow, narrow
+from ltcl.operators.packing import pack, spread
 from tests import gallery, reference
 from tests.operators import helpers
 
@@ -27,10 +29,13 @@ def twin(A: Tiles):
     pointers = stored["pointers"]
     page = np.repeat(np.arange(len(pointers) - 1) % pages, np.diff(pointers))
     columns = np.minimum((page * 65536 + stored["starts"]) * granule, A.shape[1] - width)
-    values = stored["values"].astype(np.float64)
+    values = stored["codes"].astype(np.float64)
     if A.precision == "bfloat16":
-        values = np.ldexp(*_bfloat16(stored["values"].astype(np.int64)))
-    factors = stored["unit"] * (stored["scales"] if stored["scales"].size else np.ones(A.shape[0]))
+        values = np.ldexp(*_bfloat16(stored["codes"].astype(np.int64)))
+    if A.precision == "int8":
+        bits = stored["scales"].astype(np.int64)
+        values = np.ldexp(values * (8 + bits % 8)[:, None], (bits // 8 - 15 - 3)[:, None])
+    factors = np.full(A.shape[0], float(stored["unit"]))
     return lambda *operands: reference.tile_matvec(pointers[::pages], columns, values, factors, *operands)
 
 
@@ -64,9 +69,8 @@ def test_every_kind_and_its_transpose_is_the_matrix_it_stands_for(device, monkey
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_transposes_are_exact_ones_of_the_same_numbers(device, name, precision):
     A = Tiles(device, gallery.SPARSE[name], 8, precision)
-    turned = A.transposed_copy().matrix().T.toarray()
-    scales = A.packed.scales if A.packed.scales.size else np.ones(A.shape[0])
-    np.testing.assert_array_equal(scales[:, None].astype(np.float64) * turned, A.to_dense())
+    np.testing.assert_array_equal(A.transposed_copy().matrix().T.toarray(), A.to_dense())
+    assert A.transposed_copy().precision == ("float16" if precision == "int8" else precision)
 
 
 @pytest.mark.parametrize("name", gallery.SPARSE)
@@ -81,17 +85,26 @@ def test_floats_are_rounded_to_nearest(device, name, width, precision):
 
 
 def test_ties_go_to_even():
-    from ltcl.operators.packing import pack
-
     ties = scipy.sparse.csr_array([[1 + 2.0**-8, 1 + 3 * 2.0**-8, -1 - 2.0**-8]])
     assert pack(ties, 1, "bfloat16").matrix().toarray().tolist() == [[1, 1 + 2.0**-6, -1]]
 
 
-def test_int8_is_within_half_a_step_of_its_row(device):
-    matrix = gallery.SPARSE["strong rows"].toarray().astype(np.float64)
-    found = Tiles(device, gallery.SPARSE["strong rows"], 16, "int8").to_dense()
-    step = np.abs(matrix).max(axis=1, keepdims=True) / 127
-    assert np.all(np.abs(found - matrix) <= step / 2 * (1 + 1e-5))
+@pytest.mark.parametrize("width", WIDTHS)
+def test_int8_is_within_half_a_step_of_its_tile(width):
+    packed = pack(gallery.SPARSE["stretches"], width, "int8")
+    exact = pack(gallery.SPARSE["stretches"], width, "float32").stored.decoded()
+    found = packed.stored.decoded()
+    step = np.abs(exact).max(axis=1, keepdims=True) / 127 * 1.125  # of 3 bits of fraction, rounded up
+    assert np.all(np.abs(found - exact) <= step / 2)
+    assert np.abs(packed.stored.codes).max() <= 127
+
+
+def test_products_of_all_scales_and_codes_are_exact_in_float16():
+    bits = np.arange(8, 23 * 8, dtype=np.uint8)  # numbers end below 2^15
+    codes = np.broadcast_to(np.arange(-127, 128, dtype=np.int8), (len(bits), 255))
+    numbers = Narrow("int8", codes, bits, 1.0).decoded()
+    again = narrow(numbers, "float16", 1.0).decoded()
+    np.testing.assert_array_equal(numbers[np.abs(numbers) < 2.0**15], again[np.abs(numbers) < 2.0**15])
 
 
 @pytest.mark.parametrize("exponent", [-149, -126, -60, 0, 60, 127])
@@ -119,8 +132,6 @@ def test_what_is_lost_is_known(device, name, precision):
 
 
 def test_tiles_are_the_fewest():
-    from ltcl.operators.covers import cover
-
     rng = np.random.default_rng(5)
     for columns, width in itertools.product((1, 7, 8, 17, 23), WIDTHS):
         pattern = scipy.sparse.csr_array((rng.random((40, columns)) < 0.3).astype(np.float32))
@@ -202,10 +213,13 @@ def test_stored_arrays_make_the_same_again(device, width, precision):
         ("pointers", lambda a: a + 1),
         ("starts", lambda a: a.astype(np.int64)),
         ("starts", lambda a: a[:-1]),
-        ("values", lambda a: a[:, :-1]),
-        ("values", lambda a: a.astype(np.float32)),
+        ("starts", lambda a: a + np.uint16(90)),
+        ("codes", lambda a: a[:, :-1]),
+        ("codes", lambda a: a.astype(np.float32)),
         ("scales", lambda a: a[:-1]),
-        ("scales", lambda a: a * np.nan),
+        ("scales", lambda a: a.astype(np.float32)),
+        ("precision", lambda a: np.array("int9")),
+        ("precision", lambda a: np.array("float16")),
         ("unit", lambda a: a * np.nan),
         ("difference", lambda a: a + np.inf),
         ("layout", lambda a: a * 2),
@@ -220,9 +234,9 @@ def test_stored_arrays_that_do_not_fit_are_refused(device, name, spoil):
 def test_bytes_are_those_of_the_buffers(device, small_device):
     A = Tiles(device, gallery.SPARSE["stretches"], 8, "int8")
     tiles = len(A.packed.starts)
-    assert A.nbytes == tiles * (8 + 2) + 4 * 25 + 4 * 24
+    assert A.nbytes == tiles * (8 + 1 + 2) + 4 * 25
     A.apply_transpose(device.upload(np.ones(24)))
-    assert A.nbytes == tiles * (8 + 2) + 4 * 25 + 4 * 24 + A.transposed_copy().nbytes
+    assert A.nbytes == tiles * (8 + 1 + 2) + 4 * 25 + A.transposed_copy().nbytes
     cut = Tiles(small_device, gallery.SPARSE["129x129"], 1, "float32")
     buffers = {id(a): a.nbytes for slab in cut.slabs for a in slab.arguments if not isinstance(a, int)}
     assert cut.nbytes == sum(buffers.values())
@@ -259,6 +273,20 @@ def test_the_smallest_that_is_good_enough_is_named(device):
         assert chosen.packed.nbytes == min(A.packed.nbytes for A in good)
     assert smallest(scattered, 0.1)[0] == 1
     assert smallest(runs, 0.1)[0] > 1
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_what_lies_in_kept_tiles_is_kept(width):
+    matrix = gallery.SPARSE["stretches"]
+    kept = scipy.sparse.csr_array(matrix * (abs(matrix) > 0.9))
+    found = spread(kept, matrix, width)
+    assert len(cover(found, width).rows) == len(cover(kept, width).rows)
+    some, all_of, given = kept.toarray(), found.toarray(), matrix.toarray()
+    np.testing.assert_array_equal(all_of[some != 0], some[some != 0])
+    np.testing.assert_array_equal(all_of[all_of != 0], given[all_of != 0])
+    assert found.nnz > kept.nnz or width == 1
+    with pytest.raises(InputError, match="kept has shape"):
+        spread(kept, matrix.T, width)
 
 
 def test_memory_is_asked_before_anything_is_allocated(device, monkeypatch):
