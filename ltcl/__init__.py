@@ -36,7 +36,7 @@ from ltcl.device import Device, list_devices, open_device
 from ltcl.relighting import relight
 from ltcl.separation import Separation, separate
 from ltcl.solvers import Inverse, Solution, Status, solve
-from ltcl.store import load, save
+from ltcl.store import load, load_inverse, save, save_inverse
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
@@ -61,11 +61,13 @@ __all__ = [
     "invert",
     "list_devices",
     "load",
+    "load_inverse",
     "open_device",
     "operators",
     "plots",
     "relight",
     "save",
+    "save_inverse",
     "scenes",
     "separate",
     "solve",

@@ -167,8 +167,9 @@ def _check_inverse(
     T: Transport, inverse: Any, method: str, rtol: float, exact: Any, options: dict[str, Any]
 ) -> None:
     require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
-    if options:
-        name = next(iter(options))
+    unknown = [name for name in options if name not in ("callback", "throw")]
+    if unknown:
+        name = unknown[0]
         raise InputTypeError(f"option {name!r} is given, but with inverse there is no solve that takes it")
 
 

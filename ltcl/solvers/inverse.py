@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ltcl import checks, first_bounces, layout
-from ltcl.device import Device
+from ltcl import channels, checks, first_bounces, layout
+from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import IdentityPlus, Operator
+from ltcl.operators import IdentityPlus, Operator, stored
 from ltcl.operators.interreflection import nbytes
 from ltcl.solvers import units
 from ltcl.solvers.result import Solution, Status
@@ -80,7 +80,7 @@ class Inverse:
         self.errors = tuple(checks.number("error", error, least=0.0) for error in errors)
         F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce)).astype(np.float64)
         self._F = checks.shape("first_bounce", np.atleast_2d(F), (len(bounces), n))
-        self.mixing = None if mixing is None else np.asarray(mixing, np.float64)
+        self.mixing = None if mixing is None else channels.mixing(mixing, len(bounces), None)
         self.confidence = checks.number("confidence", confidence, above=0.0, most=1.0)
         self._known: Transport | None = None  # the last one that this was found to be the inverse of
 
@@ -201,6 +201,38 @@ class Inverse:
             for p, f in zip(light, self._F, strict=True)
         ]
         return shape.pack(limited, self.grid).astype(np.float32)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Plain arrays by name, as files hold them; `from_arrays` makes the same of them, to the bit."""
+        mixed = {} if self.mixing is None else {"mixing": self.mixing}
+        return {
+            "grid": np.array(self.grid),
+            "first_bounce": self._F,
+            "errors": np.array(self.errors),
+            "confidence": np.array(self.confidence),
+            **mixed,
+            **stored.to_arrays(self.systems),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray], device: Device | str | None = None) -> Inverse:
+        """Of what `to_arrays` gave, on a device that is opened at once.
+
+        Raises
+        ------
+        InputError
+            Arrays that are missing, or do not fit each other.
+        """
+        for name in ("grid", "first_bounce", "errors", "confidence"):
+            if name not in arrays:
+                raise InputError(f"an inverse has the array {name!r}, which is missing")
+        systems = stored.from_arrays(open_device(device), arrays)
+        if any(X.sign != -1.0 for X in systems):
+            raise InputError("the operators are I + R; those of an inverse are I - A")
+        errors = np.ravel(arrays["errors"]).tolist()
+        confidence = float(checks.shape("confidence", arrays["confidence"], ()))
+        grid, F = checks.shape("grid", arrays["grid"], (2,)), arrays["first_bounce"]
+        return cls([X.R for X in systems], errors, grid.tolist(), F, arrays.get("mixing"), confidence)
 
     def refuse_beyond(self, rtol: float | None) -> None:
         """Refuse a tolerance that is below the error."""
