@@ -5,12 +5,15 @@ R is compressed, as `compress` does, in a basis that both sides share; A is foun
 coefficients again (`iteration`), and stored in as few bytes as its own error allows. With e what solutions
 with R~ may be off by and g that of the inverse of S~ = I + R~,
 
-    ||x~ - x|| <= ||x~ - x_R|| + ||x_R - x|| <= (g (1 + e) + e) ||x||.
+    ||x~ - x|| <= ||x~ - x_R|| + ||x_R - x|| <= (g (1 + e) + e) ||x||,
+
+and what float32 rounds in a product, sqrt(N) units of it, is added.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +37,8 @@ from ltcl.transport import Transport, require
 BASES = ("db2", "haar", "db4", "pixels")
 _SHARE = 0.4  # of the tolerance, for R
 _ITERATION = 0.9  # of the rest, for A; the last tenth is for rounding its core
+_UNIT = 2.0**-24  # rounding of float32
+_BOUNCES = 2.0  # |b| and |A| |b|, where A takes no more light than there is
 _CONFIDENCE = 1e-6  # what each of two bounds may fail with
 
 Note = Callable[[str, float], object]
@@ -123,19 +128,27 @@ class _Coefficients:
 def _invert(S: IdentityPlus, rtol: float, method: str, own: Callable) -> tuple[Operator, float]:
     """A of one channel, and what solutions may be off by; `own` gives the basis of A for that of R."""
     R, off = _coefficients(S), S.solution_error
-    rest = (rtol - off) / (1.0 + off)
+    norm = _norm(R.matrix, 1.0, S.device)
+    rounding = _UNIT * math.sqrt(S.shape[0]) * norm  # of x relative to x, for every unit of |b| + |A| |b|
+    rest = (rtol - off - _BOUNCES * rounding) / (1.0 + off)
+    if rest <= 0.0:
+        least = checks.upwards(off + _BOUNCES * rounding)
+        raise InputError(
+            f"rtol is {rtol:g}, but float32 leaves products off by {least}; it must be above that"
+        )
     A = invert_coefficients(R.matrix, rtol=_ITERATION * rest, method=method, device=S.device)
-    core, error = _stored(R.matrix, A.D, A.error, rest, S.device)
-    error = error * (1.0 + off) + off
+    core, error = _stored(R.matrix, A.D, A.error, rest, norm, S.device)
+    size = _norm(core.matrix(), -1.0, S.device)
+    error = error * (1.0 + off) + off + _BOUNCES * rounding
     # Of X = I - A~ and A~ - A = (I - X S) S^-1, where ||I - X S|| <= error.
-    dropped = error / (1.0 - error) * _norm(core.matrix(), -1.0, S.device)
-    return Compressed(core, own(R.basis), own(R.basis), error=dropped), error
+    return Compressed(core, own(R.basis), own(R.basis), error=error / (1.0 - error) * size), error
 
 
-def _stored(R: Any, A: Any, error: float, rest: float, device: Device) -> tuple[CSR | Tiles, float]:
+def _stored(
+    R: Any, A: Any, error: float, rest: float, norm: float, device: Device
+) -> tuple[CSR | Tiles, float]:
     """A in few bytes, and the error of I - A then: at most `rest`."""
-    allowance = (1.0 - _ITERATION) * rest / _norm(R, 1.0, device)
-    core = cores.best(device, A, allowance).operator
+    core = cores.best(device, A, (1.0 - _ITERATION) * rest / norm).operator
     if isinstance(core, Tiles):
         bound = certify(Residual(R, core.matrix(), 1.0), device, rest)
         if bound.upper <= rest:

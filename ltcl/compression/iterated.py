@@ -56,7 +56,8 @@ class Iterated:
 
     def __str__(self) -> str:
         n = self.D.shape[0]
+        advice = "" if self.converged else f": {self.status.value}"
         return (
             f"{self.method}: {self.status.name.lower()} after {self.products} products, "
-            f"error {self.error:.2g}, {self.D.nnz / n:.3g} numbers a row: {self.status.value}"
+            f"error {self.error:.2g}, {self.D.nnz / n:.3g} numbers a row{advice}"
         )

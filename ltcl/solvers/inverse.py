@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -35,13 +36,14 @@ class Inverse:
     bounces : sequence of 1 or 3 Operator, (N, N)
         A of each channel.
     errors : sequence of float
-        Bound on ``||x~ - x|| / ||x||`` of every solution in each channel, with the `confidence`.
+        Bound on ``||x~ - x|| / ||x||`` of every solution in each channel.
     grid : (h, w)
     first_bounce : (N,) or (channels, N)
         F of T; 0 at masked pixels.
     mixing : (3, 3), optional
         Of the projector's colours, as in `ltcl.Transport`.
     confidence : float
+        Of each of these bounds, over the random starts of `theory.two_norm`.
 
     Attributes
     ----------
@@ -82,7 +84,7 @@ class Inverse:
         self._F = checks.shape("first_bounce", np.atleast_2d(F), (len(bounces), n))
         self.mixing = None if mixing is None else channels.mixing(mixing, len(bounces), None)
         self.confidence = checks.number("confidence", confidence, above=0.0, most=1.0)
-        self._known: Transport | None = None  # the last one that this was found to be the inverse of
+        self._known: weakref.ref[Transport] | None = None  # the last that this was found to fit
 
     def __repr__(self) -> str:
         (h, w), kind = self.grid, {1: "grey", 3: "colour"}[self.channels]
@@ -247,7 +249,7 @@ class Inverse:
 
     def refuse_other(self, T: Transport) -> None:
         """Refuse a transport that this is not the inverse of: told by one random light, once a transport."""
-        if self._known is T:
+        if self._known is not None and self._known() is T:
             return
         for name in ("grid", "channels"):
             if getattr(T, name) != getattr(self, name):
@@ -265,7 +267,7 @@ class Inverse:
                 f"inverse is not that of T: a random light comes back off by {missed:.2g}, which may be "
                 f"{checks.upwards(allowed)} at most; make it with ltcl.invert(T)"
             )
-        self._known = T
+        self._known = weakref.ref(T)
 
     def _miss(self, T: Transport) -> tuple[float, float]:
         """By how much X S v misses v, relatively and in the worst channel, and what it may be."""
