@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 from ltcl import checks
 from ltcl.compression import cores, fit, kinds
@@ -162,19 +163,34 @@ def inverse_bound(problem: Problem, fitted: Fit) -> float:
     return inverse_norm(IdentityPlus(problem.operator)).upper
 
 
-def refuse(problem: Problem, candidate: Candidate, rtol: float, budget: float, parts: float = 1.0) -> None:
+class TooLarge(InputError):
+    """No core of one channel is within its share of the budget.
+
+    Attributes
+    ----------
+    needed : float
+        The whole budget that this tolerance takes.
+    allows : float
+        A tolerance that the budget allows; 1 or more where it allows none.
+    """
+
+    def __init__(self, budget: float, rtol: float, needed: float, allows: float) -> None:
+        self.budget, self.rtol, self.needed, self.allows = budget, rtol, needed, allows
+        advice = f"it allows rtol {_up(allows)}" if allows < 1.0 else "no rtol below 1 fits into it"
+        super().__init__(
+            f"budget is {budget:.0f} bytes, but rtol {rtol:g} needs {math.ceil(needed)} "
+            f"({checks.size(needed)}); {advice}"
+        )
+
+
+def refuse(problem: Problem, candidate: Candidate, rtol: float, budget: float, parts: float) -> NoReturn:
     """Say which budget this tolerance needs, and which tolerance the budget allows."""
     core, found = candidate.core, candidate.found
     sizes = Magnitudes.of(found.core.data)
     count = int(0.95 * budget * candidate.fit.coefficients.core.nnz / core.nbytes)
-    kept = found.above(sizes.at_most(max(count, 0)))
-    fitted = fit.measure(problem, candidate.fit.kind, kept)
+    fitted = fit.measure(problem, candidate.fit.kind, found.above(sizes.at_most(count)))
     error = 1.1 * inverse_bound(problem, fitted) * fitted.norm.upper / DROPPING
-    advice = f"it allows rtol {_up(error)}" if error < 1.0 else "no rtol below 1 fits into it"
-    raise InputError(
-        f"budget is {parts * budget:.0f} bytes, but rtol {rtol:g} needs {math.ceil(parts * core.nbytes)} "
-        f"({checks.size(parts * core.nbytes)}); {advice}"
-    )
+    raise TooLarge(parts * budget, rtol, parts * core.nbytes, error)
 
 
 def _up(error: float) -> str:

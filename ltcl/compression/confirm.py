@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from ltcl.compression import choice, cores, fit
 from ltcl.compression.choice import Candidate, Choice
 from ltcl.compression.coefficients import Coefficients
@@ -20,7 +22,7 @@ from ltcl.compression.inverse_norm import inverse_norm
 from ltcl.compression.kinds import Kind
 from ltcl.compression.result import ChannelCompression
 from ltcl.errors import InputError
-from ltcl.operators import Compressed, IdentityPlus
+from ltcl.operators import CSR, Compressed, IdentityPlus, Operator, Tiles
 from ltcl.theory import TwoNorm, two_norm
 
 _TRIES = 6
@@ -44,6 +46,18 @@ class Confirmed:
     def solution_error(self) -> float:
         """Bound on ||x~ - x|| / ||x||."""
         return self.norm.upper * self.inverse.upper
+
+    def fresh(self, kind: Kind, diagonal: np.ndarray | None) -> Compressed:
+        """R~ again, of the same numbers but without what measuring it has left on the device.
+
+        `kind` is fresh, too; `diagonal` is that of R.
+        """
+        core = self.core.operator
+        if isinstance(core, Tiles):
+            again: Operator = Tiles(core.device, core.packed)
+        else:
+            again = CSR(core.device, self.fit.coefficients.core)
+        return Compressed(again, kind.out, kind.into, error=self.norm.upper, diagonal=diagonal)
 
     def report(self, made: Choice) -> ChannelCompression:
         """What is told of this channel."""
@@ -144,7 +158,7 @@ def _measured(problem: Problem, fitted: Fit, core: Core) -> Confirmed:
     R = fitted.operator(core.operator)
     total = fit.certain(fitted.coefficients) + core.quantisation
     norm = two_norm(problem.operator, R, factor=1.05, frobenius=total, seed=_FRESH)
-    inverse = inverse_norm(IdentityPlus(R), seed=_FRESH + 1)
+    inverse = inverse_norm(IdentityPlus(R), factor=1.05, seed=_FRESH + 1)
     R.error = norm.upper
     timed = core if core.seconds is None or R.two_sided else cores.seconds(R)
     core = timed if isinstance(timed, Core) else dataclasses.replace(core, seconds=timed)

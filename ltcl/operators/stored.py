@@ -92,10 +92,14 @@ def _operator(A: Operator, bases: list[Basis]) -> Arrays:
     if type(A) is Compressed:
         sides = {"out": np.array(_number(A.out, bases)), "into": np.array(_number(A.into, bases))}
         known = {} if A.known_diagonal is None else {"diagonal": A.known_diagonal}
-        return own | {"kind": np.array("compressed")} | sides | known | _named("core", _operator(A.core, bases))
+        return (
+            own | {"kind": np.array("compressed")} | sides | known | _named("core", _operator(A.core, bases))
+        )
     if type(A) is Sum:
         parts = [_named(f"part_{i}", _operator(B, bases)) for i, B in enumerate(A.operators)]
-        return own | {"kind": np.array("sum")} | {name: value for part in parts for name, value in part.items()}
+        return (
+            own | {"kind": np.array("sum")} | {name: value for part in parts for name, value in part.items()}
+        )
     raise InputTypeError(f"R holds a {type(A).__name__}, which cannot be kept as arrays")
 
 
@@ -141,7 +145,9 @@ class _Reader:
         if kind == "sum":
             names = sorted({name.split(".")[0] for name in own if name.startswith("part_")}, key=_trailing)
             return Sum(*(self._operator(_under(own, name), depth + 1) for name in names))
-        found = self._core(checks.one_of("kind of a stored operator", kind, [*_CORES, "compressed", "sum"]), own)
+        found = self._core(
+            checks.one_of("kind of a stored operator", kind, [*_CORES, "compressed", "sum"]), own
+        )
         found.error = error
         return found
 
