@@ -14,7 +14,7 @@ from ltcl.operators import Basis, basis
 from ltcl.operators.wavelets import filters
 
 PIXELS, HILBERT, ROWS = "pixels", "hilbert", " rows"
-KINDS = ("db2", "haar", "db4", "db2 rows", "haar rows", PIXELS)  # in the order they are tried
+KINDS = ("db2", "haar", "db4", "db2 rows", "haar rows", PIXELS, HILBERT)  # in the order they are tried
 
 
 @dataclass(frozen=True)

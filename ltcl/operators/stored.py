@@ -85,24 +85,6 @@ def from_arrays(device: Device, arrays: Mapping[str, np.ndarray]) -> tuple[Ident
 
 
 def _operator(A: Operator, bases: list[Basis]) -> Arrays:
-<<<<<<< HEAD
-    own: Arrays = {"error": np.array(float(A.error))}
-    for kind, core in _CORES.items():
-        if type(A) is core:
-            return own | {"kind": np.array(kind)} | A.to_arrays()
-    if type(A) is Compressed:
-        sides = {"out": np.array(_number(A.out, bases)), "into": np.array(_number(A.into, bases))}
-        known = {} if A.known_diagonal is None else {"diagonal": A.known_diagonal}
-        return (
-            own | {"kind": np.array("compressed")} | sides | known | _named("core", _operator(A.core, bases))
-        )
-    if type(A) is Sum:
-        parts = [_named(f"part_{i}", _operator(B, bases)) for i, B in enumerate(A.operators)]
-        return (
-            own | {"kind": np.array("sum")} | {name: value for part in parts for name, value in part.items()}
-        )
-    raise InputTypeError(f"R holds a {type(A).__name__}, which cannot be kept as arrays")
-=======
     kind = next((kind for kind, known in _KINDS.items() if type(A) is known), None)
     if kind is None:
         raise InputTypeError(f"R holds a {type(A).__name__}, which cannot be kept as arrays")
@@ -118,7 +100,6 @@ def _operator(A: Operator, bases: list[Basis]) -> Arrays:
         return own
     assert isinstance(A, CSR | Dense | Tiles)  # noqa: S101 - the other kinds
     return own | A.to_arrays()
->>>>>>> coef
 
 
 def _number(W: Basis | None, bases: list[Basis]) -> int:
@@ -163,13 +144,7 @@ class _Reader:
         if kind == "sum":
             names = sorted({name.split(".")[0] for name in own if name.startswith("part_")}, key=_trailing)
             return Sum(*(self._operator(_under(own, name), depth + 1) for name in names))
-<<<<<<< HEAD
-        found = self._core(
-            checks.one_of("kind of a stored operator", kind, [*_CORES, "compressed", "sum"]), own
-        )
-=======
         found = self._core(kind, own)
->>>>>>> coef
         found.error = error
         return found
 
