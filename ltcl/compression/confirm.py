@@ -114,26 +114,26 @@ def confirm(
         found, fitted = made.best.found, made.best.fit
     else:
         found, fitted = _whole(problem, kind, made, progress)
-    loosened, result = False, None
+    good: Confirmed | None = None
+    reached = math.inf
     for _ in range(_TRIES):
         core = cores.best(problem.device, fitted.coefficients.core, choice.ROUNDING * goal, budget)
         if core.nbytes > budget:
             choice.refuse(problem, Candidate(fitted, core, None, found), rtol, budget, parts)
         result = _measured(problem, fitted, core)
         reached = result.solution_error / rtol
-        if reached <= 1.0 and (loosened or reached >= _LOOSE or not core.nbytes):
+        if reached <= 1.0 and (reached >= _LOOSE or not fitted.coefficients.core.nnz):
             return result
-        loosened |= reached <= 1.0
-        start = fitted.coefficients.dropped * _AIM / reached
-        goal *= _AIM / reached
+        if good is not None:  # the larger threshold was too large, or gained little
+            return result if reached <= 1.0 else good
+        good = result if reached <= 1.0 else None
+        start = fitted.coefficients.dropped * _AIM / max(reached, 1e-9)
+        goal *= _AIM / max(reached, 1e-9)
         if found.dropped > choice.DROPPING * goal:
             found = fit.gather(problem, kind, choice.GATHER * choice.DROPPING * goal, progress=progress)
         fitted = fit.fit(problem, kind, found, choice.DROPPING * goal, start)
-    assert result is not None  # noqa: S101 - there was an attempt
-    if result.solution_error <= rtol:
-        return result
     raise InputError(
-        f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by {result.solution_error:.2g}; "
+        f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by {reached * rtol:.2g}; "
         "it must be larger"
     )
 
