@@ -28,6 +28,7 @@ from ltcl.theory import TwoNorm, two_norm
 _TRIES = 6
 _AIM = 0.96  # of the tolerance
 _LOOSE = 0.8  # of it: so far below, a larger threshold is tried once
+_MOST = 3.0  # times: no threshold grows by more
 _FRESH = 1  # seed of the random starts
 _MORE = 4  # times the numbers kept on the window, which the whole may need
 
@@ -127,8 +128,8 @@ def confirm(
         if good is not None:  # the larger threshold was too large, or gained little
             return result if reached <= 1.0 else good
         good = result if reached <= 1.0 else None
-        start = fitted.coefficients.dropped * _AIM / max(reached, 1e-9)
-        goal *= _AIM / max(reached, 1e-9)
+        change = _AIM / max(reached, _AIM / _MOST)
+        start, goal = change * fitted.coefficients.dropped, change * goal
         if found.dropped > choice.DROPPING * goal:
             found = fit.gather(problem, kind, choice.GATHER * choice.DROPPING * goal, progress=progress)
         fitted = fit.fit(problem, kind, found, choice.DROPPING * goal, start)
