@@ -111,15 +111,21 @@ def compress(
         masked, mixing = False, None
     find = functools.cache(functools.partial(kinds.kind, channels[0].device))
     share = float("inf") if limit is None else limit / len(channels)
-    made = [
-        _channel(problem, names, rtol, share, len(channels), find, _note(progress, index, len(channels)))
-        for index, problem in enumerate(channels)
+    made = _each(
+        [
+            functools.partial(_channel, problem, names, rtol, share, len(channels), find, note)
+            for problem, note in zip(channels, _notes(progress, len(channels)), strict=True)
+        ]
+    )
+    fresh = functools.cache(functools.partial(kinds.kind, channels[0].device, shape))
+    systems = [
+        IdentityPlus(
+            one.fresh(fresh(one.fit.kind.name), _diagonal(problem)), solution_error=one.solution_error
+        )
+        for problem, (one, _) in zip(channels, made, strict=True)
     ]
     C = Transport(
-        [
-            ScaledColumns(IdentityPlus(one.operator, solution_error=one.solution_error), f)
-            for (one, _), f in zip(made, F, strict=True)
-        ],
+        [ScaledColumns(S, f) for S, f in zip(systems, F, strict=True)],
         shape,
         first_bounce=F,
         on_dark="mask" if masked else "raise",
@@ -129,6 +135,20 @@ def compress(
     spent = time.perf_counter() - started
     C.compression = Compression(rtol, limit, pixels(shape)[1], spent, reports)
     return C
+
+
+def _each(tasks: Sequence[Callable[[], Any]]) -> list[Any]:
+    """What the tasks of all channels give; refused by the one that needs the largest budget."""
+    made, refused = [], []
+    for task in tasks:
+        try:
+            made.append(task())
+        except choice.TooLarge as error:
+            refused.append(error)
+    if refused:
+        needed, allows = (max(getattr(error, name) for error in refused) for name in ("needed", "allows"))
+        raise choice.TooLarge(refused[0].budget, refused[0].rtol, needed, allows)
+    return made
 
 
 def _channel(
@@ -165,6 +185,13 @@ def _channel(
     )
     note("done", 1.0)
     return found, found.report(made)
+
+
+def _diagonal(problem: Problem) -> np.ndarray | None:
+    try:
+        return problem.operator.diagonal()
+    except InputError:  # somebody's own operator, which does not tell it
+        return None
 
 
 def _names(basis: str | Sequence[str] | None) -> Sequence[str]:
@@ -231,9 +258,12 @@ def _first_bounce(parts: Sequence[RowSource], given: Any, device: Device, memory
     return F
 
 
-def _note(progress: Note | None, index: int, count: int) -> Note:
-    """`progress` for one of several channels."""
-    if progress is None:
-        return lambda text, share: None
-    name = f"{('red', 'green', 'blue')[index]}: " if count == 3 else ""
-    return lambda text, share: progress(name + text, (index + share) / count)
+def _notes(progress: Note | None, count: int) -> list[Note]:
+    """`progress` for each of several channels."""
+    names = ("red: ", "green: ", "blue: ") if count == 3 else ("",)
+
+    def note(index: int, text: str, share: float) -> None:
+        if progress is not None:
+            progress(names[index] + text, (index + share) / count)
+
+    return [functools.partial(note, index) for index in range(count)]

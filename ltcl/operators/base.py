@@ -16,6 +16,9 @@ from ltcl.device import Array, Device
 from ltcl.errors import InputError
 
 WIDTHS = (8, 4, 3, 2, 1)  # right-hand sides one launch of a product kernel takes
+MOST = (
+    1 << 14
+)  # items along the second and third dimension where kernels stride: GPUs take 65535 groups there
 
 
 @dataclass(frozen=True)

@@ -105,9 +105,9 @@ PRECISIONS = {
 def narrow(numbers: np.ndarray, precision: str, unit: float | None = None) -> Narrow:
     """The numbers of tiles, (tiles, width), in a precision; `unit` is given where they have had one before.
 
-    >>> found = narrow(np.array([[1.0, -127.0], [0.5, 0.0]]), "int8")
-    >>> found.decoded().tolist()
-    [[1.0, -127.0], [0.5, 0.0]]
+    >>> found = narrow(np.array([[1.2, -127.0]]), "int8")
+    >>> found.codes.tolist(), found.decoded().tolist(), found.nbytes
+    ([[1, -127]], [[1.0, -127.0]], 3)
     """
     _to_float32(numbers)  # refuses what float32 arithmetic cannot hold
     if unit is None:

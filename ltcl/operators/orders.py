@@ -75,7 +75,7 @@ def relatives(grid: Any, levels: int) -> np.ndarray:
     Examples
     --------
     >>> relatives((2, 4), 1).tolist()
-    [0, 2, 4, 6, 1, 3, 5, 7]
+    [0, 1, 2, 4, 6, 3, 5, 7]
     """
     h, w = checks.grid("grid", grid)
     checks.count("levels", levels, least=0)

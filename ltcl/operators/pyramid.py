@@ -14,7 +14,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, Device
-from ltcl.operators.base import group_of, lanes_of
+from ltcl.operators.base import MOST, group_of, lanes_of
 from ltcl.operators.bases import Basis
 
 
@@ -72,13 +72,12 @@ class Pyramid(Basis):
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
         if x.columns == 0:
             return
-        steps = [("gather", level) for level in range(len(self.cells))]
-        if transpose:
-            steps = [("spread", level) for level, _ in reversed(list(enumerate(self.cells)))]
+        levels = range(len(self.cells))
+        name, levels = ("spread", reversed(levels)) if transpose else ("gather", levels)
         with self._lock:
             if self._sums.size < self.shape[0] * x.columns:
                 self._sums = self.device.empty(self.shape[0] * x.columns)
-            for name, level in steps:
+            for level in levels:
                 self._launch(name, level, scale, int(add is not None), x, self._sums, add or out, out)
 
     def _launch(self, name: str, level: int, *arguments: Any) -> None:
@@ -87,9 +86,9 @@ class Pyramid(Basis):
         kernel = self.device.kernel("pyramid", f"pyramid_{name}", K=lanes)
         pieces = -(-k // lanes)
         if self.device.is_cpu:
-            size, group = (1, min(w, -(-64 // h)), h), (1, 1, 1)
+            size, group = (1, min(w, -(-64 // h)), min(h, MOST)), (1, 1, 1)
         else:
-            size, group = (pieces, w, h), (*group_of(pieces), 1)
+            size, group = (pieces, min(w, MOST), min(h, MOST)), (*group_of(pieces), 1)
         kernel(size, group, *self.grid, level, len(self.cells), k, *arguments)
 
 
