@@ -30,7 +30,7 @@ from ltcl.exact import beside
 from ltcl.operators import IdentityPlus
 from ltcl.single_view import negative_bounces
 from ltcl.solvers import Inverse, Solution, sampled, solve
-from ltcl.solvers.inverse import require_inverse
+from ltcl.solvers.precomputed import require_inverse
 from ltcl.solvers.solve import SAMPLED
 from ltcl.transport import Transport, require
 

@@ -21,7 +21,7 @@ from ltcl.compensation.start import Backward, Start, at_gain, at_largest_gain
 from ltcl.errors import ConvergenceError
 from ltcl.exact import beside
 from ltcl.solvers import Bounded, Inverse, Status
-from ltcl.solvers.inverse import require_inverse
+from ltcl.solvers.precomputed import require_inverse
 from ltcl.transport import Transport, require
 
 _EXPLAINED = 3.0  # times the root mean square of an error: few of a solve's are larger

@@ -8,6 +8,12 @@ from typing import Any
 
 from ltcl.solvers.result import Status
 
+_ADVICE = {
+    Status.MAXITER: "maxiter was reached before the tolerance; raise maxiter, or loosen rtol",
+    Status.DIVERGED: "the residual grew; try method='elimination', or a wider spectrum=",
+    Status.STAGNATED: "the type of C has no more digits; loosen rtol, or give C in float64",
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Iterated:
@@ -56,7 +62,7 @@ class Iterated:
 
     def __str__(self) -> str:
         n = self.D.shape[0]
-        advice = "" if self.converged else f": {self.status.value}"
+        advice = "" if self.converged else f": {_ADVICE.get(self.status, self.status.value)}"
         return (
             f"{self.method}: {self.status.name.lower()} after {self.products} products, "
             f"error {self.error:.2g}, {self.D.nnz / n:.3g} numbers a row{advice}"

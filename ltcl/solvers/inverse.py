@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-import weakref
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,15 +16,11 @@ import numpy as np
 
 from ltcl import channels, checks, first_bounces, layout
 from ltcl.device import Device, open_device
-from ltcl.errors import InputError, InputTypeError
+from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus, Operator, stored
 from ltcl.operators.interreflection import nbytes
 from ltcl.solvers import units
 from ltcl.solvers.result import Solution, Status
-from ltcl.transport import Transport, require
-
-_SAME = 1e-6  # relative difference of first bounces, which float32 hardly tells from none
-_ROUNDING = 1e-5  # of float32, in the light that tells whether an inverse is that of a transport
 
 
 class Inverse:
@@ -84,7 +79,6 @@ class Inverse:
         self._F = checks.shape("first_bounce", np.atleast_2d(F), (len(bounces), n))
         self.mixing = None if mixing is None else channels.mixing(mixing, len(bounces), None)
         self.confidence = checks.number("confidence", confidence, above=0.0, most=1.0)
-        self._known: weakref.ref[Transport] | None = None  # the last that this was found to fit
 
     def __repr__(self) -> str:
         (h, w), kind = self.grid, {1: "grey", 3: "colour"}[self.channels]
@@ -147,7 +141,9 @@ class Inverse:
         """
         start = time.perf_counter()
         self.refuse_beyond(rtol)
-        X = self.systems[checks.count("channel", channel, least=0)]
+        if checks.count("channel", channel, least=0) >= self.channels:
+            raise InputError(f"channel is {channel}; it must be below {self.channels}")
+        X = self.systems[channel]
         b = checks.finite("b", checks.real("b", b))
         if b.ndim not in (1, 2) or b.shape[0] != X.shape[0] or b.size == 0:
             raise InputError(f"b has shape {b.shape}; it must be ({X.shape[0]},) or ({X.shape[0]}, k)")
@@ -193,7 +189,7 @@ class Inverse:
         >>> ltcl.invert(T).pattern(numpy.array([[0.3, 0.3]])).round(2).tolist()
         [[0.5, 0.5]]
         """
-        low, high = (checks.number(f"bounds[{i}]", bound) for i, bound in enumerate(bounds))
+        low, high = _bounds(bounds)
         gain, dark = checks.number("gain", gain, above=0.0), checks.number("background", background)
         columns, shape = layout.unpack("desired", desired, self.grid, self.channels)
         solved = [self.solve(gain * b - dark, channel).x for channel, b in enumerate(columns)]
@@ -247,44 +243,11 @@ class Inverse:
                 "ask for no less, or make a better one with ltcl.invert(T, rtol=...)"
             )
 
-    def refuse_other(self, T: Transport) -> None:
-        """Refuse a transport that this is not the inverse of: told by one random light, once a transport."""
-        if self._known is not None and self._known() is T:
-            return
-        for name in ("grid", "channels"):
-            if getattr(T, name) != getattr(self, name):
-                raise InputError(
-                    f"inverse has {name} {getattr(self, name)}; it must be that of T, {getattr(T, name)}"
-                )
-        if not np.allclose(self._F, np.atleast_2d(T.first_bounce), rtol=_SAME, atol=0.0):
-            raise InputError("inverse has another first bounce than T; make it with ltcl.invert(T)")
-        own, others = (np.eye(3) if M is None else M for M in (self.mixing, T.mixing))
-        if not np.array_equal(own, others):
-            raise InputError("inverse mixes colours in another way than T; make it with ltcl.invert(T)")
-        missed, allowed = self._miss(T)
-        if not missed <= allowed:
-            raise InputError(
-                f"inverse is not that of T: a random light comes back off by {missed:.2g}, which may be "
-                f"{checks.upwards(allowed)} at most; make it with ltcl.invert(T)"
-            )
-        self._known = weakref.ref(T)
 
-    def _miss(self, T: Transport) -> tuple[float, float]:
-        """By how much X S v misses v, relatively and in the worst channel, and what it may be."""
-        v = np.random.default_rng(0).standard_normal(T.shape[1]).astype(np.float32)
-        misses = [np.linalg.norm(X @ (S @ v) - v) for X, S in zip(self.systems, T.systems, strict=True)]
-        off = T.error * (1.0 + self.error)
-        return float(max(misses) / np.linalg.norm(v)), self.error + off + _ROUNDING
-
-
-def require_inverse(T: Transport, inverse: Any, rtol: float | None, **others: Any) -> Inverse:
-    """`inverse`, if it can serve for T at `rtol`; `others` are arguments that it takes the place of."""
-    if not isinstance(inverse, Inverse):
-        raise InputTypeError(f"inverse is a {type(inverse).__name__}; it must be what ltcl.invert(T) gives")
-    for name, value in others.items():
-        if value is not None:
-            raise InputError(f"{name} is given, but inverse takes the place of all solves; leave one out")
-    require(T)
-    inverse.refuse_beyond(rtol)
-    inverse.refuse_other(T)
-    return inverse
+def _bounds(value: Any) -> tuple[float, float]:
+    try:
+        low, high = value
+    except (TypeError, ValueError):
+        raise InputError(f"bounds is {value!r}; it must be (low, high)") from None
+    low = checks.number("bounds[0]", low)
+    return low, checks.number("bounds[1]", high, above=low)

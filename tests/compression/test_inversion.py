@@ -84,18 +84,40 @@ def test_colours_have_their_own(smooth):
     assert c.error <= 2e-2
 
 
+def counted(monkeypatch):
+    """The systems that products are made with from now on, one entry each."""
+    products, product = [], IdentityPlus._product
+
+    def count(self, *arguments):
+        products.append(self)
+        return product(self, *arguments)
+
+    monkeypatch.setattr(IdentityPlus, "_product", count)
+    return products
+
+
+def test_further_frames_take_one_product_each(smooth, monkeypatch):
+    T, inverse = smooth
+    frames = np.full((3, *T.grid), 0.3)
+    ltcl.compensate(T, frames, inverse=inverse)  # tells that the two belong together
+    ltcl.separate(T, T @ frames, 1, rtol=1e-2, inverse=inverse)  # and looks for gloss
+    (X,), (S,) = inverse.systems, T.systems
+    products = counted(monkeypatch)
+    ltcl.compensate(T, frames, inverse=inverse)
+    assert products == [X, S]  # S for the appearance
+    products.clear()
+    inverse.pattern(frames)
+    assert products == [X]
+    products.clear()
+    ltcl.separate(T, frames, 3, rtol=1e-2, inverse=inverse)
+    assert products == [X] * 4
+
+
 @pytest.mark.parametrize("columns", [(), (1,), (5,)])
 def test_a_solution_is_one_product(smooth, columns, monkeypatch):
     T, inverse = smooth
     b = RNG.random((128, *columns))
-    products = []
-    product = IdentityPlus._product
-
-    def counted(self, *arguments):
-        products.append(self)
-        return product(self, *arguments)
-
-    monkeypatch.setattr(IdentityPlus, "_product", counted)
+    products = counted(monkeypatch)
     s = inverse.solve(b)
     assert products == [inverse.systems[0]]
     monkeypatch.undo()
@@ -248,6 +270,13 @@ def test_what_it_cannot_do_is_refused_before_it_does_anything(smooth):
         ltcl.compensate(T, picture, rtol=1e-5, inverse=inverse)
     with pytest.raises(InputError, match=r"b has shape \(3,\); it must be \(128,\)"):
         inverse.solve(np.ones(3))
+    with pytest.raises(InputError, match="channel is 1; it must be below 1"):
+        inverse.solve(np.ones(128), 1)
+    for bounds in ((1.0, 0.0), 3):
+        with pytest.raises(InputError, match="bounds"):
+            inverse.pattern(picture, bounds=bounds)
+    with pytest.raises(InputError, match=r"desired has shape \(3, 3\)"):
+        inverse.pattern(np.ones((3, 3)))
     with pytest.raises(InputError, match="method is given, but inverse takes the place"):
         ltcl.compensate(T, picture, method="cg", inverse=inverse)
     with pytest.raises(InputError, match="exact is given, but inverse takes the place"):
