@@ -19,7 +19,7 @@ from ltcl.theory import two_norm
 
 _WIDTHS = (1, 8, 16)
 _MORE = 1.5  # times the fewest bytes: what takes more is not timed
-_ALIKE = 1.15  # times the least seconds: noise, and bytes decide
+_ALIKE, _LAUNCH = 1.15, 2e-5  # times the least seconds, and seconds more: noise, and bytes decide
 _REPEATS = 7
 
 
@@ -75,7 +75,8 @@ def choose(cores: list[Core]) -> Core:
     """The fastest, of those alike the smallest; the smallest where one was not timed."""
     times = [core.seconds for core in cores if core.seconds is not None]
     if len(times) == len(cores):
-        cores = [core for core in cores if (core.seconds or 0.0) <= _ALIKE * min(times)]
+        most = max(_ALIKE * min(times), min(times) + _LAUNCH)
+        cores = [core for core in cores if (core.seconds or 0.0) <= most]
     return min(cores, key=lambda core: core.nbytes)
 
 
