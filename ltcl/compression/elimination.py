@@ -20,8 +20,8 @@ from ltcl.device import Device
 from ltcl.errors import InputError
 from ltcl.solvers.result import Status
 
-_DENSE = 2.0e10  # additions and multiplications in a second, of dense elimination
-_SPARSE = 1.5e8  # and of sparse products; two cores, measured
+_DENSE = 2.0e10  # additions and multiplications in a second of dense elimination, roughly, on two cores
+_SPARSE = 1.5e8  # multiplications of sparse products; only the ratio of the two decides
 _PRODUCTS = 6
 _MATRICES = 4  # dense ones in memory at once
 _LARGEST = 8192  # rows
