@@ -10,7 +10,8 @@
 //
 // Required define: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8.
 // Layout: the cells of all levels one after another, the finest first, each level row-major, right-hand
-// sides side by side. height and width are the picture's. sums (cells, k) is scratch, of which level 0 is not used.
+// sides side by side. height and width are the picture's. sums is scratch for as many, of which level 0 is not
+// used, with a spare cell between levels: wide loads reach beyond the last of a level.
 
 #include "common/pieces.h"
 
@@ -36,7 +37,7 @@ kernel void pyramid_gather(
 {
     const cells a = cells_at(height, width, level), below = cells_at(height, width, max(level - 1, 0));
     const int reach = level == 0 ? 1 : 2;
-    global const real *of = level < 2 ? x : sums + below.at * k;
+    global const real *of = level < 2 ? x : sums + (below.at + level - 1) * k;
     for (int row = get_global_id(2); row < a.height; row += get_global_size(2))
         for (int column = get_global_id(1); column < a.width; column += get_global_size(1))
             for (int p = get_global_id(0); p < pieces_of(k); p += get_global_size(0)) {
@@ -47,7 +48,7 @@ kernel void pyramid_gather(
                         sum += LOAD(of + (i * below.width + j) * k + q.at);
                 const int cell = (a.at + row * a.width + column) * k + q.at;
                 if (level > 0 && level + 1 < levels)
-                    put(sums, cell, sum, q.skip, 1, 0, x);
+                    put(sums, level * k + cell, sum, q.skip, 1, 0, x);
                 put(out, cell, sum, q.skip, scale, adds, add);
             }
 }
@@ -65,9 +66,9 @@ kernel void pyramid_spread(
                 const int cell = (a.at + row * a.width + column) * k + q.at;
                 lanes sum = LOAD(x + cell);
                 if (level + 1 < levels)
-                    sum += LOAD(sums + (above.at + row / 2 * above.width + column / 2) * k + q.at);
+                    sum += LOAD(sums + (above.at + level + 1 + row / 2 * above.width + column / 2) * k + q.at);
                 if (level > 0)
-                    put(sums, cell, sum, q.skip, 1, 0, x);
+                    put(sums, level * k + cell, sum, q.skip, 1, 0, x);
                 else
                     put(out, cell, sum, q.skip, scale, adds, add);
             }

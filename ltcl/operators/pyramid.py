@@ -75,8 +75,9 @@ class Pyramid(Basis):
         levels = range(len(self.cells))
         name, levels = ("spread", reversed(levels)) if transpose else ("gather", levels)
         with self._lock:
-            if self._sums.size < self.shape[0] * x.columns:
-                self._sums = self.device.empty(self.shape[0] * x.columns)
+            needed = (self.shape[0] + len(self.cells)) * x.columns  # a spare cell a level
+            if self._sums.size < needed:
+                self._sums = self.device.empty(needed)
             for level in levels:
                 self._launch(name, level, scale, int(add is not None), x, self._sums, add or out, out)
 
