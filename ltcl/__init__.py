@@ -14,6 +14,7 @@ The house, from the ground up; imports point down only:
     errors, checks, files           one-line refusals; outputs that appear whole or not at all
     device                          OpenCL: devices, kernels, arrays; operators: matrices there, S = I + R
     transport, theory, solvers      T = S F; what can be forecast; one algorithm per file
+    exact, parts                    a compressed T beside the one it stands for; as the arrays of a file
     compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
     compression                     T in few numbers, with a bound on what solutions lose
     images, layout, report          pictures, pictures as right-hand sides, JSON

@@ -60,7 +60,7 @@ class Separation:
         scene. The first bounce of a glossy scene is off by a few times as much, later ones by more.
     warning : str
         Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 and the
-        negative light at most 0.005, or unknown.
+        negative light at most 0.005, or unknown; of a compressed T both may be more by its error.
     """
 
     direct: np.ndarray
@@ -140,7 +140,7 @@ def separate(
 
     direct, *indirect = [picture([chain.bounces[k] for chain in chains]) for k in range(bounces + 1)]
     negative = max(negative_bounces(true))
-    warning = _warning(true.reciprocity_defect, negative)
+    warning = _warning(true.reciprocity_defect, negative, true.error)
     if warning:
         logger.warning(warning)
     per_bounce = [tuple(chain.solutions[k] for chain in chains) for k in range(bounces + 1)]
@@ -156,13 +156,16 @@ def separate(
     )
 
 
-def _warning(defect: float, negative: float) -> str:
-    """What is wrong with T for a separation; nothing where both are small, or unknown."""
+def _warning(defect: float, negative: float, error: float) -> str:
+    """What is wrong with T for a separation; nothing where both are small, or unknown.
+
+    What a compressed T may be off by is no sign of anything.
+    """
     found = []
-    if defect > LARGEST_DEFECT:
-        found.append(f"T is not reciprocal (defect {defect:.2g}, above {LARGEST_DEFECT:g})")
-    if negative > LARGEST_NEGATIVE:
-        found.append(f"a bounce takes away {negative:.2g} of its light (above {LARGEST_NEGATIVE:g})")
+    if defect > (most := LARGEST_DEFECT + error):
+        found.append(f"T is not reciprocal (defect {defect:.2g}, above {most:.2g})")
+    if negative > (most := LARGEST_NEGATIVE + error):
+        found.append(f"a bounce takes away {negative:.2g} of its light (above {most:.2g})")
     if not found:
         return ""
     return (

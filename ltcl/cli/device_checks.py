@@ -96,18 +96,18 @@ def _product(A: Operator, truth: np.ndarray) -> str:
     return _agrees(worst, 1e-5, "NumPy")
 
 
-def _tiles(device: Device, R: scipy.sparse.csr_array) -> str:
-    """Each width and each precision once, against what the tiles stand for."""
-    kinds = ((16, "float32"), (8, "bfloat16"), (1, "float16"), (16, "int8"))
-    made = [Tiles(device, R, width, precision) for width, precision in kinds]
-    return max(_product(tiles, tiles.to_dense()) for tiles in made)
-
-
 def _wavelets() -> np.ndarray:
     """What PyWavelets makes of pictures of 8 x 8 pixels, a column each of which has one pixel lit."""
     pictures = np.eye(64).reshape(64, 8, 8)
     coefficients = [pywt.dwt2(picture, "db2", "periodization") for picture in pictures]
     return np.stack([pywt.coeffs_to_array(list(c))[0].ravel() for c in coefficients], axis=1)
+
+
+def _tiles(device: Device, R: scipy.sparse.csr_array) -> str:
+    """Each width and each precision once, against what the tiles stand for."""
+    kinds = ((16, "float32"), (8, "bfloat16"), (1, "float16"), (16, "int8"))
+    made = [Tiles(device, R, width, precision) for width, precision in kinds]
+    return max(_product(tiles, tiles.to_dense()) for tiles in made)
 
 
 def _solve(S: Operator, R: np.ndarray) -> str:

@@ -19,7 +19,7 @@ from ltcl.transport import Transport
 logger = logging.getLogger(__name__)
 
 Columns = list[np.ndarray]
-_OWN = ("bounds", "background", "gain", "loss", "weights", "method", "rtol")
+_OWN = ("bounds", "background", "gain", "loss", "weights", "method", "rtol", "exact")
 _OPTIONS = ("atol", "maxiter", "callback", "throw")  # of `ltcl.solve`, that a solve within bounds has, too
 
 _LEAST_LOSS = 1e-6

@@ -196,7 +196,7 @@ class Transposed(Operator):
     def __init__(self, base: Operator) -> None:
         super().__init__(base.device, base.shape[::-1])
         self.base = base
-        self.error = base.error
+        self.error, self.solution_error = base.error, base.solution_error
 
     @property
     def nbytes(self) -> int:
