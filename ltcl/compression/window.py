@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from ltcl.compression.fit import Problem
-from ltcl.compression.sources import source
+from ltcl.compression.sources import at_once, cut, source
 from ltcl.operators import Dense
 
 SIDE = 64
@@ -31,7 +31,7 @@ def window(problem: Problem, side: int | None = None) -> Problem:
         return problem
     R = np.empty((len(chosen), len(chosen)), np.float32)
     for row in range(grid[0]):  # neighbours in a row of the picture
-        part = slice(row * grid[1], (row + 1) * grid[1])
-        first = int(chosen[part][0])
-        R[part] = problem.R.rows(first, first + grid[1])[:, chosen]
+        for start, stop in cut(grid[1], at_once(problem.pixels, problem.memory)):
+            place, first = row * grid[1], int(chosen[row * grid[1]])
+            R[place + start : place + stop] = problem.R.rows(first + start, first + stop)[:, chosen]
     return Problem(source("R", R), Dense(problem.device, R), grid, problem.memory)

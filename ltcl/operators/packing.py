@@ -16,6 +16,8 @@ from ltcl.errors import InputError
 from ltcl.operators.covers import PLACES, WIDTHS, Cover, Layout, cover
 from ltcl.operators.narrow import PRECISIONS, Narrow, narrow
 
+_STORED = ("shape", "layout", "pointers", "starts", "precision", "codes", "scales", "unit", "difference")
+
 
 class Difference(NamedTuple):
     """Of two matrices: its Frobenius norm, and a bound on its 2-norm."""
@@ -93,6 +95,9 @@ class Packed:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Packed:
         """Of what `to_arrays` gave; what does not fit together is refused."""
+        lacking = [name for name in _STORED if name not in arrays]
+        if lacking:
+            raise InputError(f"stored tiles lack {', '.join(lacking)}; they must be what to_arrays gave")
         precision = checks.one_of("precision", str(arrays["precision"]), PRECISIONS)
         width, granule, pages, long = (int(n) for n in arrays["layout"])
         codes, scales = np.asarray(arrays["codes"]), np.asarray(arrays["scales"])
@@ -169,7 +174,12 @@ def spread(kept: Any, matrix: Any, width: int) -> scipy.sparse.csr_array:
 def given(matrix: Any) -> scipy.sparse.csr_array:
     """A matrix as users hold it, sparse or dense, as a checked `csr_array`."""
     if scipy.sparse.issparse(matrix):
-        return checks.csr("matrix", matrix)
+        checked = checks.csr("matrix", matrix)
+        if np.all(checked.data):
+            return checked
+        checked = checked.copy()
+        checked.eliminate_zeros()  # they would claim tiles
+        return checked
     dense = checks.finite("matrix", checks.real("matrix", matrix))
     if dense.ndim != 2:
         raise InputError(f"matrix has shape {dense.shape}; it must be (M, N)")

@@ -43,7 +43,10 @@ def test_refusals(program: Program, transport: Path, tmp_path: Path) -> None:
         "budget is 10 bytes", "needs"
     )
     program("compress", transport, "--out", tmp_path / "C.txt").refused("C.txt")
-    assert not out.exists()
+    program("compress", transport, "--out", tmp_path / "C.npy").refused(
+        "C.npy; a compressed transport must be"
+    )
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -206,6 +206,8 @@ def test_a_window_is_the_middle():
     chosen = [row * 12 + column for row in range(1, 5) for column in range(4, 8)]
     np.testing.assert_allclose(part.operator.to_dense(), R[np.ix_(chosen, chosen)], rtol=1e-6)
     assert part.grid == (4, 4)
+    few = window.Problem(problem.R, problem.operator, problem.grid, memory=32 * len(R) * 16)
+    np.testing.assert_array_equal(window.window(few, 4).operator.to_dense(), part.operator.to_dense())
     assert window.window(problem, 64) is problem
 
 

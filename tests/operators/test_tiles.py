@@ -229,6 +229,20 @@ def test_stored_arrays_that_do_not_fit_are_refused(device, name, spoil):
         Tiles.from_arrays(device, {**arrays, name: spoil(arrays[name])})
 
 
+def test_stored_arrays_that_lack_one_are_refused(device):
+    arrays = Tiles(device, gallery.SPARSE["53x7"]).to_arrays()
+    for name in arrays:
+        with pytest.raises(InputError, match=f"lack {name}"):
+            Tiles.from_arrays(device, {other: array for other, array in arrays.items() if other != name})
+
+
+def test_zeros_that_are_stored_claim_no_tiles():
+    matrix = scipy.sparse.csr_array(np.ones((2, 40)))
+    matrix.data[1:] = 0
+    assert len(pack(matrix, 8).starts) == 1
+    assert matrix.nnz == 80  # the user's matrix is left alone
+
+
 def test_bytes_are_those_of_the_buffers(device, small_device):
     A = Tiles(device, gallery.SPARSE["stretches"], 8, "int8")
     tiles = len(A.packed.starts)
