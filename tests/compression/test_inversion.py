@@ -261,11 +261,20 @@ def test_refusals(change, error, words):
     assert "\n" not in str(refused.value)
 
 
+def test_separation_asks_for_no_more_than_there_is_unless_told_to(smooth):
+    T, inverse = smooth
+    picture = T @ np.full(T.grid, 0.3)
+    exact, found = ltcl.separate(T, picture, 2, rtol=1e-5), ltcl.separate(T, picture, 2, inverse=inverse)
+    assert all(one.products == 1 for one in found.solutions)
+    off = np.linalg.norm(found.direct - exact.direct) / np.linalg.norm(exact.direct)
+    assert 0.0 < off <= inverse.error
+
+
 def test_what_it_cannot_do_is_refused_before_it_does_anything(smooth):
     T, inverse = smooth
     picture = np.full(T.grid, 0.3)
     with pytest.raises(InputError, match=r"rtol is 0.001, but what this inverse gives may be off by 0.0"):
-        ltcl.separate(T, picture, inverse=inverse)
+        ltcl.separate(T, picture, rtol=1e-3, inverse=inverse)
     with pytest.raises(InputError, match=r"rtol is 1e-05, but what this inverse"):
         ltcl.compensate(T, picture, rtol=1e-5, inverse=inverse)
     with pytest.raises(InputError, match=r"b has shape \(3,\); it must be \(128,\)"):
