@@ -129,7 +129,9 @@ def confirm(
             return result if reached <= 1.0 else good
         good = result if reached <= 1.0 else None
         change = _AIM / max(reached, _AIM / _MOST)
-        start, goal = change * fitted.coefficients.dropped, change * goal
+        # From what the fit came to, which may be well below the goal that it had.
+        goal = change * max(fitted.norm.upper / choice.DROPPING, 0.5 * goal)
+        start = change * fitted.coefficients.dropped
         if found.dropped > choice.DROPPING * goal:
             found = fit.gather(problem, kind, choice.GATHER * choice.DROPPING * goal, progress=progress)
         fitted = fit.fit(problem, kind, found, choice.DROPPING * goal, start)

@@ -27,7 +27,7 @@ from ltcl.compression.streamed import Streamed
 from ltcl.compression.window import pixels, window
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.operators import IdentityPlus, ScaledColumns
+from ltcl.operators import IdentityPlus, Operator, ScaledColumns, Shifted
 from ltcl.operators.interreflection import made_with
 from ltcl.transport import Transport, require
 
@@ -52,8 +52,9 @@ def compress(
     ----------
     T : Transport, or (N, N) rows of one
         Square. Or what gives the rows of T a block at a time and may be far larger than memory: an array or
-        memory-mapped file, an HDF5 or zarr array, anything with ``shape`` and ``rows(start, stop)``, a
-        sequence of 3 of these for RGB; `grid` and `first_bounce` then come with it.
+        memory-mapped file, an HDF5 or zarr array, anything with ``shape`` and ``rows(start, stop)``; or an
+        operator, whose rows are products of its transpose; a sequence of 3 of these for RGB. `grid` and
+        `first_bounce` then come with it.
     rtol : float
         The relative error that a solution x of S x = b may have: ``||x~ - x|| <= rtol ||x||``, any b.
     budget : int, optional
@@ -106,6 +107,9 @@ def compress(
     names = _names(basis)
     if isinstance(T, Transport):
         given = _of_transport(T, memory, {"grid": grid, "first_bounce": first_bounce, "device": device})
+    elif _are_operators(T):  # their products are at hand, their rows are made of those
+        F = "diagonal" if first_bounce is None else first_bounce
+        given = _of_transport(Transport(T, _grid(grid), F, device=device), memory, {})
     else:
         given = _of_rows(T, grid, first_bounce, device, memory)
     parts = len(given.problems)
@@ -228,7 +232,7 @@ def _of_transport(T: Transport, memory: int | None, others: dict[str, Any]) -> _
     try:
         operators = [S.R for S in T.systems]
     except MemoryLimitError:
-        operators = [Streamed(T.device, R, memory) for R in rows]
+        operators = [_streamed(T.device, R, memory) for R in rows]
     problems = [Problem(R, A, T.grid, memory) for R, A in zip(rows, operators, strict=True)]
     return _Given(problems, F, T.grid, bool(T.masked.any()), T.mixing)
 
@@ -241,13 +245,29 @@ def _of_rows(T: Any, grid: Any, first_bounce: Any, device: Device | str | None, 
     for part in parts:
         if tuple(part.shape) != (n, n):
             raise InputError(f"T has shape {tuple(part.shape)}; it must be square, (N, N), to have an S")
-    if grid is None:
-        raise InputError(f"grid is None, but T is rows of a matrix; it must be (h, w) with h * w = {n}")
-    shape = checks.grid("grid", grid, n)
+    shape = checks.grid("grid", _grid(grid), n)
     chosen = device if isinstance(device, Device) else open_device(device)
     F = _first_bounce(parts, first_bounce, chosen, memory)
     rows = [Interreflection(part, f) for part, f in zip(parts, F, strict=True)]
-    return _Given([Problem(R, Streamed(chosen, R, memory), shape, memory) for R in rows], F, shape)
+    return _Given([Problem(R, _streamed(chosen, R, memory), shape, memory) for R in rows], F, shape)
+
+
+def _streamed(device: Device, R: Interreflection, memory: int | None) -> Operator:
+    """R = T F^-1 - I by products with the rows of T as they are read."""
+    lit = R.F > 0
+    scaled = ScaledColumns(Streamed(device, R.T, memory), np.where(lit, 1.0 / np.where(lit, R.F, 1.0), 0.0))
+    return Shifted(scaled, None if lit.all() else lit)
+
+
+def _grid(grid: Any) -> Any:
+    if grid is None:
+        raise InputError("grid is None, but T is no Transport; it must be (h, w), the projector's pixels")
+    return grid
+
+
+def _are_operators(T: Any) -> bool:
+    parts = T if isinstance(T, (list, tuple)) else [T]
+    return all(hasattr(part, "matvec") and not isinstance(part, RowSource) for part in parts)
 
 
 def _first_bounce(parts: Sequence[RowSource], given: Any, device: Device, memory: int | None) -> np.ndarray:

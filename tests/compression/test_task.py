@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 import scipy.sparse
+import scipy.sparse.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +16,7 @@ import ltcl
 from ltcl import checks
 from ltcl.compression import window
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import Compressed, Tiles
+from ltcl.operators import Compressed, Dense, Tiles
 from tests import gallery
 from tests.compression.helpers import smooth
 
@@ -178,6 +179,15 @@ def test_rows_from_elsewhere_give_the_same_bits(tmp_path):
     np.testing.assert_array_equal(kept.first_bounce, streamed.first_bounce)
 
 
+def test_operators_give_their_rows_by_products(device):
+    T = ltcl.scenes.dihedral(8, albedo=0.8).transport()
+    for operator in (Dense(device, T.matrices[0]), scipy.sparse.linalg.aslinearoperator(T.matrices[0])):
+        F = None if isinstance(operator, Dense) else T.first_bounce
+        C = ltcl.compress(operator, 0.05, basis="db2", grid=T.grid, first_bounce=F)
+        np.testing.assert_allclose(C.first_bounce, T.first_bounce, rtol=1e-6)
+        assert worst_error(dense_systems(T)[0], C.systems[0].to_dense()) <= C.error <= 0.05
+
+
 def test_rows_may_be_dropped_where_no_memory_holds_them(monkeypatch):
     T = ltcl.scenes.dihedral(16, albedo=0.8).transport()
     systems = T.systems  # before there is no memory left
@@ -258,7 +268,7 @@ def test_other_refusals():
     T, rows = SCENES["one pixel"](), np.eye(6)
     with pytest.raises(InputError, match="grid is 2 x 4"):
         ltcl.compress(rows, grid=(2, 4))
-    with pytest.raises(InputError, match="grid is None, but T is rows"):
+    with pytest.raises(InputError, match="grid is None, but T is no Transport"):
         ltcl.compress(rows)
     with pytest.raises(InputError, match=r"T has shape \(6, 5\); it must be square"):
         ltcl.compress(rows[:, :5], grid=(1, 6))
