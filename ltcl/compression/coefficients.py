@@ -22,7 +22,8 @@ from ltcl.compression.sources import COLUMNS, RowSource, at_once, cut
 
 Transform = Callable[[np.ndarray], np.ndarray]  # (N, k) float32 -> (M, k) float32, k a multiple of COLUMNS
 _FEW = 16  # blocks tell what may be dropped between the passes
-_SHARE = 8  # one of so many numbers is looked at for a threshold
+_SHARE = 8  # one of so many rows or columns is looked at for a threshold
+_LEAST = 512  # but so many at least, or all
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def coefficients(
     out, into : callable (N, k) -> (M', k), or None for pixels
         W_out of (M, k), W_in of (N, k); orthonormal.
     threshold : float, optional
-        What is smaller is dropped at the end. When not given, an eighth of the numbers is looked at for one
+        What is smaller is dropped at the end. When not given, a sample of the numbers is looked at for one
         that drops about the Frobenius norm `drop`, or more where about `most` are kept with it.
     first : float, optional
         What is smaller is dropped between the passes. With 0 nothing is, and all M x N' numbers lie in
@@ -156,9 +157,9 @@ class _Rows:
         return _transformed(self.into, rows.T)
 
     def sample(self, most: int = 1 << 30) -> _Sample:
-        """Of an eighth of the rows, and at most `most` blocks."""
+        """Of an eighth of the rows or more, and at most `most` blocks."""
         starts = np.arange(0, self.count, COLUMNS)
-        wanted = min(-(-len(starts) // _SHARE), most)
+        wanted = min(max(-(-len(starts) // _SHARE), _LEAST // COLUMNS), len(starts), most)
         chosen = np.sort(np.random.default_rng(0).choice(starts, wanted, replace=False))
         blocks = [np.arange(start, min(start + COLUMNS, self.count)) for start in chosen]
         return _sampled(self, blocks)
@@ -189,7 +190,7 @@ class _Columns:
 
     def sample(self) -> _Sample:
         # Single columns: those of large numbers lie side by side, and blocks would hit or miss them all.
-        chosen = np.random.default_rng(0).permutation(self.count)[: -(-self.count // _SHARE)]
+        chosen = np.random.default_rng(0).permutation(self.count)[: max(-(-self.count // _SHARE), _LEAST)]
         return _sampled(self, [chosen[start:stop] for start, stop in cut(len(chosen), 4 * COLUMNS)])
 
 

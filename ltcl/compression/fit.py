@@ -25,6 +25,8 @@ _STEPS = 6
 _CLOSE = 0.85  # of the goal is good enough
 _AIM = 0.94
 _FACTOR = 1.06  # between the bounds of a norm
+_MISLED = 1.25  # times the Frobenius norm that was to be dropped: a sample was not like the rest
+_BINDS = 0.5  # of the numbers that are to be kept at most
 _ROUNDING = 1e-6  # of coefficients that went through transforms in float32
 
 
@@ -68,15 +70,24 @@ def gather(
     most: int | None = None,
     progress: Callable[[float], object] | None = None,
 ) -> Coefficients:
-    """Coefficients to fit: all but about the Frobenius norm `drop`, and at most about `most`."""
-    return coefficients(
-        problem.R,
-        *kind.transforms,
-        drop=drop,
-        most=most,
-        memory=problem.memory,
-        progress=progress,
-    )
+    """Coefficients to fit: all but about the Frobenius norm `drop`, and at most about `most`.
+
+    The threshold comes from a sample; where that has misled, all is read again.
+    """
+    wanted = drop
+    while True:
+        found = coefficients(
+            problem.R,
+            *kind.transforms,
+            drop=wanted,
+            most=most,
+            memory=problem.memory,
+            progress=progress,
+        )
+        bound = most is not None and found.core.nnz >= _BINDS * most
+        if found.second <= _MISLED * drop or bound or found.threshold == 0.0:
+            return found
+        wanted *= drop / found.second
 
 
 def fit(problem: Problem, kind: Kind, found: Coefficients, goal: float, start: float | None = None) -> Fit:
