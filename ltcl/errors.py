@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ltcl.compression.iteration import Iterated
     from ltcl.solvers.result import Solution
 
 
@@ -40,6 +41,6 @@ class DeviceError(LtclError, RuntimeError):
 class ConvergenceError(LtclError, ArithmeticError):
     """A solve did not reach its tolerance. `solution` holds the best iterate and the history."""
 
-    def __init__(self, message: str, solution: Solution) -> None:
+    def __init__(self, message: str, solution: Solution | Iterated) -> None:
         super().__init__(message)
         self.solution = solution

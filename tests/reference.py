@@ -33,6 +33,25 @@ def csr_matvec(
     return out if add is None else out + add
 
 
+def tile_matvec(
+    pointers: np.ndarray,
+    columns: np.ndarray,
+    values: np.ndarray,
+    factors: np.ndarray,
+    x: np.ndarray,
+    scale: float = 1.0,
+    add: np.ndarray | None = None,
+) -> np.ndarray:
+    """out = scale * diag(factors) (A x) + add; columns are the first of each tile, values (tiles, width)."""
+    x, values = np.asarray(x, np.float64), np.asarray(values, np.float64)
+    sums = np.zeros((len(pointers) - 1, *x.shape[1:]))
+    for row, (start, stop) in enumerate(itertools.pairwise(pointers)):
+        for tile in range(start, stop):
+            sums[row] += values[tile] @ x[columns[tile] : columns[tile] + values.shape[1]]
+    out = scale * (sums.T * factors).T
+    return out if add is None else out + add
+
+
 def dense_matvec(
     matrix: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
 ) -> np.ndarray:

@@ -32,6 +32,7 @@ LAYERS: list[set[str]] = [
     {"solvers"},
     {
         "compensation",
+        "compression",
         "single_view",
         "separation",
         "relighting",

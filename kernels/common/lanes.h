@@ -22,24 +22,30 @@
 #if K == 8
 typedef real8 lanes;
 #define LOAD(x) LOAD8(x)
+#define STORE(v, x) STORE8(v, x)
 #elif K == 4
 typedef real4 lanes;
 #define LOAD(x) LOAD4(x)
+#define STORE(v, x) STORE4(v, x)
 #elif K == 3
 typedef real4 lanes;  // the fourth lane is never stored; every ltcl buffer ends in 16 spare bytes for it
 #define LOAD(x) LOAD4(x)
+#define STORE(v, x) (STORE2((v).lo, x), (x)[2] = (v).s2)
 #elif K == 2
 typedef float2 lanes;
 #define LOAD(x) LOAD2(x)
-#elif K != 1
+#define STORE(v, x) STORE2(v, x)
+#elif K == 1
+typedef real lanes;
+#define LOAD(x) (*(x))
+#define STORE(v, x) (*(x) = (v))
+#else
 #error "K must be 1, 2, 3, 4 or 8"
 #endif
 
-#if K > 1
 typedef union {
     lanes vector;
     real item[sizeof(lanes) / sizeof(real)];
 } lanes_items;
-#endif
 
 #endif

@@ -12,7 +12,7 @@ typedef float real;
 typedef float4 real4;
 typedef float8 real8;
 
-// Wide loads from any address that is aligned to one real. PoCL 3.0 compiles vload8 to a call, twice as
+// Wide loads and stores at any address that is aligned to one real. PoCL 3.0 compiles vload8 to a call, twice as
 // slow as the unaligned load instruction that Clang makes of a vector type with its alignment lowered.
 #ifdef __clang__
 typedef float2 real2_packed __attribute__((aligned(4)));
@@ -21,10 +21,23 @@ typedef real8 real8_packed __attribute__((aligned(4)));
 #define LOAD2(p) (*(global const real2_packed *)(p))
 #define LOAD4(p) (*(global const real4_packed *)(p))
 #define LOAD8(p) (*(global const real8_packed *)(p))
+#define STORE2(v, p) (*(global real2_packed *)(p) = (v))
+#define STORE4(v, p) (*(global real4_packed *)(p) = (v))
+#define STORE8(v, p) (*(global real8_packed *)(p) = (v))
 #else
 #define LOAD2(p) vload2(0, p)
 #define LOAD4(p) vload4(0, p)
 #define LOAD8(p) vload8(0, p)
+#define STORE2(v, p) vstore2(v, 0, p)
+#define STORE4(v, p) vstore4(v, 0, p)
+#define STORE8(v, p) vstore8(v, 0, p)
+#endif
+
+// What works on several values at once must be inlined: a call passes each of them through memory.
+#ifdef __clang__
+#define INLINE inline __attribute__((always_inline))
+#else
+#define INLINE inline
 #endif
 
 // Every product ends in out = scale * sum + add, so that one launch makes a residual or an iteration.

@@ -33,13 +33,6 @@ typedef union {
     real item[LANES];
 } stretch_items;
 
-// What works on stretches must be inlined: a call passes each of them through memory.
-#ifdef __clang__
-#define INLINE inline __attribute__((always_inline))
-#else
-#define INLINE inline
-#endif
-
 // PoCL compiles fabs() of eight lanes to a call.
 INLINE stretch magnitude(stretch v)
 {

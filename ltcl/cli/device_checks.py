@@ -16,7 +16,7 @@ import scipy.sparse
 
 from ltcl.device import Device, cache, list_devices, sources, trial
 from ltcl.errors import DeviceError, FileError
-from ltcl.operators import CSR, Dense, IdentityPlus, Operator
+from ltcl.operators import CSR, Dense, IdentityPlus, Operator, Tiles
 from ltcl.operators.base import WIDTHS
 from ltcl.solvers import solve
 
@@ -64,6 +64,7 @@ def on_device(device: Device) -> dict[str, Callable[[], str]]:
     return {
         **{f"kernels/{file}.cl": partial(_compile, device, file) for file in files},
         "sparse product": lambda: _product(CSR(device, scipy.sparse.csr_array(R)), R),
+        "products of tiles": lambda: _tiles(device, scipy.sparse.csr_array(R)),
         "dense product": lambda: _product(Dense(device, R), R),
         "solve": lambda: _solve(IdentityPlus(Dense(device, R)), R),
     }
@@ -71,7 +72,7 @@ def on_device(device: Device) -> dict[str, Callable[[], str]]:
 
 def _compile(device: Device, file: str) -> str:
     """Build a kernel file with every value of the defines it requires."""
-    values = {"K": WIDTHS, "LANES": (8 if device.is_cpu else 1,)}
+    values = {"K": WIDTHS, "LANES": (8 if device.is_cpu else 1,), "TAPS": (2, 4, 8)}
     names = sorted(set(_GUARD.findall(sources.load(file).text)))
     choices = [values.get(name, (1,)) for name in names]
     built = [
@@ -91,6 +92,13 @@ def _product(A: Operator, truth: np.ndarray) -> str:
         for found, wanted in ((A @ x, truth @ x), (A.T @ x, truth.T @ x)):
             worst = max(worst, float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted)))
     return _agrees(worst, 1e-5, "NumPy")
+
+
+def _tiles(device: Device, R: scipy.sparse.csr_array) -> str:
+    """Each width and each precision once, against what the tiles stand for."""
+    kinds = ((16, "float32"), (8, "bfloat16"), (1, "float16"), (16, "int8"))
+    made = [Tiles(device, R, width, precision) for width, precision in kinds]
+    return max(_product(tiles, tiles.to_dense()) for tiles in made)
 
 
 def _solve(S: Operator, R: np.ndarray) -> str:

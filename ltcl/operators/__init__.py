@@ -9,26 +9,39 @@ import scipy.sparse
 
 from ltcl.device import Device, open_device
 from ltcl.operators.base import Norms, Operator, Transposed
+from ltcl.operators.bases import Basis, Chained, Ordered
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators.compressed import Compressed, Sum
 from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.packing import smallest
+from ltcl.operators.tiles import Tiles
+from ltcl.operators.wavelets import Wavelet
 
 __all__ = [
     "CSR",
+    "Basis",
+    "Chained",
+    "Compressed",
     "Coupled",
     "Dense",
     "Host",
     "IdentityPlus",
     "Norms",
     "Operator",
+    "Ordered",
     "Pattern",
     "ScaledColumns",
     "Shifted",
+    "Sum",
+    "Tiles",
     "Transposed",
+    "Wavelet",
     "as_operator",
     "interreflections",
+    "smallest",
 ]
 
 

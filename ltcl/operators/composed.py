@@ -28,6 +28,10 @@ class IdentityPlus(Operator):
         +1 for I + R, -1 for I - R.
     weights : (N,), optional
         All positive: S is self-adjoint in the inner product <x, y> = sum_i w_i x_i y_i, as far as is known.
+    solution_error : float
+        Bound on ``||x~ - x|| / ||x||`` for every right-hand side, x~ the solution with this S and x with the
+        one that it was compressed from: ``||S^-1|| ||E||``, E what was dropped. 0 for exact ones, infinite
+        where nothing is known.
 
     Examples
     --------
@@ -38,14 +42,24 @@ class IdentityPlus(Operator):
     [1.0, 0.5]
     """
 
-    def __init__(self, R: Operator, sign: float = 1.0, weights: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        R: Operator,
+        sign: float = 1.0,
+        weights: np.ndarray | None = None,
+        *,
+        solution_error: float = 0.0,
+    ) -> None:
         if R.shape[0] != R.shape[1]:
             raise InputError(f"R has shape {R.shape}; S = I + R needs a square one")
         if sign not in (1.0, -1.0):
             raise InputError(f"sign is {sign!r}; it must be 1 for I + R or -1 for I - R")
+        if not solution_error >= 0.0:
+            raise InputError(f"solution_error is {solution_error!r}; it must be a number of at least 0")
         super().__init__(R.device, R.shape)
         self.R = R
         self.sign = float(sign)
+        self.solution_error = float(solution_error)
         self.error = R.error
         self.weights = None if weights is None else checks.shape("weights", weights, R.shape[:1])
 

@@ -23,6 +23,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import Operator
 from ltcl.solvers.columns import ratio
 from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import Monitor, System
@@ -63,8 +64,13 @@ class CG:
         if self.normal:
             _normal_equations(system, x, r, monitor)
         else:
-            weights = system.S.weights if self.weights is None else self.weights
-            _conjugate_gradients(system, x, r, monitor, _Inner(system, weights))
+            _conjugate_gradients(system, x, r, monitor, _Inner(system, self.inner(system.S)))
+
+    def inner(self, S: Operator) -> Any:
+        """The weights of the inner product that a solve with S has, (N,), or None of the plain one."""
+        if self.normal:
+            return None
+        return S.weights if self.weights is None else self.weights
 
 
 class _Inner:

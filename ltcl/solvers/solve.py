@@ -15,7 +15,7 @@ from ltcl import checks
 from ltcl.device import Array
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
-from ltcl.solvers import auto, sampled
+from ltcl.solvers import auto, coefficients, refinement, sampled, units
 from ltcl.solvers.bicgstab import BiCGStab
 from ltcl.solvers.block_gauss_seidel import BlockGaussSeidel
 from ltcl.solvers.cg import CG
@@ -31,7 +31,7 @@ from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.richardson import Richardson
 from ltcl.solvers.sor import SOR
 from ltcl.solvers.southwell import Southwell
-from ltcl.solvers.stopping import Monitor, Rule, System
+from ltcl.solvers.stopping import Rule, System
 
 ITERATIVE = {
     method.name: method
@@ -65,6 +65,7 @@ def solve(
     x0: Any = None,
     callback: Callable[[int, float], object] | None = None,
     throw: bool = True,
+    exact: Any = None,
     **options: Any,
 ) -> Solution:
     """Solve S x = b with products by S only.
@@ -91,6 +92,9 @@ def solve(
     throw : bool
         Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that sample,
         whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
+    exact : like S, optional
+        What a compressed S stands for: S then makes the steps, and the residual is that of `exact`, for a
+        tolerance that S alone cannot keep; see `ltcl.solvers.refinement`.
     **options
         Of the method, for instance ``spectrum=(0.5, 4.0)`` of chebyshev. An unknown one is an error.
 
@@ -101,7 +105,8 @@ def solve(
     Raises
     ------
     InputError, InputTypeError
-        Shapes that do not fit, NaN, a tolerance or option out of range.
+        Shapes that do not fit, NaN, a tolerance or option out of range, or below what a compressed S is
+        worth.
     ConvergenceError
         Divergence or ``maxiter``, with the best iterate in ``.solution``.
 
@@ -154,11 +159,17 @@ def solve(
     rule = _rule(shape, b_host, rtol, atol, maxiter, callback)
     guess = _guess(x0, b_host)
     chosen = _method(method, options)
+    if exact is not None and method in SAMPLED:
+        raise InputTypeError(f"exact= corrects iterates, but method {method!r} samples; leave it out")
     if isinstance(chosen, MonteCarlo):
         chosen.check(shape[0])
     S = as_operator(S)
+    if exact is None:
+        refinement.refuse_beyond(S, rule, _wanted(b_host, rule))
+    else:
+        exact = refinement.exact_operator(exact, S)
     solve_it = _automatic if chosen is None else functools.partial(_run, chosen)
-    solution = solve_it(S, b_host, guess, rule)
+    solution = solve_it(S, b_host, guess, rule, exact)
     solution = dataclasses.replace(solution, seconds=time.perf_counter() - start)
     if throw and solution.status not in (Status.CONVERGED, Status.SAMPLED):
         raise ConvergenceError(str(solution), solution)
@@ -217,13 +228,16 @@ def _method(name: str, options: dict[str, Any]) -> Any:
     return kind(**options)
 
 
-def _automatic(S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
+def _automatic(
+    S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule, exact: Operator | None
+) -> Solution:
     """The first method of the plan that converges, else the best iterate; all products are counted."""
     attempts: list[Solution] = []
     reasons, products = [], 0
-    for choice in auto.plan(S, _wanted(b, rule), 1 if b.ndim == 1 else b.shape[1]):
+    wanted = min(_wanted(b, rule), 0.5) if exact is None else refinement.step_tolerance(S)
+    for choice in auto.plan(S, wanted, 1 if b.ndim == 1 else b.shape[1]):
         reasons.append(choice.why)
-        attempts.append(_run(choice.method, S, b, guess, rule))
+        attempts.append(_run(choice.method, S, b, guess, rule, exact))
         products += choice.products + attempts[-1].products
         if attempts[-1].converged:
             break
@@ -233,31 +247,38 @@ def _automatic(S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule)
 
 
 def _wanted(b: np.ndarray, rule: Rule) -> float:
-    """The relative residual that all columns have to reach."""
+    """The relative residual that all columns have to reach; infinite where all are dark."""
     norms = np.linalg.norm(b.astype(np.float64), axis=0)
-    wanted = np.maximum(rule.rtol, rule.atol / np.where(norms > 0.0, norms, np.inf))
-    return min(float(np.min(np.where(norms > 0.0, wanted, 0.5))), 0.5)
+    wanted = np.maximum(rule.rtol, rule.atol / np.where(norms > 0.0, norms, 1.0))
+    return float(np.min(np.where(norms > 0.0, wanted, np.inf)))
 
 
-def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule: Rule) -> Solution:
-    if isinstance(method, Direct):
+def _run(
+    method: Any,
+    S: Operator,
+    b: np.ndarray,
+    guess: np.ndarray | None,
+    rule: Rule,
+    exact: Operator | None = None,
+) -> Solution:
+    if isinstance(method, Direct) and exact is None:
         return _run_direct(method, S, b, rule)
-    unit = _unit(b)
-    system = System(S, S.device.upload(b / unit))
+    unit = units.of(b)
     rule = dataclasses.replace(rule, atol=rule.atol / unit)
-    x, r = _start(system, None if guess is None else guess / unit)
+    light, first = (None if part is None else S.device.upload(part / unit) for part in (b, guess))
+    assert light is not None  # noqa: S101 - b is not
     if isinstance(method, MonteCarlo | Hybrid):
-        found = method.estimate(system, x.get().astype(np.float64), r, rule, unit)
-        return sampled.solution(method, system, found, rule, functools.partial(_in_units, unit=unit))
-    monitor = Monitor(system, rule)
-    method.iterate(system, x, r, monitor)
-    best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
+        return _run_sampled(method, System(S, light), first, rule, unit)
+    if exact is None:
+        x, monitor = coefficients.iterate(method, S, light, first, rule)
+    else:
+        x, monitor = refinement.iterate(method, S, exact, light, first, rule)
     assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
     return Solution(
-        _in_units(best.get(), unit),
+        units.restored(x.get(), unit),
         monitor.status,
         monitor.iterations,
-        system.products,
+        monitor.system.products,
         tuple(monitor.residuals),
         0.0,
         method.name,
@@ -265,25 +286,10 @@ def _run(method: Any, S: Operator, b: np.ndarray, guess: np.ndarray | None, rule
     )
 
 
-def _unit(b: np.ndarray) -> np.ndarray:
-    """A power of two for each column, near its largest value: in such units norms stay inside float32."""
-    largest = np.max(np.abs(b, dtype=np.float64), axis=0)
-    return np.exp2(np.floor(np.log2(np.where(largest > 0.0, largest, 1.0))))
-
-
-def _in_units(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """x times its unit in float32, or in float64 where it is beyond float32."""
-    wide = x * unit
-    return wide if np.any(np.abs(wide) > np.finfo(np.float32).max) else wide.astype(np.float32)
-
-
-def _start(system: System, guess: np.ndarray | None) -> tuple[Array, Array]:
-    """The first iterate and its residual; that of zero is b and costs no product."""
-    device, b = system.S.device, system.b
-    if guess is None:
-        return device.upload(np.zeros(b.shape, np.float32)), b.copy()
-    x = device.upload(guess)
-    return x, system.residual(x, b.like())
+def _run_sampled(method: Any, system: System, guess: Array | None, rule: Rule, unit: np.ndarray) -> Solution:
+    x, r = coefficients.start(system, guess)
+    found = method.estimate(system, x.get().astype(np.float64), r, rule, unit)
+    return sampled.solution(method, system, found, rule, functools.partial(units.restored, unit=unit))
 
 
 def _run_direct(method: Direct, S: Operator, b: np.ndarray, rule: Rule) -> Solution:

@@ -105,6 +105,12 @@ class Monitor:
         """Iterations done: the first residual is that of the start."""
         return max(0, len(self.residuals) - 1)
 
+    @property
+    def left(self) -> float:
+        """What the residuals of the columns above the tolerance have to shrink by, at most 1."""
+        where = self.unsolved
+        return float(np.min(self._target[where] / self.norms[where], initial=1.0))
+
     def done(
         self, x: Array, r: Array, *, recursive: bool = False, replace: bool = False, lazy: bool = False
     ) -> bool:

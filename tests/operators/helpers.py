@@ -39,14 +39,14 @@ def meets_twin(A: Operator, matrix: np.ndarray, twin: Twin | None = None, *, tra
     for k in COLUMNS:
         x = gallery.vectors(matrix.shape[1], k)
         for scale, kind in EPILOGUES.values():
-            add, out = _operands(A, gallery.vectors(matrix.shape[0], k, 2), kind)
+            add, out = operands(A, gallery.vectors(matrix.shape[0], k, 2), kind)
             expected_add = None if add is None else add.get()
             assert apply(A.device.upload(x), out, scale=scale, add=add) is out
             expected = twin(x, scale, expected_add)
             close(out.get(), expected, reference.product_error(matrix, x, scale, expected_add))
 
 
-def _operands(A: Operator, values: np.ndarray, kind: str | None) -> tuple[Array | None, Array]:
+def operands(A: Operator, values: np.ndarray, kind: str | None) -> tuple[Array | None, Array]:
     if kind == "out":
         out = A.device.upload(values)
         return out, out

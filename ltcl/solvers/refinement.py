@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Iterative refinement: a compressed S~ solves, and the S that it stands for judges.
+
+    x^(k+1) = x^(k) + S~^-1 (b - S x^(k))
+
+With S~ = S + E and each solve to a tolerance t, the error shrinks by about ||S~^-1 E|| + t a step, the first
+of which the `solution_error` of S~ bounds. Below 1, any tolerance is reached that float32 products can tell,
+with one product by S a step; the others are by S~, and run on its coefficients. Otherwise residuals may grow,
+which the monitor sees. (Wilkinson, Rounding Errors in Algebraic Processes, 1963; Higham, Accuracy and
+Stability of Numerical Algorithms, 2nd ed., chapter 12.)
+
+A solve reports true residuals, those of S; its iterations are steps of refinement, and its products those by
+S and by S~ together.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ltcl.device import Array, vectors
+from ltcl.errors import InputError
+from ltcl.operators import IdentityPlus, Operator, as_operator
+from ltcl.solvers import coefficients
+from ltcl.solvers.direct import Direct
+from ltcl.solvers.result import Status
+from ltcl.solvers.stopping import Monitor, Rule, System
+
+_LEAST, _MOST = 1e-3, 0.1  # of the tolerance of a step: many short steps waste products by S, long ones by S~
+_HALF = 0.5  # of a residual: a solve that ended early but left no more is a step, too
+
+
+def refuse_beyond(S: Operator, rule: Rule, wanted: float) -> None:
+    """Refuse a relative residual `wanted` that says less about the solution than S itself."""
+    error = S.solution_error if isinstance(S, IdentityPlus) else 0.0
+    if wanted < error:
+        atol = f" and atol {rule.atol:g}" if np.any(rule.atol) else ""
+        raise InputError(
+            f"rtol is {rule.rtol:g}{atol}; S is compressed and its solutions may be off by {_up(error)}: "
+            "ask for no less, or give exact= the uncompressed S"
+        )
+
+
+def exact_operator(exact: Any, S: Operator) -> Operator:
+    """`exact` on the device of S, checked."""
+    found = as_operator(exact, S.device)
+    if found.shape != S.shape:
+        raise InputError(f"exact has shape {found.shape}; it must be that of S, {S.shape}")
+    if found.device is not S.device:
+        raise InputError(f"exact is on another device, {found.device}; it must be on {S.device}")
+    return found
+
+
+def step_tolerance(S: Operator) -> float:
+    """Relative residual of the solves with S~: no smaller than what S~ is worth.
+
+    >>> from ltcl.operators import as_operator
+    >>> step_tolerance(IdentityPlus(as_operator([[0.5]]), solution_error=0.004))
+    0.004
+    """
+    error = S.solution_error if isinstance(S, IdentityPlus) else 0.0
+    return min(max(error, _LEAST), _MOST)
+
+
+def iterate(
+    method: Any, S: Operator, exact: Operator, b: Array, guess: Array | None, rule: Rule
+) -> tuple[Array, Monitor]:
+    """Refine solutions of S~ x = b, `S` being S~, until the monitor ends it; the iterate to return."""
+    system = System(exact, b)
+    x, r = coefficients.start(system, guess)
+    monitor = Monitor(system, rule)
+    while not monitor.done(x, r):
+        step = _step(method, S, r, Rule(_tolerance(S, monitor), 0.0, rule.maxiter), system)
+        if isinstance(step, Status):
+            monitor.give_up(step)
+            break
+        vectors.axpy(1.0, step, x)
+        system.residual(x, r)
+    best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
+    return best, monitor
+
+
+def _tolerance(S: Operator, monitor: Monitor) -> float:
+    """Of the next step: that of S~, or more where less is left to do."""
+    return min(max(step_tolerance(S), _HALF * monitor.left), _MOST)
+
+
+def _step(method: Any, S: Operator, r: Array, rule: Rule, system: System) -> Array | Status:
+    """S~^-1 r, or why there is none."""
+    if isinstance(method, Direct):
+        try:
+            return S.device.upload(method.solve(S, r.get().astype(np.float64))[0])
+        except np.linalg.LinAlgError:
+            return Status.BREAKDOWN
+    step, inner = coefficients.iterate(method, S, r, None, rule)
+    system.products += inner.system.products
+    assert inner.status is not None  # noqa: S101 - iterate returns only when the monitor said so
+    return step if inner.status is Status.CONVERGED or inner.lowest <= _HALF else inner.status
+
+
+def _up(error: float) -> str:
+    """Two digits, rounded up, so that asking for what is shown is enough.
+
+    >>> _up(0.00421), _up(0.0042), _up(2.0)
+    ('0.0043', '0.0042', '2')
+    """
+    if not 0.0 < error < math.inf:
+        return f"{error:g}"
+    shown = float(f"{error:.1e}")
+    if shown < error:
+        unit = 10.0 ** (math.floor(math.log10(error)) - 1)
+        shown += unit
+    return f"{shown:.2g}"

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Bases of any size made of dense matrices, and operators compressed in them."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+
+from ltcl.device import Array, Device
+from ltcl.operators import CSR, Compressed, Dense
+from ltcl.operators.bases import Basis
+
+
+class Given(Basis):
+    """W of any matrix (M, N)."""
+
+    name = "given"
+
+    def __init__(self, device: Device, matrix: np.ndarray) -> None:
+        super().__init__(device, matrix.shape)
+        self.matrix = matrix.astype(np.float32).astype(np.float64)  # as it lies on the device
+        self.grid = (1, matrix.shape[1])
+        self.orthonormal = bool(np.allclose(matrix.T @ matrix, np.eye(matrix.shape[1]), atol=1e-5))
+        self._on_device = Dense(device, matrix)
+
+    @property
+    def nbytes(self) -> int:
+        return self._on_device.nbytes
+
+    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        self._on_device._product(x, out, scale, add, transpose)
+
+
+def rotation(n: int, seed: int = 0) -> np.ndarray:
+    """A random orthonormal matrix (n, n)."""
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))[0]
+
+
+def two_sided(device: Device, R: np.ndarray, keep: float = 1.0, seed: int = 0) -> Compressed:
+    """R in a random orthonormal basis, of whose coefficients a share `keep` stays."""
+    W = Given(device, rotation(len(R), seed))
+    C = W.matrix @ R @ W.matrix.T
+    C[np.abs(C) < np.quantile(np.abs(C), 1.0 - keep)] = 0.0
+    return Compressed(CSR(device, scipy.sparse.csr_array(C)), W, W)
+
+
+def stands_for(R: Compressed) -> np.ndarray:
+    """The float64 matrix of it, (M, N), and so the truth that its products are rounded from."""
+    C = R.core.to_dense()
+    C = C if R.out is None else R.out.matrix.T @ C  # pyright: ignore[reportAttributeAccessIssue]
+    return C if R.into is None else C @ R.into.matrix  # pyright: ignore[reportAttributeAccessIssue]
