@@ -5,6 +5,7 @@ A projector lights a concave, coloured scene; light bounces before the camera se
 ltcl undoes the bounces with matrix-vector products only.
 
     T = ltcl.load("transport.npz")             # measured, or ltcl.scenes.box(40, sides=3).transport()
+    T = ltcl.compress(T, rtol=1e-2)            # few numbers instead of N^2, solutions within 1 %
     c = ltcl.compensate(T, desired)            # c.pattern makes the wall look like `desired`
     b = ltcl.separate(T, image)                # b.direct, b.bounces: each bounce as its own picture
 
@@ -14,6 +15,7 @@ The house, from the ground up; imports point down only:
     device                          OpenCL: devices, kernels, arrays; operators: matrices there, S = I + R
     transport, theory, solvers      T = S F; what can be forecast; one algorithm per file
     compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
+    compression                     T in few numbers, with a bound on what solutions lose
     images, layout, report          pictures, pictures as right-hand sides, JSON
     plots, demo, cli                what people look at
 
@@ -29,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 from ltcl import errors
 from ltcl.analysis import Analysis, analyze
 from ltcl.compensation import Compensation, compensate
+from ltcl.compression import Compression, compress
 from ltcl.device import Device, list_devices, open_device
 from ltcl.relighting import relight
 from ltcl.separation import Separation, separate
@@ -43,6 +46,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Analysis",
     "Compensation",
+    "Compression",
     "Device",
     "Separation",
     "Solution",
@@ -50,6 +54,7 @@ __all__ = [
     "Transport",
     "analyze",
     "compensate",
+    "compress",
     "errors",
     "images",
     "list_devices",

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl.operators import Operator
+from ltcl.errors import InputError
+from ltcl.operators import IdentityPlus, Operator
 from ltcl.solvers import solve
 
 _RTOL, _MAXITER = 1e-4, 200
@@ -50,7 +51,7 @@ class Energy:
         return self.bounce_highest < 1.0
 
 
-def check(T: Any, F: np.ndarray, S: Operator) -> Energy:
+def check(T: Any, F: np.ndarray, S: IdentityPlus) -> Energy:
     """The energy of T (N, N) with first bounce F (N,), 0 at masked pixels, and its S on the device.
 
     Examples
@@ -66,17 +67,24 @@ def check(T: Any, F: np.ndarray, S: Operator) -> Energy:
     return Energy(float(once.min()), float(once.max()), _from_columns(T, F, lit), *_negative(T, F))
 
 
-def _one_bounce(S: Operator) -> np.ndarray:
+def _one_bounce(S: IdentityPlus) -> np.ndarray:
     """A 1 = 1 - S^-1 1, (N,)."""
     ones = np.ones(S.shape[0])
-    solved = solve(S, ones, "chebyshev", rtol=_RTOL, maxiter=_MAXITER, throw=False)
+    solved = solve(S.as_it_stands(), ones, "chebyshev", rtol=_RTOL, maxiter=_MAXITER, throw=False)
     return ones - solved.x if solved.converged else np.full(S.shape[0], np.nan)
 
 
 def _from_columns(T: Any, F: np.ndarray, lit: np.ndarray) -> float:
-    if not isinstance(T, (np.ndarray, scipy.sparse.csr_array)):
+    if isinstance(T, Operator):
+        try:
+            sums = T.rmatvec(np.ones(len(F)))
+        except InputError:  # of those that have no transpose
+            return float("nan")
+    elif isinstance(T, (np.ndarray, scipy.sparse.csr_array)):
+        sums = np.asarray(T.sum(axis=0, dtype=np.float64))
+    else:
         return float("nan")
-    sums = np.asarray(T.sum(axis=0, dtype=np.float64))[lit] / F[lit] - 1.0
+    sums = sums[lit] / F[lit] - 1.0
     largest = max(float(sums.max()), 0.0)
     return largest / (1.0 + largest)
 

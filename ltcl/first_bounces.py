@@ -70,15 +70,15 @@ def _exact(matrix: Any) -> np.ndarray:
     return F
 
 
-def refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, matrices: Sequence[Any]) -> None:
-    """Refuse pixels without a positive first bounce, unless they may be masked."""
+def refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, maskable: bool) -> None:
+    """Refuse pixels without a positive first bounce, unless they may be masked and this T is `maskable`."""
     pixels = np.flatnonzero(dark.any(axis=0))
     if len(pixels) == dark.shape[1]:
         raise InputError(
             "first_bounce is zero or negative at every pixel; it must be positive where light falls: "
             "check the sign and the black level of T"
         )
-    if on_dark == "mask" and all(isinstance(m, (np.ndarray, scipy.sparse.csr_array)) for m in matrices):
+    if on_dark == "mask" and maskable:
         return
     listed = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
     more = f" and {len(pixels) - 8} more" if len(pixels) > 8 else ""

@@ -24,6 +24,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 ALL, QUICK = 1 << 22, 1 << 18  # entries to compare at most, in `analyze` and in passing
+_DEARER = 16  # times an entry that is found by products
 _STEPS, _RTOL = 200, 1e-6  # of conjugate gradients
 _LARGEST = 60.0  # of |log d|: beyond, there is nothing but noise to fit
 
@@ -31,9 +32,11 @@ _LARGEST = 60.0  # of |log d|: beyond, there is nothing but noise to fit
 def defect(T: Any, F: np.ndarray, *, entries: int = ALL, seed: int = 0) -> float:
     """The defect of T, (N, N), in the module's first lines; NaN where T does not show its entries.
 
+    Operators of `ltcl.operators` show theirs, at a product for each pixel of the sample.
+
     Parameters
     ----------
-    T : array, csr_array, or LinearOperator
+    T : array, csr_array, Operator, or LinearOperator
     F : (N,)
         First bounce; pixels where it is 0 are left out.
     entries : int
@@ -50,10 +53,14 @@ def defect(T: Any, F: np.ndarray, *, entries: int = ALL, seed: int = 0) -> float
     >>> round(defect(np.array([[1.0, 0.2], [0.0, 1.0]]), np.ones(2)), 3)
     1.0
     """
-    if not isinstance(T, (np.ndarray, scipy.sparse.csr_array)):
+    lit = np.flatnonzero(F > 0)
+    if hasattr(T, "between"):
+        pixels = _sample(lit, len(F) ** 2, len(F), entries // _DEARER, seed)
+        R = _indirect(T.between(pixels, pixels), F[pixels], np.arange(len(pixels)))
+    elif isinstance(T, (np.ndarray, scipy.sparse.csr_array)):
+        R = _indirect(T, F, _sample(lit, _stored(T), len(F), entries, seed))
+    else:
         return float("nan")
-    pixels = _sample(np.flatnonzero(F > 0), _stored(T), len(F), entries, seed)
-    R = _indirect(T, F, pixels)
     root = np.exp(_log_scale(R) / 2)
     if isinstance(R, np.ndarray):
         N = R * root / root[:, None]

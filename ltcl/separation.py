@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks, layout
+from ltcl.exact import beside
 from ltcl.operators import Operator
 from ltcl.single_view import negative_bounces
 from ltcl.solvers import Solution, sampled, solve
@@ -77,7 +78,14 @@ class Separation:
 
 
 def separate(
-    T: Transport, image: Any, bounces: int = 4, *, method: str = "auto", rtol: float = 1e-3, **options: Any
+    T: Transport,
+    image: Any,
+    bounces: int = 4,
+    *,
+    method: str = "auto",
+    rtol: float = 1e-3,
+    exact: Transport | None = None,
+    **options: Any,
 ) -> Separation:
     """Split an image of the scene into direct light and bounces.
 
@@ -91,6 +99,8 @@ def separate(
         How many indirect bounces to tell apart.
     method, rtol, **options
         Of `ltcl.solve`; rtol is per bounce.
+    exact : Transport, optional
+        What a compressed T stands for: T then solves, to any `rtol`, and all that is told is of `exact`.
 
     Returns
     -------
@@ -99,7 +109,8 @@ def separate(
     Raises
     ------
     InputError
-        A rectangular T, shapes that do not fit, a negative number of bounces.
+        A rectangular T, shapes that do not fit, a negative number of bounces, an `rtol` below the error of
+        a compressed T without `exact`.
     ConvergenceError
         A solve did not reach `rtol`.
 
@@ -118,16 +129,18 @@ def separate(
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     pictures = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
+    true, judges = beside(T, exact)
     chains = [
-        _chain(S, l_out, bounces, method, rtol, options) for S, l_out in zip(T.systems, columns, strict=True)
+        _chain(S, l_out, bounces, method, rtol, {**options, "exact": E})
+        for S, l_out, E in zip(T.systems, columns, judges, strict=True)
     ]
 
     def picture(parts: list[np.ndarray]) -> np.ndarray:
         return shape.pack(parts, T.grid).astype(np.float32)
 
     direct, *indirect = [picture([chain.bounces[k] for chain in chains]) for k in range(bounces + 1)]
-    negative = max(negative_bounces(T))
-    warning = _warning(T.reciprocity_defect, negative)
+    negative = max(negative_bounces(true))
+    warning = _warning(true.reciprocity_defect, negative)
     if warning:
         logger.warning(warning)
     per_bounce = [tuple(chain.solutions[k] for chain in chains) for k in range(bounces + 1)]
@@ -137,7 +150,7 @@ def separate(
         bounces=np.stack(indirect) if indirect else np.empty((0, *direct.shape), np.float32),
         rest=picture([chain.rest for chain in chains]),
         solutions=tuple(found[0] if T.channels == 1 else found for found in per_bounce),
-        reciprocity_defect=T.reciprocity_defect,
+        reciprocity_defect=true.reciprocity_defect,
         negative_bounce=negative,
         warning=warning,
     )

@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ltcl.errors import ConvergenceError
-from ltcl.operators import Operator
+from ltcl.operators import IdentityPlus
 from ltcl.solvers import solve
 from ltcl.transport import Transport
 
@@ -50,9 +50,9 @@ def _parts(grid: tuple[int, int]) -> np.ndarray:
     return (number[:, None] == np.arange(number[-1] + 1)).astype(np.float64)
 
 
-def _share(S: Operator, parts: np.ndarray) -> float:
+def _share(S: IdentityPlus, parts: np.ndarray) -> float:
     try:
-        bounced = parts - solve(S, parts, rtol=1e-3).x  # A e for the indicator e of each part
+        bounced = parts - solve(S.as_it_stands(), parts, rtol=1e-3).x  # A e for the indicator e of each part
     except ConvergenceError:
         return float("nan")
     between = parts.T @ bounced

@@ -16,7 +16,8 @@ import numpy as np
 from ltcl import channels, checks, first_bounces, inverse_diagonal, layout, reciprocity
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import CSR, Coupled, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
+from ltcl.operators import Coupled, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
+from ltcl.operators.interreflection import device_of, made_with, maskable, nbytes
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +30,8 @@ class Transport:
     matrix : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3 for RGB, or 3 x 3 of them
         T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j; pixels
         are row-major. matrix[c][d] is what camera channel c sees of projector channel d; such a T has no S of
-        one channel, it relights and compensates.
+        one channel, it relights and compensates. An operator S diag(F) of `ltcl.operators`, S an
+        `IdentityPlus`, is used as it stands where F is the first bounce: so are compressed transports made.
     grid : (h, w)
         Of the projector; N = h * w.
     first_bounce : "diagonal", "exact", "estimate" or array (N,) or (3, N)
@@ -40,7 +42,7 @@ class Transport:
     camera_grid : (h, w), optional
         Of the camera where T is rectangular, M = h * w; S then does not exist: T relights and compensates.
     device : Device or str, optional
-        As `open_device` takes it; opened at the first product only.
+        As `open_device` takes it; opened at the first product only. Operators have one already.
     on_dark : "raise" or "mask"
         What to do where F is zero or negative: refuse, or never light these projector pixels in a
         compensation. Relighting stays exact: what a pattern lights there is seen.
@@ -60,6 +62,8 @@ class Transport:
         Projector pixels dropped by ``on_dark="mask"``, in any channel.
     first_bounce_error : array like first_bounce, or None
         Standard error of an estimated first bounce.
+    compression : ltcl.Compression or None
+        How `ltcl.compress` made it.
 
     Raises
     ------
@@ -97,9 +101,10 @@ class Transport:
         self.grid = checks.grid("grid", grid, self.shape[1])
         self.camera_grid = _camera_grid(camera_grid, self.shape, self.grid)
         self._wanted_device = device
-        self._device: Device | None = None
+        self._device: Device | None = device_of(self.blocks or [self.matrices], device)
         self._systems: tuple[IdentityPlus, ...] | None = None
         self._forward: tuple[Operator, ...] | None = None
+        self.compression: Any = None
         self.masked: np.ndarray = np.zeros(self.shape[1], bool)
         self._first_bounce: np.ndarray | None = None
         self.first_bounce_error: np.ndarray | None = None
@@ -112,7 +117,7 @@ class Transport:
             F = self._find_first_bounce(first_bounce, probes, seed)
             dark = F <= 0.0
             if dark.any():
-                first_bounces.refuse_dark(dark, self.grid, on_dark, self.matrices)
+                first_bounces.refuse_dark(dark, self.grid, on_dark, all(map(maskable, self.matrices)))
                 self.masked = np.asarray(dark.any(axis=0))
                 F = np.where(self.masked, 0.0, F)
             self._first_bounce = F
@@ -120,7 +125,10 @@ class Transport:
     def __repr__(self) -> str:
         kind = {1: "grey", 3: "colour"}[self.channels]
         (rows, columns), (h, w) = self.shape, self.grid
-        return f"<ltcl Transport {rows} x {columns}, {kind}, grid {h} x {w}>"
+        compressed = ""
+        if any(made_with(T) is not None for T in self.matrices):
+            compressed = f", compressed to {checks.size(self.nbytes)} with an error of {self.error:.2g}"
+        return f"<ltcl Transport {rows} x {columns}, {kind}, grid {h} x {w}{compressed}>"
 
     @property
     def channels(self) -> int:
@@ -173,10 +181,14 @@ class Transport:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all S on the device; a pattern that channels share counts once."""
-        patterns = [S.R.pattern for S in self.systems if isinstance(S.R, CSR)]
-        twice = sum(pattern.nbytes for pattern in patterns) - sum(p.nbytes for p in set(patterns))
-        return sum(S.nbytes for S in self.systems) - twice
+        """Bytes of all S on the device; a pattern or a basis that channels share counts once."""
+        return nbytes(self.systems)
+
+    @property
+    def error(self) -> float:
+        """The largest `solution_error` of the systems: what light may be off by; 0 where all are exact."""
+        compressed = self.is_square and any(made_with(T) is not None for T in self.matrices)
+        return max(S.solution_error for S in self.systems) if compressed else 0.0
 
     @property
     def operators(self) -> tuple[Operator, ...]:
@@ -197,7 +209,10 @@ class Transport:
         if not self.is_square or self.masked.any():
             return tuple(as_operator(matrix, self.device) for matrix in self.matrices)
         F = self._require_first_bounce()
-        return tuple(ScaledColumns(S, f) for S, f in zip(self.systems, F, strict=True))
+        return tuple(
+            T if isinstance(T, Operator) else ScaledColumns(S, f)
+            for T, S, f in zip(self.matrices, self.systems, F, strict=True)
+        )
 
     def join(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
         """What `operators` take, of one (N, k) a channel: the same, or all below each other, (3 N, k)."""
@@ -256,10 +271,11 @@ class Transport:
         return self._first_bounce
 
 
-def require(T: Any, *, square: bool = True) -> Transport:
+def require(T: Any, *, square: bool = True, name: str = "T") -> Transport:
     """T itself; refuses, before anything is uploaded, what is no Transport or has no S that is needed."""
     if not isinstance(T, Transport):
-        raise InputTypeError(f"T is a {type(T).__name__}; it must be a ltcl.Transport(matrix, grid=(h, w))")
+        kind = type(T).__name__
+        raise InputTypeError(f"{name} is a {kind}; it must be a ltcl.Transport(matrix, grid=(h, w))")
     if square:
         T._require_first_bounce()
     return T

@@ -14,12 +14,9 @@ from ltcl.operators.bases import Basis
 class Given(Basis):
     """W of any matrix (M, N)."""
 
-    name = "given"
-
     def __init__(self, device: Device, matrix: np.ndarray) -> None:
-        super().__init__(device, matrix.shape)
+        super().__init__(device, (1, matrix.shape[1]), "given", len(matrix))
         self.matrix = matrix.astype(np.float32).astype(np.float64)  # as it lies on the device
-        self.grid = (1, matrix.shape[1])
         self.orthonormal = bool(np.allclose(matrix.T @ matrix, np.eye(matrix.shape[1]), atol=1e-5))
         self._on_device = Dense(device, matrix)
 

@@ -572,3 +572,87 @@ def bounded_move(
 def _free(lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray) -> np.ndarray:
     """-g, 0 where x is at a bound and -g points out."""
     return np.where(((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0)), 0.0, -g)
+
+
+def wavelet_side(pixels: int, level: int, taps: np.ndarray) -> np.ndarray:
+    """The orthonormal matrix that splits a side, already halved `level` times: approximation above details.
+
+    What is regular goes round in a circle of its own, however often the filters wrap around it. The last
+    sample stands for the pixels left over; joined to another by weights, it keeps a constant constant.
+    """
+    size, rest = 2**level, pixels % 2**level
+    n, regular = -(-pixels // size), pixels // size // 2
+    half = (n + 1) // 2
+    M = np.zeros((n, n))
+    for m, t in itertools.product(range(regular), range(taps.shape[1])):
+        M[[m, half + m], (2 * m + 1 - taps.shape[1] // 2 + t) % (2 * regular)] += taps[:, t]
+    if half > regular and n % 2:
+        M[half - 1, n - 1] = 1
+    elif half > regular:
+        weights = np.sqrt([size, rest]) / np.sqrt(size + rest)
+        M[half - 1, n - 2 :], M[n - 1, n - 2 :] = weights, weights[::-1] * [1, -1]
+    return M
+
+
+def wavelet_split_rows(x: np.ndarray, width: int, level: int, taps: np.ndarray) -> np.ndarray:
+    """Lines of which each row of x (rows, n, k) makes one."""
+    return np.einsum("ij,rjk->rik", wavelet_side(width, level, taps), np.asarray(x, np.float64))
+
+
+def wavelet_split_columns(lines: np.ndarray, height: int, level: int, taps: np.ndarray) -> np.ndarray:
+    """The same down the columns of (n, columns, k)."""
+    return np.einsum("ij,jck->ick", wavelet_side(height, level, taps), np.asarray(lines, np.float64))
+
+
+def wavelet_join_columns(x: np.ndarray, height: int, level: int, taps: np.ndarray) -> np.ndarray:
+    """The inverse of orthonormal ones is the transpose."""
+    return np.einsum("ji,jck->ick", wavelet_side(height, level, taps), np.asarray(x, np.float64))
+
+
+def wavelet_join_rows(lines: np.ndarray, width: int, level: int, taps: np.ndarray) -> np.ndarray:
+    """The inverse of wavelet_split_rows."""
+    return np.einsum("ji,rjk->rik", wavelet_side(width, level, taps), np.asarray(lines, np.float64))
+
+
+def wavelet_split_all(x: np.ndarray, levels: int, taps: np.ndarray) -> np.ndarray:
+    """Coefficients of pictures (h, w, k), after all levels."""
+    (h, w), x = x.shape[:2], np.array(x, np.float64)
+    for level in range(levels):
+        corner = np.s_[: -(-h // 2**level), : -(-w // 2**level)]
+        x[corner] = wavelet_split_columns(wavelet_split_rows(x[corner], w, level, taps), h, level, taps)
+    return x
+
+
+def wavelet_join_all(x: np.ndarray, levels: int, taps: np.ndarray) -> np.ndarray:
+    """Pictures (h, w, k) of coefficients."""
+    (h, w), x = x.shape[:2], np.array(x, np.float64)
+    for level in reversed(range(levels)):
+        corner = np.s_[: -(-h // 2**level), : -(-w // 2**level)]
+        x[corner] = wavelet_join_rows(wavelet_join_columns(x[corner], h, level, taps), w, level, taps)
+    return x
+
+
+def ordered_gather(
+    order: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
+) -> np.ndarray:
+    """out = scale * x[order] + add."""
+    out = scale * np.asarray(x, np.float64)[order]
+    return out if add is None else out + add
+
+
+def pyramid_gather(x: np.ndarray) -> np.ndarray:
+    """Sums of pictures (h, w, k) over the cells of all levels, (cells, k), each straight from its pixels."""
+    x = np.asarray(x, np.float64)
+    h, w, k = x.shape
+    sums = []
+    for level in range((max(h, w) - 1).bit_length() + 1):
+        corners = itertools.product(range(0, h, 2**level), range(0, w, 2**level))
+        sums += [x[i : i + 2**level, j : j + 2**level].sum(axis=(0, 1)) for i, j in corners]
+    return np.reshape(sums, (-1, k))
+
+
+def pyramid_spread(x: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """Pictures (h, w, k) of cells (cells, k): the transpose of pyramid_gather."""
+    h, w = grid
+    units = np.eye(h * w).reshape(h, w, -1)
+    return (pyramid_gather(units).T @ np.asarray(x, np.float64)).reshape(h, w, -1)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ltcl.compensation import gain as gains
 from ltcl.compensation.problem import Problem
+from ltcl.operators import IdentityPlus
 from ltcl.solvers import Solution, solve
 from ltcl.transport import Transport
 
@@ -43,6 +44,7 @@ class Inverse:
     T: Transport
     method: str
     options: dict[str, Any] = field(default_factory=dict)
+    exact: tuple[IdentityPlus | None, ...] = ()  # what a compressed S stands for, in every channel
 
     def light(self, parts: Columns) -> Columns:
         """Projector light, one array a system, of one solution a channel."""
@@ -50,8 +52,9 @@ class Inverse:
 
     def __call__(self, parts: Columns) -> tuple[Solution, ...]:
         """One solution a channel, of one target a system."""
-        pairs = zip(self.T.systems, self.T.split(parts), strict=True)
-        return tuple(solve(S, l_out, self.method, **self.options) for S, l_out in pairs)
+        exact = self.exact or (None,) * self.T.channels
+        each = zip(self.T.systems, self.T.split(parts), exact, strict=True)
+        return tuple(solve(S, l_out, self.method, exact=E, **self.options) for S, l_out, E in each)
 
 
 def at_gain(inverse: Inverse, problem: Problem, gain: float) -> Start:

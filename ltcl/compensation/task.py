@@ -19,6 +19,7 @@ from ltcl.compensation.problem import Limits, Problem, systems
 from ltcl.compensation.result import Compensation
 from ltcl.compensation.start import Inverse, Start, at_gain, at_largest_gain
 from ltcl.errors import ConvergenceError
+from ltcl.exact import beside
 from ltcl.solvers import Bounded, Status
 from ltcl.transport import Transport, require
 
@@ -37,6 +38,7 @@ def compensate(
     weights: Any = None,
     method: str = "auto",
     rtol: float = 1e-2,
+    exact: Transport | None = None,
     **options: Any,
 ) -> Compensation:
     """Find the projector pattern under which the scene looks most like `desired`.
@@ -65,6 +67,8 @@ def compensate(
         Of `ltcl.solve`. Within the bounds the error is the least there is up to `rtol`, relative to
         gain * desired - background. Where no bound holds, noise of a method that samples stays; it is part of
         `error` and `gap`, and makes the gain that gain="auto" finds smaller.
+    exact : Transport, optional
+        What a compressed T stands for: T then solves, to any `rtol`, and everything else is of `exact`.
 
     Returns
     -------
@@ -74,8 +78,9 @@ def compensate(
     Raises
     ------
     InputError
-        Shapes that do not fit, bounds in the wrong order, a gain that is not positive, weights below 0, or
-        no gain that keeps the picture within `loss`.
+        Shapes that do not fit, bounds in the wrong order, a gain that is not positive, weights below 0, no
+        gain that keeps the picture within `loss`, or an `rtol` below the error of a compressed T without
+        `exact`.
     ConvergenceError
         A solve did not reach `rtol` in `maxiter` steps, or not at all. Within the bounds, where float32 is
         too coarse to prove it, the best that was found comes back, and `gap` tells what is proved.
@@ -102,14 +107,15 @@ def compensate(
     counts = inputs.weights(weights, T, shape, wanted)
     rules = inputs.rules(T, method, rtol, options)
     wanted, dark = T.join(wanted), T.join(dark)
-    problem = Problem(systems(T), wanted, dark, None if counts is None else T.join(counts), limits, rules)
-    inverse = Inverse(T, method, {"rtol": rtol, **options})
+    true, judges = beside(T, exact)
+    problem = Problem(systems(true), wanted, dark, None if counts is None else T.join(counts), limits, rules)
+    inverse = Inverse(T, method, {"rtol": rtol, **options}, judges)
     if sought is not None:
         start = at_gain(inverse, problem, sought)
     else:
         start = at_largest_gain(inverse, problem, loss, exactly=weights is None)
     light, limited = _within(problem, start, options.get("throw", True))
-    return _result(T, problem, shape, start, light, limited)
+    return _result(true, problem, shape, start, light, limited)
 
 
 def _within(problem: Problem, start: Start, throw: bool) -> tuple[Columns, list[Bounded | None]]:

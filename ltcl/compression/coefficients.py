@@ -21,6 +21,7 @@ from ltcl.compression.magnitudes import Magnitudes
 from ltcl.compression.sources import COLUMNS, RowSource, at_once, cut
 
 Transform = Callable[[np.ndarray], np.ndarray]  # (N, k) float32 -> (M, k) float32, k a multiple of COLUMNS
+_FEW = 16  # blocks tell what may be dropped between the passes
 _SHARE = 8  # one of so many numbers is looked at for a threshold
 
 
@@ -67,7 +68,7 @@ def coefficients(
     *,
     drop: float = 0.0,
     most: int | None = None,
-    first: float = 0.0,
+    first: float | None = None,
     memory: int | None = None,
     progress: Callable[[float], object] | None = None,
 ) -> Coefficients:
@@ -81,9 +82,10 @@ def coefficients(
     threshold : float, optional
         What is smaller is dropped at the end. When not given, an eighth of the numbers is looked at for one
         that drops about the Frobenius norm `drop`, or more where about `most` are kept with it.
-    first : float
+    first : float, optional
         What is smaller is dropped between the passes. With 0 nothing is, and all M x N' numbers lie in
-        memory there; else those that are left, with 8 bytes each.
+        memory there; else those that are left, with 8 bytes each. When not given, 0 where the host has room
+        for all, twice; else what drops about a third of `drop`, or more where even that has no room.
     memory : int, optional
         Bytes for a block; as `sources.at_once`. The result has the same bits for any, with a threshold and
         without `first`.
@@ -104,6 +106,7 @@ def coefficients(
     if out is None:
         last: _Rows | _Columns = _Rows(R, into)
     else:
+        first = _first(_Rows(R, into), drop) if first is None else first
         last = _Columns(_first_pass(R, into, first, memory, lambda share: done(share / 2)), out)
     if threshold is None:
         threshold = last.sample().threshold_for(drop, math.inf if most is None else most)
@@ -152,9 +155,11 @@ class _Rows:
         rows = np.asarray(self.R.rows(int(which[0]), int(which[-1]) + 1), np.float32)
         return _transformed(self.into, rows.T)
 
-    def sample(self) -> _Sample:
+    def sample(self, most: int = 1 << 30) -> _Sample:
+        """Of an eighth of the rows, and at most `most` blocks."""
         starts = np.arange(0, self.count, COLUMNS)
-        chosen = np.sort(np.random.default_rng(0).choice(starts, -(-len(starts) // _SHARE), replace=False))
+        wanted = min(-(-len(starts) // _SHARE), most)
+        chosen = np.sort(np.random.default_rng(0).choice(starts, wanted, replace=False))
         blocks = [np.arange(start, min(start + COLUMNS, self.count)) for start in chosen]
         return _sampled(self, blocks)
 
@@ -193,6 +198,14 @@ def _sampled(last: _Rows | _Columns, blocks: list[np.ndarray]) -> _Sample:
     counts, squares = sum(m.counts for m in found), sum(m.squares for m in found)
     share = sum(map(len, blocks)) / last.count
     return _Sample(Magnitudes(np.asarray(counts), np.asarray(squares)), share)
+
+
+def _first(rows: _Rows, drop: float) -> float:
+    """A threshold between the passes that leaves what the host has room for."""
+    room = checks.host_memory() // 2
+    if 4 * rows.count * rows.height <= room:
+        return 0.0
+    return rows.sample(_FEW).threshold_for(drop / 3, room // 16)  # 8 bytes each, turned once
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,9 @@ from ltcl.operators.coupled import Coupled
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.named_bases import basis, basis_of
 from ltcl.operators.packing import smallest
+from ltcl.operators.pyramid import Pyramid
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
 
@@ -33,6 +35,7 @@ __all__ = [
     "Operator",
     "Ordered",
     "Pattern",
+    "Pyramid",
     "ScaledColumns",
     "Shifted",
     "Sum",
@@ -40,6 +43,8 @@ __all__ = [
     "Transposed",
     "Wavelet",
     "as_operator",
+    "basis",
+    "basis_of",
     "interreflections",
     "smallest",
 ]

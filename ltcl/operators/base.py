@@ -44,11 +44,15 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         Bytes of its matrix on the device.
     error : float
         Bound on the 2-norm of what a compressed operator dropped; 0 for exact ones.
+    solution_error : float
+        Bound on ``||x~ - x|| / ||x||`` for every right-hand side, x~ the solution with this operator, x with
+        the one that it was compressed from; 0 for exact ones.
     weights : (N,) float64 or None
         Of an inner product <x, y> = sum_i w_i x_i y_i in which it should be self-adjoint, where one is known.
     """
 
     error = 0.0
+    solution_error = 0.0
     weights: np.ndarray | None = None
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
@@ -115,12 +119,17 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         """The whole matrix as (M, N) float64 on the host, column block by column block."""
         rows, columns = self.shape
         checks.fits_host(f"a dense {rows} x {columns} matrix", 8 * rows * columns)
-        dense = np.empty(self.shape)
-        for start in range(0, columns, 64):
-            block = np.zeros((columns, min(64, columns - start)), np.float32)
-            block[start + np.arange(block.shape[1]), np.arange(block.shape[1])] = 1
-            dense[:, start : start + block.shape[1]] = self._matmat(block)
-        return dense
+        return self.between(np.arange(rows), np.arange(columns))
+
+    def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """The entries (rows, columns), both lists of indices, in float64: a product for each column."""
+        found = np.empty((len(rows), len(columns)))
+        for start in range(0, len(columns), 64):
+            chosen = columns[start : start + 64]
+            block = np.zeros((self.shape[1], len(chosen)), np.float32)
+            block[chosen, np.arange(len(chosen))] = 1
+            found[:, start : start + 64] = self._matmat(block)[rows]
+        return found
 
     # What SciPy asks for: NumPy in, NumPy out.
 

@@ -29,8 +29,7 @@ class IdentityPlus(Operator):
     weights : (N,), optional
         All positive: S is self-adjoint in the inner product <x, y> = sum_i w_i x_i y_i, as far as is known.
     solution_error : float
-        Bound on ``||x~ - x|| / ||x||`` for every right-hand side, x~ the solution with this S and x with the
-        one that it was compressed from: ``||S^-1|| ||E||``, E what was dropped. 0 for exact ones, infinite
+        What solutions with a compressed R may be off by: ``||S^-1|| ||E||``, E what was dropped. Infinite
         where nothing is known.
 
     Examples
@@ -71,6 +70,10 @@ class IdentityPlus(Operator):
     def diagonal(self) -> np.ndarray:
         """1 + sign diag(R), (N,) float64."""
         return 1.0 + self.sign * self.R.diagonal()
+
+    def as_it_stands(self) -> IdentityPlus:
+        """The same S taken for exact: what is asked of it is asked of no other."""
+        return self if self.solution_error == 0.0 else IdentityPlus(self.R, self.sign, self.weights)
 
     def to_dense(self) -> np.ndarray:
         """I + sign R, (N, N) float64, on the host."""

@@ -9,6 +9,8 @@ its core; see `ltcl.solvers.coefficients`.
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 
 from ltcl import checks
@@ -38,6 +40,8 @@ class Compressed(Operator):
     ----------
     two_sided : bool
         Whether out and into are one orthonormal basis: then R is as good as its core.
+    known_diagonal : (min(M, N),) float64 or None
+        The diagonal as far as it was given or found.
 
     Raises
     ------
@@ -69,8 +73,9 @@ class Compressed(Operator):
         self.core, self.out, self.into = core, out, into
         self.error = _error(core, out, into) if error is None else checks.number("error", error, least=0.0)
         self.two_sided = out is into and out is not None and out.orthonormal
-        self._diagonal = None if diagonal is None else _known(diagonal, min(self.shape))
+        self.known_diagonal = None if diagonal is None else _known(diagonal, min(self.shape))
         self._scratch: list[Array | None] = [None, None]
+        self._lock = threading.Lock()  # a product must have the scratch to itself while it is queued
 
     @property
     def nbytes(self) -> int:
@@ -85,9 +90,10 @@ class Compressed(Operator):
         InputError
             It was not given, and there are too many pixels for a product each.
         """
-        if self._diagonal is None:
-            self._diagonal = self.core.diagonal() if self.out is self.into is None else self._by_products()
-        return self._diagonal
+        if self.known_diagonal is None:
+            pixels = self.out is None and self.into is None
+            self.known_diagonal = self.core.diagonal() if pixels else self._by_products()
+        return self.known_diagonal
 
     def _by_products(self) -> np.ndarray:
         n = min(self.shape)
@@ -101,16 +107,17 @@ class Compressed(Operator):
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
         first, last = (self.out, self.into) if transpose else (self.into, self.out)
         rows, columns = self.core.shape[::-1] if transpose else self.core.shape
-        if first is not None:
-            coefficients = self._room(0, columns, x)
-            first._product(x, coefficients, 1.0, None, False)
-            x = coefficients
-        if last is None:
-            self.core._product(x, out, scale, add, transpose)
-            return
-        product = self._room(1, rows, x)
-        self.core._product(x, product, 1.0, None, transpose)
-        last._product(product, out, scale, add, True)
+        with self._lock:
+            if first is not None:
+                coefficients = self._room(0, columns, x)
+                first._product(x, coefficients, 1.0, None, False)
+                x = coefficients
+            if last is None:
+                self.core._product(x, out, scale, add, transpose)
+                return
+            product = self._room(1, rows, x)
+            self.core._product(x, product, 1.0, None, transpose)
+            last._product(product, out, scale, add, True)
 
     def _room(self, place: int, count: int, like: Array) -> Array:
         """An array of `count` coefficients for the columns of `like`, kept until others are asked for."""

@@ -134,6 +134,25 @@ class CSR(RowOperator):
             lowest=float(np.min(self._host.data, initial=0.0)),
         )
 
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Plain arrays, of which `from_arrays` makes the same again, to the bit."""
+        return {
+            "shape": np.array(self.shape, np.int64),
+            "data": self.data.astype(np.float32),
+            "indices": self.pattern.indices.astype(np.int32),
+            "indptr": self.pattern.indptr,
+        }
+
+    @classmethod
+    def from_arrays(
+        cls, device: Device, arrays: Mapping[str, np.ndarray], pattern: Pattern | None = None
+    ) -> CSR:
+        """Of what `to_arrays` gave; what does not fit together is refused."""
+        rows, columns = (int(n) for n in arrays["shape"])
+        data, indices, indptr = (arrays[name] for name in ("data", "indices", "indptr"))
+        checks.compressed("the stored matrix", indptr, indices, checks.real("data", data), (rows, columns))
+        return cls(device, scipy.sparse.csr_array((data, indices, indptr), shape=(rows, columns)), pattern)
+
     def to_dense(self) -> np.ndarray:
         """The whole matrix, (M, N) float64, on the host."""
         checks.fits_host(f"a dense matrix {self.shape}", 8 * self.shape[0] * self.shape[1])

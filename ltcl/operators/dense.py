@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,16 @@ class Dense(RowOperator):
             row = max(row, float(block.sum(axis=1).max(initial=0.0)))
             squares += float(np.vdot(block, block))
         return Norms(float(columns.max(initial=0.0)), row, squares**0.5, lowest)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Plain arrays, of which `from_arrays` makes the same again, to the bit."""
+        checks.fits_host(f"a dense matrix {self.shape}", 4 * self.shape[0] * self.shape[1])
+        return {"matrix": np.concatenate([slab.arguments[1].get() for slab in self.slabs])}
+
+    @classmethod
+    def from_arrays(cls, device: Device, arrays: Mapping[str, np.ndarray]) -> Dense:
+        """Of what `to_arrays` gave; what does not fit together is refused."""
+        return cls(device, arrays["matrix"])
 
     def to_dense(self) -> np.ndarray:
         """The whole matrix, (M, N) float64, on the host."""

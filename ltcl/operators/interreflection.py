@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,9 +11,12 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device import Device
+from ltcl.device import Device, open_device
+from ltcl.errors import InputError
 from ltcl.operators.base import Operator
+from ltcl.operators.bases import Basis
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators.compressed import Compressed, Sum
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 
@@ -22,8 +26,8 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
 
     Parameters
     ----------
-    matrices : sequence of (N, N) array, csr_array or LinearOperator
-        T of each channel, checked.
+    matrices : sequence of (N, N) array, csr_array, Operator or LinearOperator
+        T of each channel, checked. Of S diag(F), which has an S already, that S is taken as it is.
     F : (channels, N)
         First bounces; 0 where a projector pixel is masked, whose column of R is then 0.
     device : Device
@@ -37,10 +41,63 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
     """
     systems, pattern = [], None
     for matrix, f in zip(matrices, F, strict=True):
+        S = made_with(matrix)
+        if S is not None and np.array_equal(matrix.d, f):
+            systems.append(S)
+            continue
         R = _interreflection(matrix, f, device, pattern)
         pattern = R.pattern if isinstance(R, CSR) else None
-        systems.append(IdentityPlus(R, weights=1.0 / f if np.all(f > 0) else None))
+        weights = 1.0 / f if np.all(f > 0) else None
+        systems.append(IdentityPlus(R, weights=weights, solution_error=_carried(matrix, f)))
     return tuple(systems)
+
+
+def made_with(matrix: Any) -> IdentityPlus | None:
+    """The S of an operator that is S diag(d); None of any other matrix."""
+    if isinstance(matrix, ScaledColumns) and isinstance(matrix.A, IdentityPlus):
+        return matrix.A
+    return None
+
+
+def maskable(matrix: Any) -> bool:
+    """Whether pixels of it may be dropped: others of somebody's own LinearOperator would stay in products."""
+    return isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) or made_with(matrix) is not None
+
+
+def device_of(rows: Sequence[Sequence[Any]], wanted: Device | str | None) -> Device | None:
+    """The device that operators among the parts lie on, None where there are none; no two, and no other."""
+    found = {part.device for row in rows for part in row if isinstance(part, Operator)}
+    if not found:
+        return None
+    (first, *others) = found
+    if others or (wanted is not None and open_device(wanted) is not first):
+        asked = f"device is {wanted!r}" if not others else "matrix has operators on several devices"
+        raise InputError(f"{asked}, but operators lie on {first}; all must be on one device")
+    return first
+
+
+def nbytes(systems: Sequence[IdentityPlus]) -> int:
+    """Bytes of all S on the device; a pattern or a basis that they share counts once."""
+    parts = [part for S in systems for part in _shareable(S.R)]
+    return sum(S.nbytes for S in systems) - sum(p.nbytes for p in parts) + sum(p.nbytes for p in set(parts))
+
+
+def _shareable(R: Operator) -> list[Pattern | Basis]:
+    if isinstance(R, CSR):
+        return [R.pattern]
+    if isinstance(R, Compressed):
+        return [*{W for W in (R.out, R.into) if W is not None}, *_shareable(R.core)]
+    return [part for A in R.operators for part in _shareable(A)] if isinstance(R, Sum) else []
+
+
+def _carried(matrix: Any, f: np.ndarray) -> float:
+    """Solution error of T diag(1 / f), T = S diag(d): norms change by max(d / f) / min(d / f) at most."""
+    S = made_with(matrix)
+    if S is None or S.solution_error == 0.0:
+        return 0.0
+    ratio = matrix.d[f > 0] / f[f > 0]
+    least = float(np.min(np.abs(ratio)))
+    return S.solution_error * float(np.max(np.abs(ratio))) / least if least > 0.0 else math.inf
 
 
 def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Pattern | None) -> Operator:
@@ -52,7 +109,8 @@ def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Patter
         return Dense(device, _dense_R(matrix, divisor, lit))
     if isinstance(matrix, scipy.sparse.csr_array):
         return CSR(device, _sparse_R(matrix, divisor, lit), pattern)
-    return Shifted(ScaledColumns(Host(device, matrix), 1.0 / divisor), None if lit.all() else lit)
+    operator = matrix if isinstance(matrix, Operator) else Host(device, matrix)
+    return Shifted(ScaledColumns(operator, 1.0 / divisor), None if lit.all() else lit)
 
 
 def _dense_R(T: np.ndarray, divisor: np.ndarray, lit: np.ndarray) -> np.ndarray:

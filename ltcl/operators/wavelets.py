@@ -77,6 +77,8 @@ class Wavelet(Basis):
         return {**super().to_arrays(), "levels": np.array(self.levels)}
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+        if x.size == 0:
+            return
         if self.levels == 0:
             vectors.axpby(scale, x, 0.0 if add is None else 1.0, x if add is None else add, out)
             return
@@ -189,18 +191,23 @@ class _Task:
             )  # fmt: skip
 
 
+def is_known(name: Any) -> bool:
+    """Whether PyWavelets knows a discrete wavelet of this name."""
+    return name in _pywt.wavelist(kind="discrete")
+
+
 def filters(name: str) -> np.ndarray:
     """Low-pass and high-pass filter of an orthonormal wavelet, (2, taps) float64, in the order of samples.
 
     >>> filters("haar").round(4).tolist()
     [[0.7071, 0.7071], [0.7071, -0.7071]]
     """
-    if name not in _pywt.wavelist(kind="discrete"):
-        raise InputError(f"wavelet is {name!r}; it must be one of {_families()}")
+    if not is_known(name):
+        raise InputError(f"wavelet is {name!r}; it must be one of {families()}")
     wavelet = _pywt.Wavelet(name)
     taps = np.array([wavelet.rec_lo, wavelet.rec_hi])
     if not _orthonormal(taps):
-        raise InputError(f"wavelet {name} is not orthonormal; it must be one of {_families()}")
+        raise InputError(f"wavelet {name} is not orthonormal; it must be one of {families()}")
     return taps
 
 
@@ -211,7 +218,7 @@ def _orthonormal(taps: np.ndarray) -> bool:
     return bool(np.abs(np.array(shifts) - [np.eye(2) * (s == 0) for s in range(length // 2)]).max() < 1e-7)
 
 
-def _families() -> str:
+def families() -> str:
     """The orthonormal wavelets that PyWavelets knows: haar, db1 to db38, ..."""
     names = [n for n in _pywt.wavelist(kind="discrete") if n != "dmey" and _pywt.Wavelet(n).orthogonal]
     numbers = {n.rstrip("0123456789"): [] for n in names}

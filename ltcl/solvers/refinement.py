@@ -22,7 +22,7 @@ import numpy as np
 
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError
-from ltcl.operators import IdentityPlus, Operator, as_operator
+from ltcl.operators import Operator, as_operator
 from ltcl.solvers import coefficients
 from ltcl.solvers.direct import Direct
 from ltcl.solvers.result import Status
@@ -34,7 +34,7 @@ _HALF = 0.5  # of a residual: a solve that ended early but left no more is a ste
 
 def refuse_beyond(S: Operator, rule: Rule, wanted: float) -> None:
     """Refuse a relative residual `wanted` that says less about the solution than S itself."""
-    error = S.solution_error if isinstance(S, IdentityPlus) else 0.0
+    error = S.solution_error
     if wanted < error:
         atol = f" and atol {rule.atol:g}" if np.any(rule.atol) else ""
         raise InputError(
@@ -56,12 +56,11 @@ def exact_operator(exact: Any, S: Operator) -> Operator:
 def step_tolerance(S: Operator) -> float:
     """Relative residual of the solves with S~: no smaller than what S~ is worth.
 
-    >>> from ltcl.operators import as_operator
+    >>> from ltcl.operators import IdentityPlus, as_operator
     >>> step_tolerance(IdentityPlus(as_operator([[0.5]]), solution_error=0.004))
     0.004
     """
-    error = S.solution_error if isinstance(S, IdentityPlus) else 0.0
-    return min(max(error, _LEAST), _MOST)
+    return min(max(S.solution_error, _LEAST), _MOST)
 
 
 def iterate(

@@ -12,7 +12,7 @@ import scipy.linalg
 
 from ltcl import checks
 from ltcl.errors import InputTypeError
-from ltcl.operators import Operator
+from ltcl.operators import Compressed, IdentityPlus, Operator
 from ltcl.theory.spectrum import POWER_ITERATION, SpectralRadius, require_operator
 
 FREE_BOUNDS, SWEEPS, RITZ = "free bounds", "trial sweeps", "ritz values"
@@ -116,6 +116,8 @@ def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
     3
     """
     n = require_operator("S", S).shape[0]
+    if isinstance(S, IdentityPlus) and isinstance(S.R, Compressed):
+        return Forecast(math.nan, NOTHING)  # its sweeps, where it has any, are over coefficients
     if n > _LARGEST_SWEEP or 2 * 8 * n * n > checks.host_memory():
         return Forecast(math.nan, NOTHING)
     left, made, rho = _trial_sweeps(S.to_dense(), rtol)

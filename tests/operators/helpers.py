@@ -54,6 +54,11 @@ def operands(A: Operator, values: np.ndarray, kind: str | None) -> tuple[Array |
     return (A.device.upload(values) if kind else None), garbage
 
 
+def product(A: Operator, x: np.ndarray) -> np.ndarray:
+    """A x, of the type that `@` does not tell."""
+    return A.apply(A.device.upload(x)).get()
+
+
 def close(found: np.ndarray, expected: np.ndarray, error: np.ndarray) -> None:
     """Assert |found - expected| <= error, value by value."""
     assert found.shape == expected.shape

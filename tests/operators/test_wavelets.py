@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Wavelets on the device against their twins, PyWavelets, and what orthonormal means."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import pywt
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ltcl.device import Device
+from ltcl.errors import InputError
+from ltcl.operators import Wavelet, wavelets
+from tests import gallery, reference
+from tests.operators import helpers
+
+NAMES = ("haar", "db2", "db4", "coif1")
+GRIDS = ((1, 1), (1, 2), (2, 1), (3, 5), (1, 29), (29, 1), (8, 8), (7, 12), (2, 17))
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def shape_of_launches(request, monkeypatch):
+    """Kernels are launched as on either kind of device, whatever this one is."""
+    monkeypatch.setattr(Device, "is_cpu", property(lambda _: request.param == "cpu"))
+
+
+@pytest.fixture(params=[0, 12, 4096], ids=["a launch each", "small ones together", "all in one"])
+def small(request, monkeypatch):
+    """How many pixels a level may have to be among those that one launch does."""
+    monkeypatch.setattr(wavelets, "_SMALL", request.param)
+
+
+def twin(W: Wavelet, transpose: bool = False):
+    """The twin of a transform with its epilogue, as `helpers.meets_twin` takes it."""
+    taps = wavelets.filters(W.name)
+    transform = reference.wavelet_join_all if transpose else reference.wavelet_split_all
+
+    def product(x, scale=1.0, add=None):
+        out = scale * transform(x.reshape(*W.grid, -1), W.levels, taps).reshape(x.shape)
+        return out if add is None else out + add
+
+    return product
+
+
+def matrix(W: Wavelet) -> np.ndarray:
+    return twin(W)(np.eye(W.shape[1]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.usefixtures("small")
+def test_transforms_meet_their_twin(device, grid, name):
+    W = Wavelet(device, grid, name)
+    for transpose in (False, True):
+        helpers.meets_twin(W, matrix(W), twin(W, transpose), transpose=transpose)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.usefixtures("small", "shape_of_launches")
+def test_either_shape_of_launches_will_do(device, grid):
+    W = Wavelet(device, grid)
+    for transpose in (False, True):
+        helpers.meets_twin(W, matrix(W), twin(W, transpose), transpose=transpose)
+
+
+@pytest.mark.parametrize("levels", range(5))
+def test_transforms_stop_after_the_levels_asked_for(device, levels):
+    W = Wavelet(device, (7, 12), "db2", levels)
+    for transpose in (False, True):
+        helpers.meets_twin(W, matrix(W), twin(W, transpose), transpose=transpose)
+
+
+@pytest.mark.parametrize("name", [*NAMES, "db38", "sym20"])
+@pytest.mark.parametrize("grid", [(8, 8), (16, 2), (12, 20), (64, 96)])
+@pytest.mark.filterwarnings("ignore:Level value of")  # sides shorter than the filter are wanted here
+def test_coefficients_are_those_of_pywavelets_where_sides_halve_evenly(device, grid, name):
+    levels = min(side & -side for side in grid).bit_length() - 1
+    x = gallery.vectors(grid[0] * grid[1], None)
+    for level in range(1, levels + 1):
+        found = helpers.product(Wavelet(device, grid, name, level), x)
+        coefficients = pywt.wavedec2(x.reshape(grid).astype(float), name, "periodization", level)
+        expected = pywt.coeffs_to_array(coefficients)[0].ravel()
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.filterwarnings("ignore:Level value of")
+def test_a_side_of_one_sample_is_left_alone_while_the_other_goes_on(device, name):
+    x = gallery.vectors(4 * 32, None)
+    coefficients = pywt.coeffs_to_array(
+        pywt.wavedec2(x.reshape(4, 32).astype(float), name, "periodization", 2)
+    )[0]
+    coefficients[0, :8] = np.concatenate(pywt.wavedec(coefficients[0, :8], name, "periodization", 3))
+    found = helpers.product(Wavelet(device, (4, 32), name), x)
+    np.testing.assert_allclose(found, coefficients.ravel(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.filterwarnings("ignore:Level value of")
+def test_a_picture_of_the_size_that_counts(device, k):
+    x = gallery.vectors(256 * 512, k)
+    W = Wavelet(device, (256, 512), "db2", 8)
+    found = helpers.product(W, x)
+    for c in range(k):
+        coefficients = pywt.wavedec2(x[:, c].reshape(256, 512).astype(float), "db2", "periodization", 8)
+        expected = pywt.coeffs_to_array(coefficients)[0].ravel()
+        np.testing.assert_allclose(found[:, c], expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(helpers.product(W.T, found), x, rtol=0, atol=1e-5)
+
+
+@given(
+    grid=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    name=st.sampled_from(NAMES),
+    k=st.integers(1, 11),
+    seed=st.integers(0, 99),
+)
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_bases_are_orthonormal_and_keep_constants_compact(device, grid, name, k, seed):
+    W = Wavelet(device, grid, name)
+    n = W.shape[1]
+    x, y = gallery.vectors(n, k, seed), gallery.vectors(n, k, seed + 100)
+    x[:, 0] = 0.7
+    a = helpers.product(W, x).astype(np.float64)
+    # A value goes through two passes of a few products a level: some 50 units of the norm.
+    size = 50 * reference.UNIT * (1 + W.levels)
+    norms = np.linalg.norm(x, axis=0)
+    assert np.all(np.abs(np.linalg.norm(a, axis=0) - norms) <= size * norms)
+    assert np.all(np.linalg.norm(helpers.product(W.T, a) - x, axis=0) <= 2 * size * norms)
+    errors = size * norms * np.linalg.norm(y, axis=0)
+    assert np.all(
+        np.abs((a * y).sum(axis=0) - (x * np.float64(helpers.product(W.T, y))).sum(axis=0)) <= 2 * errors
+    )
+    constant = np.zeros(n)
+    constant[0] = np.float32(0.7) * np.sqrt(n)
+    np.testing.assert_allclose(a[:, 0], constant, rtol=0, atol=size * norms[0])
+
+
+def test_many_right_hand_sides_at_once(device):
+    W = Wavelet(device, (80, 71))
+    x = gallery.vectors(80 * 71, 203)
+    expected = twin(W)(x)
+    np.testing.assert_allclose(helpers.product(W, x), expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(helpers.product(W.T, expected), x, rtol=0, atol=1e-5)
+
+
+def test_no_right_hand_side_is_none(device):
+    W = Wavelet(device, (3, 5))
+    assert (W @ np.zeros((15, 0), np.float32)).shape == (15, 0)
+
+
+def test_facts(device):
+    W = Wavelet(device, (6, 9), "db2")
+    assert (W.grid, W.name, W.levels, W.shape, W.error) == ((6, 9), "db2", 4, (54, 54), 0.0)
+    assert W.orthonormal
+    assert [W.sides(level) for level in range(5)] == [(6, 9), (3, 5), (2, 3), (1, 2), (1, 1)]
+    with pytest.raises(InputError, match="db2 does not tell its diagonal"):
+        W.diagonal()
+
+
+def test_every_wavelet_that_is_offered_is_orthonormal(device):
+    for family in wavelets.families().split(", "):
+        name = family.split()[-1]  # the longest filters of each family
+        taps = wavelets.filters(name)
+        M = reference.wavelet_side(2 * taps.shape[1], 0, taps)
+        np.testing.assert_allclose(M @ M.T, np.eye(len(M)), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["bior2.2", "rbio1.3", "dmey"])
+def test_wavelets_that_are_not_orthonormal_are_refused(device, name):
+    with pytest.raises(InputError, match=f"{name} is not orthonormal; it must be one of .*db1 to db38, haar"):
+        Wavelet(device, (8, 8), name)
+
+
+@pytest.mark.parametrize("name", ["db99", "morl", "", None, 2])
+def test_unknown_wavelets_are_refused(device, name):
+    with pytest.raises(InputError, match=r"wavelet is .* must be one of .*haar"):
+        Wavelet(device, (8, 8), name)
+
+
+@pytest.mark.parametrize("levels", [4, -1, 1.5, "3"])
+def test_levels_beyond_the_grid_are_refused(device, levels):
+    with pytest.raises(InputError, match=r"levels is .* must be"):
+        Wavelet(device, (8, 5), "haar", levels)
+
+
+@pytest.mark.parametrize("grid", [(0, 4), (2.5, 2), 9, (1, 2, 3)])
+def test_grids_that_are_none_are_refused(device, grid):
+    with pytest.raises(InputError, match=r"grid is .* must be"):
+        Wavelet(device, grid, "haar")

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Compressed transports: every task with them, and with the exact one beside."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import ltcl
+from ltcl import exact, reciprocity
+from ltcl.device import Device
+from ltcl.errors import DeviceError, InputError, InputTypeError
+from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, ScaledColumns, Shifted
+from tests.bases import Given, rotation, stands_for, two_sided
+from tests.problems import enclosure
+
+GRID = (6, 7)
+N = 42
+SCENES = [enclosure(N, albedo, seed) for seed, albedo in enumerate((0.3, 0.4, 0.5))]
+F = np.random.default_rng(1).uniform(0.3, 0.5, (3, N))
+rng = np.random.default_rng(2)
+
+
+def bound(S, exact_S):
+    return float(np.linalg.norm(np.linalg.inv(S), 2) * np.linalg.norm(S - exact_S, 2))
+
+
+def given(device, channel=1, keep=0.5, f=None):
+    """One channel S F, the float64 S that it stands for, and the exact one."""
+    R = two_sided(device, SCENES[channel].R, keep, seed=channel)
+    S, true = np.eye(N) + stands_for(R), np.eye(N) + SCENES[channel].R
+    f = F[channel] if f is None else f
+    return ScaledColumns(IdentityPlus(R, solution_error=bound(S, true)), f), S, true
+
+
+def pair(device, channel=1, keep=0.5):
+    """A compressed transport and the exact one."""
+    matrix, _, true = given(device, channel, keep)
+    C = ltcl.Transport(matrix, GRID, first_bounce=F[channel])
+    return C, ltcl.Transport(true * F[channel], GRID, first_bounce=F[channel], device=device)
+
+
+def colour(device, keep=0.5):
+    parts = [given(device, channel, keep) for channel in range(3)]
+    C = ltcl.Transport([matrix for matrix, _, _ in parts], GRID, first_bounce=F)
+    true = [S * f for (_, _, S), f in zip(parts, F, strict=True)]
+    return C, ltcl.Transport(true, GRID, first_bounce=F, device=device)
+
+
+def test_operators_are_taken_as_they_stand(device):
+    matrix, S, _ = given(device)
+    T = ltcl.Transport(matrix, GRID, first_bounce=F[1])
+    assert T.device is device
+    assert T.systems == (matrix.A,)
+    assert T.operators == (matrix,)
+    assert T.error == matrix.A.solution_error > 0.0
+    assert T.nbytes == matrix.A.nbytes
+    p = rng.uniform(0.0, 1.0, GRID)
+    np.testing.assert_allclose((T @ p).ravel(), S @ (F[1] * p.ravel()), rtol=1e-5)
+    assert repr(T).startswith("<ltcl Transport 42 x 42, grey, grid 6 x 7, compressed to ")
+    assert repr(T).endswith(f" with an error of {T.error:.2g}>")
+
+
+def test_exact_ones_have_no_error(device):
+    _, T = pair(device)
+    assert T.error == 0.0
+    assert "compressed" not in repr(T)
+    assert ltcl.Transport(np.ones((12, N)), GRID, camera_grid=(3, 4)).error == 0.0
+
+
+def test_three_share_what_they_share(device):
+    W = Given(device, rotation(N))
+    cores = [CSR(device, scipy.sparse.csr_array(scene.R)) for scene in SCENES]
+    matrices = [ScaledColumns(IdentityPlus(Compressed(C, W, W)), f) for C, f in zip(cores, F, strict=True)]
+    T = ltcl.Transport(matrices, GRID, first_bounce=F)
+    patterns = {core.pattern for core in cores}
+    assert len(patterns) == 3
+    assert T.nbytes == sum(core.nbytes for core in cores) + W.nbytes
+    dual = [ScaledColumns(IdentityPlus(CSR(device, cores[0]._host, cores[0].pattern)), f) for f in F]
+    T = ltcl.Transport(dual, GRID, first_bounce=F)
+    assert T.nbytes == 3 * 4 * cores[0].nnz + cores[0].pattern.nbytes
+
+
+def test_another_first_bounce_makes_another_S(device):
+    """T = S F = S' F': the same picture, S' = S F / F', and a bound that F / F' widens."""
+    matrix, S, true = given(device)
+    other = F[1] * rng.uniform(0.8, 1.25, N)
+    T = ltcl.Transport(matrix, GRID, first_bounce=other)
+    found = T.systems[0]
+    assert isinstance(found.R, Shifted)
+    np.testing.assert_allclose(found.to_dense(), S * F[1] / other, atol=1e-5)
+    ratio = F[1] / other
+    assert T.error == pytest.approx(matrix.A.solution_error * ratio.max() / ratio.min())
+    b = rng.normal(size=(N, 20))
+    x, off = np.linalg.solve(true * ratio, b), np.linalg.solve(S * ratio, b)
+    assert np.all(np.linalg.norm(off - x, axis=0) <= T.error * np.linalg.norm(x, axis=0))
+
+
+def test_the_diagonal_is_that_of_the_operator(device):
+    matrix, S, _ = given(device)
+    T = ltcl.Transport(matrix, GRID)
+    np.testing.assert_allclose(T.first_bounce, S.diagonal() * F[1], rtol=1e-5)
+
+
+def test_products_stay_on_the_device(device, monkeypatch):
+    """Operators that are no S F go to the device as they are, too, not through the host."""
+    T = ltcl.Transport(Dense(device, SCENES[0].S * F[0]), GRID, first_bounce=F[0])
+    S = T.systems[0]
+    x = device.upload(rng.uniform(size=N))
+    out = x.like()
+    monkeypatch.setattr(type(x), "get", lambda self: pytest.fail("an array went to the host"))
+    S.apply(x, out)
+    monkeypatch.undo()
+    np.testing.assert_allclose(out.get(), SCENES[0].S @ x.get(), rtol=1e-5)
+
+
+def test_masked_pixels_stay_dark(device):
+    f = np.where(np.arange(N) % 5 == 0, 0.0, F[1])
+    matrix, _, _ = given(device, f=f)
+    with pytest.raises(InputError, match="give on_dark='mask'"):
+        ltcl.Transport(matrix, GRID, first_bounce=f)
+    T = ltcl.Transport(matrix, GRID, first_bounce=f, on_dark="mask")
+    assert T.systems == (matrix.A,)
+    found = ltcl.compensate(T, T @ np.full(GRID, 0.5), rtol=T.error)
+    assert not found.pattern.ravel()[T.masked].any()
+    np.testing.assert_allclose(found.pattern.ravel()[~T.masked], 0.5, atol=0.05)
+
+
+def test_one_device_for_all(device, small_device):
+    matrix, _, _ = given(device)
+    assert ltcl.Transport(matrix, GRID, first_bounce=F[1], device=device).device is device
+    with pytest.raises(InputError, match=r"device is .* but operators lie on"):
+        ltcl.Transport(matrix, GRID, first_bounce=F[1], device=small_device)
+    with pytest.raises(InputError, match="matrix has operators on several devices"):
+        ltcl.Transport([matrix, matrix, given(small_device)[0]], GRID, first_bounce=F)
+    with pytest.raises(DeviceError):
+        ltcl.Transport(matrix, GRID, first_bounce=F[1], device="there is none")
+
+
+def test_tolerances_below_the_error_are_refused_with_the_figure(device):
+    C, T = pair(device)
+    picture = T @ np.full(GRID, 0.5)
+    for task in (ltcl.compensate, ltcl.separate):
+        with pytest.raises(InputError, match=r"rtol is 1e-06; S is compressed and .* off by 0\.\d+: ask"):
+            task(C, picture, rtol=1e-6)
+
+
+def test_compensation_is_as_good_as_it_says(device):
+    C, T = pair(device)
+    p = rng.uniform(0.3, 0.7, GRID)
+    found = ltcl.compensate(C, T @ p, rtol=C.error)
+    l_d, off = F[1] * p.ravel(), F[1] * (found.pattern - p).ravel()
+    slack = np.linalg.cond(np.eye(N) + SCENES[1].R) * C.error  # of the residual that rtol leaves
+    assert np.linalg.norm(off) <= (C.error + slack) * np.linalg.norm(l_d)
+
+
+@pytest.mark.parametrize("kind", [pair, colour])
+@pytest.mark.parametrize("gain", [1.0, "auto"])
+def test_compensation_beside_the_exact_one(device, kind, gain):
+    C, T = kind(device)
+    desired = rng.uniform(0.1, 0.3, GRID)
+    ours = ltcl.compensate(C, desired, gain=gain, exact=T, rtol=1e-5)
+    theirs = ltcl.compensate(T, desired, gain=gain, rtol=1e-5, method="direct")
+    assert ours.gain == pytest.approx(theirs.gain, rel=1e-4)
+    np.testing.assert_allclose(ours.pattern, theirs.pattern, atol=1e-4)
+    np.testing.assert_allclose(ours.appearance, T @ ours.pattern, rtol=1e-5)  # not that of C
+    assert ours.error == pytest.approx(theirs.error, abs=1e-4)
+
+
+def test_beyond_the_projector(device):
+    """Least squares within the bounds takes products with the transpose, compressed ones or exact."""
+    C, T = pair(device)
+    desired = rng.uniform(0.0, 3.0, GRID)
+    alone = ltcl.compensate(C, desired, rtol=C.error)
+    matrix = C.operators[0].to_dense()
+    assert alone.clipped > 0.0
+    left = np.linalg.norm(desired.ravel() - matrix @ alone.pattern.ravel()) / np.linalg.norm(desired)
+    assert alone.error == pytest.approx(left, rel=1e-3)
+    assert alone.gap <= C.error
+    ours, theirs = ltcl.compensate(C, desired, exact=T, rtol=1e-4), ltcl.compensate(T, desired, rtol=1e-4)
+    assert ours.error == pytest.approx(theirs.error, abs=2e-4)
+
+
+@pytest.mark.parametrize("kind", [pair, colour])
+def test_separation_beside_the_exact_one(device, kind):
+    C, T = kind(device)
+    image = T @ rng.uniform(0.2, 0.8, GRID)
+    ours, theirs = ltcl.separate(C, image, 2, exact=T, rtol=1e-5), ltcl.separate(T, image, 2, rtol=1e-5)
+    np.testing.assert_allclose(ours.direct, theirs.direct, atol=1e-4)
+    np.testing.assert_allclose(ours.bounces, theirs.bounces, atol=1e-4)
+    assert ours.reciprocity_defect == theirs.reciprocity_defect < 1e-6
+    alone = ltcl.separate(C, image, 2, rtol=C.error)
+    np.testing.assert_allclose(alone.direct + alone.bounces.sum(axis=0) + alone.rest, image, atol=1e-5)
+
+
+def test_what_does_not_lie_beside(device, small_device):
+    C, T = pair(device)
+    rgb = colour(device)[1]
+    matrix = T.matrices[0]
+    for other, kind, part in (
+        (matrix, InputTypeError, "exact is a ndarray; it must be a ltcl.Transport"),
+        (rgb, InputError, "exact has channels 3; it must be that of T, 1"),
+        (
+            ltcl.Transport(matrix, (7, 6)),
+            InputError,
+            r"exact has grid \(7, 6\); .* of T, \(6, 7\)",
+        ),
+        (ltcl.Transport(matrix, GRID, first_bounce=2 * F[1]), InputError, "exact has another first bounce"),
+        (ltcl.Transport(matrix[:12], GRID, camera_grid=(3, 4)), InputError, "needs both on one grid"),
+        (ltcl.Transport(matrix, GRID, first_bounce=F[1], device=small_device), InputError, "another device"),
+    ):
+        for task in (ltcl.compensate, ltcl.separate):
+            with pytest.raises(kind, match=part):
+                task(C, np.ones(GRID), exact=other)
+    mixed = ltcl.Transport(rgb.matrices, GRID, first_bounce=F, mixing=np.eye(3) + 0.1)
+    with pytest.raises(InputError, match="exact mixes colours in another way"):
+        exact.beside(rgb, mixed)
+    with pytest.raises(InputTypeError, match="'monte_carlo' samples; leave it out"):
+        ltcl.separate(C, np.ones(GRID), method="monte_carlo", exact=T)
+
+
+def test_analysis_by_products(device):
+    """What needs the sight of entries is unknown; the rest is that of the exact T up to what was dropped."""
+    C, T = pair(device, keep=0.999)
+    ours, theirs = (ltcl.analyze(one).channels[0] for one in (C, T))
+    assert np.isnan(ours.norm_inf)
+    assert np.isnan(ours.energy.negative_entries)
+    assert np.isnan(ours.products["gauss_seidel"])
+    for name in ("spectral_radius", "negative_bounce"):
+        assert getattr(ours, name) == pytest.approx(getattr(theirs, name), abs=1e-2)
+    assert ours.reciprocity_defect == pytest.approx(0.0, abs=1e-2)
+    assert ours.energy.bounce_highest == pytest.approx(theirs.energy.bounce_highest, abs=1e-2)
+    assert ours.energy.albedo_from_columns == pytest.approx(theirs.energy.albedo_from_columns, abs=1e-2)
+    assert ours.products["jacobi"] == pytest.approx(theirs.products["jacobi"], abs=1)
+
+
+def test_a_defect_by_products_is_that_of_the_entries(device):
+    T = SCENES[0].S * F[0] * rng.uniform(0.8, 1.2, (N, N))
+    assert reciprocity.defect(Dense(device, T), F[0]) == pytest.approx(reciprocity.defect(T, F[0]), rel=1e-4)
+    some = reciprocity.defect(Dense(device, T), F[0], entries=16 * 20**2)  # 20 pixels, a product each
+    assert some == pytest.approx(reciprocity.defect(T, F[0], entries=20**2), rel=1e-4)
+
+
+def test_tasks_accept_a_T_without_any_bound(device):
+    """Infinite: nothing is known of solutions, so that only exact= helps; relighting and checks go on."""
+    R = two_sided(device, SCENES[1].R, 0.5)
+    C = ltcl.Transport(ScaledColumns(IdentityPlus(R, solution_error=np.inf), F[1]), GRID, first_bounce=F[1])
+    T = pair(device)[1]
+    with pytest.raises(InputError, match="off by inf"):
+        ltcl.compensate(C, np.ones(GRID))
+    assert ltcl.compensate(C, T @ np.full(GRID, 0.5), exact=T, rtol=1e-5).error < 1e-4
+    assert ltcl.analyze(C).channels[0].negative_bounce < 0.01
+    assert isinstance(C.device, Device)
