@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse
-from _peers import missing, sparse_products
 
 import _figures as figures
 from _harness import Options, Row, Triad, options, report, seconds
+from _peers import missing, sparse_products
 from ltcl import plots
 from ltcl.compression.coefficients import Coefficients, coefficients
 from ltcl.compression.sources import source
@@ -196,8 +196,8 @@ def draw(points: list[Point], ms: dict[str, float], A: Any) -> Figure:
     figure = figures.page(
         510,
         "What a product with a smooth R takes",
-        "Thresholding drops the far field, which is weak at every place and strong together; wavelets on both",
-        "sides keep it in a few numbers. Dashed: with a transform at each end; a solve does without.",
+        "Thresholding drops the far field, which is weak at every place and strong together; wavelets on",
+        "both sides keep it in a few numbers. Dashed: with a transform at each end; a solve does without.",
     )
     lefts, width = figures.columns(2, gap=60)
     first = figures.graph(figure, (lefts[0] + 50, 150, width - 50, 230), "Memory", "bytes", "relative error")

@@ -112,9 +112,7 @@ def build(given: Options, corner: Corner) -> Built:
             progress=progress,
         )
     found, systems = [], []
-    W = Wavelet(
-        given.device, corner.rows.grid, "db2"
-    )  # whose scratch is for pictures, not for blocks of rows
+    W = Wavelet(given.device, corner.rows.grid, "db2")  # its scratch is for pictures
     for albedo in ALBEDO:
         with spent(f"R of albedo {albedo:g}"):
             C = (A.core * np.float32(albedo / REFERENCE)).astype(np.float32)
