@@ -123,14 +123,14 @@ def of_wavelets(given: Options, at: Problem, found: Coefficients, wanted: float,
         return Compressed(core, out, W)
 
     def error(threshold: float) -> float:
-        return at.error(operator(CSR(given.device, found.above(threshold).core)) @ at.x)
+        return at.error(operator(CSR(given.device, found.above(threshold).core)).matvec(at.x))
 
     highest = float(np.abs(found.core.data).max())
     kept = found.above(bisect(error, wanted, highest)).core
     cores: list[Operator] = [CSR(given.device, kept), Tiles(given.device, kept, 1, "bfloat16")]
     form = "both" if both else "rows"
     return [
-        Point(form, operator(core), core, at.error(operator(core) @ at.x), kept.nnz / len(at.R))
+        Point(form, operator(core), core, at.error(operator(core).matvec(at.x)), kept.nnz / len(at.R))
         for core in cores
     ]
 

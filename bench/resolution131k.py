@@ -146,7 +146,7 @@ def residual_at_random(given: Options, corner: Corner, built: Built) -> float:
     """||(I + R)(I - A) v - v|| / ||v|| for random v, A by all its rows, of the worst channel."""
     v = np.random.default_rng(8).standard_normal((corner.pixels, 3))
     left = v - corner.bounce(v)
-    undone = np.stack([S @ left[:, c].astype(np.float32) for c, S in enumerate(built.T.systems)], axis=1)
+    undone = np.stack([S.matvec(left[:, c]) for c, S in enumerate(built.T.systems)], axis=1)
     return relative(undone, v)
 
 
@@ -185,7 +185,7 @@ def times(given: Options, built: Built, wanted: np.ndarray) -> dict[str, float]:
     pixels = wanted.reshape(-1, 3).astype(np.float32)
     x = given.device.upload(pixels[:, 0])
     out = x.like()
-    R = built.T.systems[0].R
+    R: Any = built.T.systems[0].R
     a = given.device.upload(np.zeros(R.core.shape[1], np.float32))
     product_out = a.like()
 
