@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from ltcl.device import Device
+from ltcl.operators import Wavelet
 from ltcl.scenes import box, dihedral
 
 BENCH = Path(__file__).resolve().parents[1] / "bench"
@@ -116,3 +117,40 @@ def test_light_field_sums_every_bounce(load: Callable[[str], Any]) -> None:
     A = np.array([[0.1, 0.4], [0.2, 0.3]])
     found = load("fig6").LightField(A) @ np.array([1.0, 2.0])
     np.testing.assert_allclose(found, np.linalg.solve(np.eye(2) - A, [1.0, 2.0]), rtol=1e-7)
+
+
+def test_a_slope_is_that_above_the_launch_floor(load: Callable[[str], Any]) -> None:
+    pixels = np.array([2, 20, 200, 2000, 20000, 200000])
+    found = load("fig7").law(pixels, 1e-3 + 1e-9 * pixels**1.5)
+    # The smallest size has no work to speak of, so its time is the floor; the next two are within twice it.
+    assert (found.start, found.count) == (20000, 2)
+    assert found.slope == pytest.approx(1.5, abs=1e-4)
+    np.testing.assert_allclose(found(pixels), 1e-3 + 1e-9 * pixels**1.5, rtol=1e-4)
+
+
+def test_what_never_leaves_the_launch_floor_has_no_slope(load: Callable[[str], Any]) -> None:
+    found = load("fig7").law(np.array([2, 20, 200]), np.array([1e-3, 1.1e-3, 2.5e-3]))
+    assert (found.slope, found.count) == (0.0, 1)
+
+
+def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any) -> None:
+    at = load("_ways").problem(3)
+    truth = at.l_out - dihedral(3, albedo=0.8).A @ at.l_out
+    np.testing.assert_allclose(at.l_d, truth, rtol=1e-6)
+    found = load("fig7").ways(given, at)
+    assert sorted(found) == ["both", "iteration", "rows", "series"]
+    for way in found.values():
+        l_d = way.run()
+        assert np.linalg.norm(l_d - truth) <= 1e-2 * np.linalg.norm(truth)
+        assert way.error == pytest.approx(np.linalg.norm(l_d - truth) / np.linalg.norm(truth), rel=1e-3)
+
+
+def test_rows_in_wavelets_are_those_of_R(load: Callable[[str], Any], given: Any) -> None:
+    ways = load("_ways")
+    at = ways.problem(3)
+    R = ways.dense(given, at).R.to_dense()
+    W = Wavelet(given.device, at.rows.grid, "db2").to_dense()
+    both = ways.of_both(given, at)
+    size = float(np.linalg.norm(R))
+    np.testing.assert_allclose(both.toarray(), W @ R @ W.T, atol=1e-3 * size)
+    np.testing.assert_allclose(ways.of_rows(given, at, both).toarray(), R @ W.T, atol=2e-3 * size)
