@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 SIZES, SMOKE = (8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256), (2, 4, 8)  # patches along a wall, N = 2 n^2
 SERIES, DENSE, SQUARES = 4096, 16562, 4  # the largest N; arrays of N x N float32 on the way
 PATIENCE, REPEATS = 3.0, 15  # s: what takes longer runs once
-ABOVE = 2.0  # times the launch floor: where a slope begins
+ABOVE, LEAST = 5.0, 3  # times the launch floor: where a slope begins; of so many points at least
 MANY = 2000  # pixels from which on W is judged: few have few wavelets
 APART = {"rows": 5, "both": -5}  # points, between times that are written beside each other
 
@@ -150,14 +150,14 @@ def law(pixels: np.ndarray, spent: np.ndarray) -> Law:
     """The slope of log time over log N above the launch floor.
 
     The floor is the time at the smallest N, where a solve is launches and checks. Points count from where all
-    take at least twice as long; where fewer than two do, the slope is 0.
+    take at least five times as long, and the last three in any case; the slope is 0 where these do not rise.
     """
     floor = float(spent[0])
-    first = int(np.flatnonzero(spent < ABOVE * floor)[-1]) + 1
-    pixels, spent = pixels[first:], spent[first:]
-    if len(pixels) < 2:
-        return Law(floor, 0.0, 0.0, int(pixels[-1]) if len(pixels) else 0, len(pixels))
-    slope, factor = np.polyfit(np.log(pixels), np.log(spent - floor), 1)
+    first = min(int(np.flatnonzero(spent < ABOVE * floor)[-1]) + 1, len(pixels) - LEAST)
+    pixels, above = pixels[first:], spent[first:] - floor
+    if above.min() <= 0.0:
+        return Law(floor, 0.0, 0.0, int(pixels[0]), len(pixels))
+    slope, factor = np.polyfit(np.log(pixels), np.log(above), 1)
     return Law(floor, float(np.exp(factor)), float(slope), int(pixels[0]), len(pixels))
 
 
@@ -225,7 +225,7 @@ def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
     for name, method in METHODS.items():
         pixels, spent = curve(points, name)
         label = method.label
-        if name in laws and laws[name].count > 1:
+        if name in laws:
             label += f": slope {laws[name].slope:.2f}"
             at = np.geomspace(laws[name].start, pixels[-1])
             axes.plot(at, laws[name](at), ":", color=method.colour, lw=1.5)
