@@ -40,7 +40,7 @@ note = Console(stderr=True).print
 
 @dataclass(frozen=True)
 class Problem:
-    """A corner, a picture of it and the direct light that makes it, (N,) float64."""
+    """A corner, a picture of it, (N,) float32, and the direct light that makes it, (N,) float64."""
 
     rows: CornerRows
     l_out: np.ndarray
