@@ -1,18 +1,20 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Pixels in another order: out = scale * (P x) + add, where row i of P x is row order[i] of x.
 //
-// Work-items stride through the k right-hand sides of a pixel (dimension 0) and through pixels (1), as many as
-// there are: a CPU takes one item a pixel, a GPU one a value.
+// Work-items stride through pieces of K right-hand sides (dimension 0) and through pixels (1), as many as there
+// are: a CPU takes one item a pixel, a GPU one a piece.
+//
+// Required define: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8.
 
-#include "common/real.h"
+#include "common/pieces.h"
 
 kernel void ordered_gather(
     int rows, int k, real scale, int adds, global const int *order, global const real *x, global const real *add,
     global real *out)
 {
-    for (int row = get_global_id(1); row < rows; row += get_global_size(1)) {
-        global const real *from = x + order[row] * k;
-        for (int c = get_global_id(0); c < k; c += get_global_size(0))
-            LTCL_STORE(out, row * k + c, from[c], scale, adds, add);
-    }
+    for (int row = get_global_id(1); row < rows; row += get_global_size(1))
+        for (int p = get_global_id(0); p < pieces_of(k); p += get_global_size(0)) {
+            const piece q = piece_of(p, k);
+            put(out, row * k + q.at, LOAD(x + order[row] * k + q.at), q.skip, scale, adds, add);
+        }
 }

@@ -8,12 +8,13 @@
 //   tile_matvec_group   one work-group a row, its items side by side along the row; for GPUs
 //
 // Required defines: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8; WIDTH: 1, 8 or 16; VALUES, the type of
-// the numbers, see common/narrow.h. Optional: PACKED, see common/lanes.h; SCALED: each row has a factor of its own;
-// LONG: places have 32 bits, not 16; GRANULE: places count in so many columns; PAGES: parts of a row, each with
-// places of its own: those of part p count from p * 65536 * GRANULE.
+// the numbers, see common/narrow.h.
+// Optional: PACKED, see common/lanes.h; LONG: places have 32 bits, not 16; GRANULE: places count in so many columns;
+// PAGES: parts of a row, each with places of its own, which in part p count from column p * 65536 * GRANULE.
 // Layout: a slab of `rows` rows, the first of which is row `first` of the matrix. pointers[rows * PAGES + 1] counts
-// tiles from 0 within the slab; starts (one a tile) and values (WIDTH a tile) follow it. Columns that no nonzero
-// claims hold zeros. `last` is the last column at which a tile may begin. scales is that of the whole matrix, read where SCALED says so.
+// tiles from 0 within the slab; starts (one a tile) and values (WIDTH a tile) follow it, and so do scales (one a tile)
+// where values are int8: they are not read elsewhere. Columns that no nonzero claims hold zeros. `last` is the last
+// column at which a tile may begin.
 // x and out are row-major with `stride` reals a row; the launch works on their columns
 // offset .. offset + K - 1. `add` counts where `adds` is 1; see LTCL_STORE in common/real.h.
 
@@ -31,11 +32,6 @@ typedef int place;
 #else
 typedef ushort place;
 #endif
-#ifdef SCALED
-#define FACTOR(row) (scale * scales[row])
-#else
-#define FACTOR(row) (scale)
-#endif
 
 #include "common/lanes.h"
 #include "common/reduce.h"
@@ -45,7 +41,7 @@ typedef ushort place;
 
 kernel void tile_matvec(
     int rows, int first, int stride, int offset, real scale, int adds, int last, global const int *pointers,
-    global const place *starts, global const narrow *values, global const real *scales, global const real *x,
+    global const place *starts, global const narrow *values, global const uchar *scales, global const real *x,
     global const real *add, global real *out)
 {
     stride = STRIDE(stride);
@@ -58,16 +54,16 @@ kernel void tile_matvec(
     pointers += row * PAGES;
     for (int page = 0; page < PAGES; ++page)
         tile_add(
-            sum, starts, values, ORIGIN(page), last, x + offset, stride, pointers[page] * WIDTH,
+            sum, starts, values, scales, ORIGIN(page), last, x + offset, stride, pointers[page] * WIDTH,
             pointers[page + 1] * WIDTH, 1);
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c)
-        LTCL_STORE(out, i + c, sum[c], FACTOR(first + row), adds, add);
+        LTCL_STORE(out, i + c, sum[c], scale, adds, add);
 }
 
 kernel void tile_matvec_stream(
     int rows, int first, int stride, int offset, real scale, int adds, int last, global const int *pointers,
-    global const place *starts, global const narrow *values, global const real *scales, global const real *x,
+    global const place *starts, global const narrow *values, global const uchar *scales, global const real *x,
     global const real *add, global real *out)
 {
     stride = STRIDE(stride);
@@ -75,18 +71,19 @@ kernel void tile_matvec_stream(
     if (row >= rows)
         return;
     pointers += row * PAGES;
-    tile_sums sum = tile_sum(starts, values, 0, last, x + offset, stride, pointers[0], pointers[1]);
+    tile_sums sum = tile_sum(starts, values, scales, 0, last, x + offset, stride, pointers[0], pointers[1]);
     for (int page = 1; page < PAGES; ++page)
         sum.vector += tile_sum(
-            starts, values, ORIGIN(page), last, x + offset, stride, pointers[page], pointers[page + 1]).vector;
+            starts, values, scales, ORIGIN(page), last, x + offset, stride, pointers[page],
+            pointers[page + 1]).vector;
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c)
-        LTCL_STORE(out, i + c, sum.item[c], FACTOR(first + row), adds, add);
+        LTCL_STORE(out, i + c, sum.item[c], scale, adds, add);
 }
 
 kernel void tile_matvec_group(
     int rows, int first, int stride, int offset, real scale, int adds, int last, global const int *pointers,
-    global const place *starts, global const narrow *values, global const real *scales, global const real *x,
+    global const place *starts, global const narrow *values, global const uchar *scales, global const real *x,
     global const real *add, global real *out, local real *scratch)
 {
     stride = STRIDE(stride);
@@ -97,12 +94,12 @@ kernel void tile_matvec_group(
     pointers += row * PAGES;
     for (int page = 0; page < PAGES; ++page)
         tile_add(
-            sum, starts, values, ORIGIN(page), last, x + offset, stride, pointers[page] * WIDTH + get_local_id(0),
-            pointers[page + 1] * WIDTH, get_local_size(0));
+            sum, starts, values, scales, ORIGIN(page), last, x + offset, stride,
+            pointers[page] * WIDTH + get_local_id(0), pointers[page + 1] * WIDTH, get_local_size(0));
     const int i = (first + row) * stride + offset;
     for (int c = 0; c < K; ++c) {
         const real total = group_sum(sum[c], scratch);
         if (get_local_id(0) == 0)
-            LTCL_STORE(out, i + c, total, FACTOR(first + row), adds, add);
+            LTCL_STORE(out, i + c, total, scale, adds, add);
     }
 }

@@ -6,8 +6,8 @@
 // wavelet_join_all do the levels first .. last - 1 of small pictures at once: one work-group for each K
 // right-hand sides, which waits for itself between passes.
 //
-// Work-items stride through lanes (dimension 0), pairs of samples (1) and rows (2), as many as there are: a
-// CPU takes one item a row or a pair, a GPU one for each K values.
+// Work-items stride through pieces of K values (dimension 0), pairs of samples (1) and rows (2), as many as
+// there are: a CPU takes one item a row or a pair, a GPU one a piece.
 //
 // Required defines: K, the neighbouring values that an item handles together: 1, 2, 3, 4 or 8;
 // TAPS, the length of the filters, even.
@@ -21,7 +21,7 @@
 // left, the last two turn into one of the approximation and a detail, by a rotation that takes a constant to
 // the approximation alone. Orthonormal, and a constant has one coefficient on any grid.
 
-#include "common/lanes.h"
+#include "common/pieces.h"
 
 #ifndef TAPS
 #error "wavelet.cl needs -DTAPS=<length of the filters: 2, 4, 6, ...>"
@@ -127,37 +127,6 @@ INLINE pair join(
         i = i + 1 == a.regular ? 0 : i + 1;
     }
     return p;
-}
-
-// Values `at` .. at + K - 1 of a stretch of `run`, of which piece p has not yet had those from `skip` on: the last
-// piece of a stretch begins early, so that all are whole.
-typedef struct {
-    int at, skip;
-} piece;
-
-INLINE piece piece_of(int p, int run)
-{
-    const int at = min(K * p, run - K);
-    piece q = {at, K * p - at};
-    return q;
-}
-
-INLINE int pieces_of(int run)
-{
-    return (run + K - 1) / K;
-}
-
-// out = scale v + add at i .. i + K - 1, but for the first `skip` of them.
-INLINE void put(global real *out, int i, lanes v, int skip, real scale, int adds, global const real *add)
-{
-    lanes_items items;
-    items.vector = adds ? scale * v + LOAD(add + i) : scale * v;
-    if (skip == 0) {
-        STORE(items.vector, out + i);
-        return;
-    }
-    for (int c = skip; c < K; ++c)
-        out[i + c] = items.item[c];
 }
 
 // Each row of x (rows, n, k) becomes a row of lines: approximation, then details.

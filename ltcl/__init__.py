@@ -14,6 +14,7 @@ The house, from the ground up; imports point down only:
     errors, checks, files           one-line refusals; outputs that appear whole or not at all
     device                          OpenCL: devices, kernels, arrays; operators: matrices there, S = I + R
     transport, theory, solvers      T = S F; what can be forecast; one algorithm per file
+    exact, parts                    a compressed T beside the one it stands for; as the arrays of a file
     compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
     compression                     T in few numbers, with a bound on what solutions lose
     images, layout, report          pictures, pictures as right-hand sides, JSON
@@ -31,12 +32,12 @@ from typing import TYPE_CHECKING, Any
 from ltcl import errors
 from ltcl.analysis import Analysis, analyze
 from ltcl.compensation import Compensation, compensate
-from ltcl.compression import Compression, compress
+from ltcl.compression import Compression, compress, invert
 from ltcl.device import Device, list_devices, open_device
 from ltcl.relighting import relight
 from ltcl.separation import Separation, separate
-from ltcl.solvers import Solution, Status, solve
-from ltcl.store import load, save
+from ltcl.solvers import Inverse, Solution, Status, solve
+from ltcl.store import load, load_inverse, save, save_inverse
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ __all__ = [
     "Compensation",
     "Compression",
     "Device",
+    "Inverse",
     "Separation",
     "Solution",
     "Status",
@@ -57,13 +59,16 @@ __all__ = [
     "compress",
     "errors",
     "images",
+    "invert",
     "list_devices",
     "load",
+    "load_inverse",
     "open_device",
     "operators",
     "plots",
     "relight",
     "save",
+    "save_inverse",
     "scenes",
     "separate",
     "solve",

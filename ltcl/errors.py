@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ltcl.compression.iteration import Iterated
+    from ltcl.compression.iterated import Iterated
     from ltcl.solvers.result import Solution
 
 

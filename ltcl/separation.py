@@ -17,16 +17,20 @@ light away, or that is far from reciprocal, gives such a scene away: the result 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks, layout
+from ltcl.errors import InputTypeError
 from ltcl.exact import beside
-from ltcl.operators import Operator
+from ltcl.operators import IdentityPlus
 from ltcl.single_view import negative_bounces
-from ltcl.solvers import Solution, sampled, solve
+from ltcl.solvers import Inverse, Solution, sampled, solve
+from ltcl.solvers.precomputed import require_inverse
 from ltcl.solvers.solve import SAMPLED
 from ltcl.transport import Transport, require
 
@@ -60,7 +64,7 @@ class Separation:
         scene. The first bounce of a glossy scene is off by a few times as much, later ones by more.
     warning : str
         Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 and the
-        negative light at most 0.005, or unknown.
+        negative light at most 0.005, or unknown; of a compressed T both may be more by its error.
     """
 
     direct: np.ndarray
@@ -85,6 +89,7 @@ def separate(
     method: str = "auto",
     rtol: float = 1e-3,
     exact: Transport | None = None,
+    inverse: Inverse | None = None,
     **options: Any,
 ) -> Separation:
     """Split an image of the scene into direct light and bounces.
@@ -101,6 +106,8 @@ def separate(
         Of `ltcl.solve`; rtol is per bounce.
     exact : Transport, optional
         What a compressed T stands for: T then solves, to any `rtol`, and all that is told is of `exact`.
+    inverse : Inverse, optional
+        Of T, as `ltcl.invert` makes it: each bounce is then one product, and `rtol` the error it may have.
 
     Returns
     -------
@@ -110,7 +117,7 @@ def separate(
     ------
     InputError
         A rectangular T, shapes that do not fit, a negative number of bounces, an `rtol` below the error of
-        a compressed T without `exact`.
+        a compressed T without `exact`, or below that of `inverse`, or an inverse of another transport.
     ConvergenceError
         A solve did not reach `rtol`.
 
@@ -129,18 +136,18 @@ def separate(
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     pictures = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
+    if inverse is not None:
+        _check_inverse(T, inverse, method, rtol, exact, options)
     true, judges = beside(T, exact)
-    chains = [
-        _chain(S, l_out, bounces, method, rtol, {**options, "exact": E})
-        for S, l_out, E in zip(T.systems, columns, judges, strict=True)
-    ]
+    undo = partial(_undo, T, inverse, method, {"rtol": rtol, **options}, judges)
+    chains = [_chain(partial(undo, channel), l_out, bounces) for channel, l_out in enumerate(columns)]
 
     def picture(parts: list[np.ndarray]) -> np.ndarray:
         return shape.pack(parts, T.grid).astype(np.float32)
 
     direct, *indirect = [picture([chain.bounces[k] for chain in chains]) for k in range(bounces + 1)]
     negative = max(negative_bounces(true))
-    warning = _warning(true.reciprocity_defect, negative)
+    warning = _warning(true.reciprocity_defect, negative, true.error)
     if warning:
         logger.warning(warning)
     per_bounce = [tuple(chain.solutions[k] for chain in chains) for k in range(bounces + 1)]
@@ -156,13 +163,26 @@ def separate(
     )
 
 
-def _warning(defect: float, negative: float) -> str:
-    """What is wrong with T for a separation; nothing where both are small, or unknown."""
+def _check_inverse(
+    T: Transport, inverse: Any, method: str, rtol: float, exact: Any, options: dict[str, Any]
+) -> None:
+    require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
+    unknown = [name for name in options if name not in ("callback", "throw")]
+    if unknown:
+        name = unknown[0]
+        raise InputTypeError(f"option {name!r} is given, but with inverse there is no solve that takes it")
+
+
+def _warning(defect: float, negative: float, error: float) -> str:
+    """What is wrong with T for a separation; nothing where both are small, or unknown.
+
+    What a compressed T may be off by is no sign of anything.
+    """
     found = []
-    if defect > LARGEST_DEFECT:
-        found.append(f"T is not reciprocal (defect {defect:.2g}, above {LARGEST_DEFECT:g})")
-    if negative > LARGEST_NEGATIVE:
-        found.append(f"a bounce takes away {negative:.2g} of its light (above {LARGEST_NEGATIVE:g})")
+    if defect > (most := LARGEST_DEFECT + error):
+        found.append(f"T is not reciprocal (defect {defect:.2g}, above {most:.2g})")
+    if negative > (most := LARGEST_NEGATIVE + error):
+        found.append(f"a bounce takes away {negative:.2g} of its light (above {most:.2g})")
     if not found:
         return ""
     return (
@@ -180,12 +200,27 @@ class _Chain:
     solutions: list[Solution]
 
 
-def _chain(
-    S: Operator, l_out: np.ndarray, bounces: int, method: str, rtol: float, options: dict[str, Any]
-) -> _Chain:
+def _undo(
+    T: Transport,
+    inverse: Inverse | None,
+    method: str,
+    options: dict[str, Any],
+    judges: tuple[IdentityPlus | None, ...],
+    channel: int,
+    l_out: np.ndarray,
+    k: int,
+) -> Solution:
+    """S^-1 l_out of one channel, for bounce k."""
+    if inverse is not None:
+        return inverse.solve(l_out, channel)
+    return solve(T.systems[channel], l_out, method, exact=judges[channel], **_fresh(method, options, k))
+
+
+def _chain(undo: Callable[[np.ndarray, int], Solution], l_out: np.ndarray, bounces: int) -> _Chain:
+    """`undo` is S^-1 of what is left, for bounce k."""
     found, solutions, left = [], [], l_out.astype(np.float64)
     for k in range(bounces + 1):
-        solution = solve(S, left, method, rtol=rtol, **_fresh(method, options, k))
+        solution = undo(left, k)
         found.append(solution.x.astype(np.float64))
         solutions.append(solution)
         left = left - found[-1]

@@ -45,7 +45,7 @@ class Transport:
         As `open_device` takes it; opened at the first product only. Operators have one already.
     on_dark : "raise" or "mask"
         What to do where F is zero or negative: refuse, or never light these projector pixels in a
-        compensation. Relighting stays exact: what a pattern lights there is seen.
+        compensation. Relighting stays exact: what a pattern lights there is seen (not of an S diag(F)).
     mixing : (3, 3), optional
         Of the projector's colours, for a T of 3 channels: the light that channel c of T answers to is
         mixing[c] @ (red, green, blue) of the pattern.
@@ -125,10 +125,10 @@ class Transport:
     def __repr__(self) -> str:
         kind = {1: "grey", 3: "colour"}[self.channels]
         (rows, columns), (h, w) = self.shape, self.grid
-        compressed = ""
-        if any(made_with(T) is not None for T in self.matrices):
-            compressed = f", compressed to {checks.size(self.nbytes)} with an error of {self.error:.2g}"
-        return f"<ltcl Transport {rows} x {columns}, {kind}, grid {h} x {w}{compressed}>"
+        size = ""
+        if self._has_systems:
+            size = f", compressed to {checks.size(self.nbytes)} with an error of {self.error:.2g}"
+        return f"<ltcl Transport {rows} x {columns}, {kind}, grid {h} x {w}{size}>"
 
     @property
     def channels(self) -> int:
@@ -187,8 +187,12 @@ class Transport:
     @property
     def error(self) -> float:
         """The largest `solution_error` of the systems: what light may be off by; 0 where all are exact."""
-        compressed = self.is_square and any(made_with(T) is not None for T in self.matrices)
-        return max(S.solution_error for S in self.systems) if compressed else 0.0
+        return max(S.solution_error for S in self.systems) if self._has_systems else 0.0
+
+    @property
+    def _has_systems(self) -> bool:
+        """Whether some channel was given as S F."""
+        return self.is_square and any(made_with(T) is not None for T in self.matrices)
 
     @property
     def operators(self) -> tuple[Operator, ...]:
@@ -230,15 +234,7 @@ class Transport:
 
     def to_light(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 at masked pixels."""
-        light = [
-            np.divide(l_d, F[:, None], out=np.zeros(l_d.shape), where=F[:, None] > 0)
-            for l_d, F in zip(columns, self._require_first_bounce(), strict=True)
-        ]
-        return (
-            light
-            if self.mixing is None
-            else list(np.einsum("ij,jnk->ink", np.linalg.inv(self.mixing), light))
-        )
+        return first_bounces.undone(columns, self._require_first_bounce(), self.mixing)
 
     def _find_first_bounce(self, wanted: Any, probes: int, seed: int) -> np.ndarray:
         checks.count("probes", probes, least=2)

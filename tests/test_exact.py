@@ -11,7 +11,7 @@ import ltcl
 from ltcl import exact, reciprocity
 from ltcl.device import Device
 from ltcl.errors import DeviceError, InputError, InputTypeError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, ScaledColumns, Shifted, Wavelet
 from tests.bases import Given, rotation, stands_for, two_sided
 from tests.problems import enclosure
 
@@ -67,6 +67,10 @@ def test_exact_ones_have_no_error(device):
     assert T.error == 0.0
     assert "compressed" not in repr(T)
     assert ltcl.Transport(np.ones((12, N)), GRID, camera_grid=(3, 4)).error == 0.0
+    matrix, _, _ = given(device)
+    coupled = ltcl.Transport([[matrix] * 3] * 3, GRID)  # of which no S is solved
+    assert coupled.error == 0.0
+    assert repr(coupled) == "<ltcl Transport 42 x 42, colour, grid 6 x 7>"
 
 
 def test_three_share_what_they_share(device):
@@ -252,3 +256,23 @@ def test_tasks_accept_a_T_without_any_bound(device):
     assert ltcl.compensate(C, T @ np.full(GRID, 0.5), exact=T, rtol=1e-5).error < 1e-4
     assert ltcl.analyze(C).channels[0].negative_bounce < 0.01
     assert isinstance(C.device, Device)
+
+
+def test_what_was_dropped_is_not_taken_for_gloss(device):
+    """Walls that share no light share some of either sign once coefficients are dropped."""
+    scene = ltcl.scenes.dihedral(12, albedo=0.6)
+    T = scene.transport(first_bounce=scene.first_bounce, device=device)
+    W = Wavelet(device, T.grid, "db2")
+    R = T.systems[0].to_dense() - np.eye(T.shape[0])
+    C = W.to_dense() @ R @ W.to_dense().T
+    core = CSR(device, scipy.sparse.csr_array(np.where(np.abs(C) < 1e-3, 0.0, C)))
+    compressed = Compressed(core, W, W)
+    S = np.eye(len(R)) + compressed.to_dense()
+    kept = ScaledColumns(
+        IdentityPlus(compressed, solution_error=bound(S, np.eye(len(R)) + R)), T.first_bounce
+    )
+    found = ltcl.separate(
+        ltcl.Transport(kept, T.grid, first_bounce=T.first_bounce), T @ np.ones(T.grid), 1, rtol=0.1
+    )
+    assert found.negative_bounce > 0.005
+    assert found.warning == ""

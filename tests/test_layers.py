@@ -29,7 +29,7 @@ LAYERS: list[set[str]] = [
     {"images", "device"},
     {"operators", "layout", "channels", "first_bounces", "reciprocity"},
     {"theory", "inverse_diagonal", "transport"},
-    {"solvers", "exact"},
+    {"solvers", "exact", "parts"},
     {
         "compensation",
         "compression",

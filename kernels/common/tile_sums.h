@@ -8,16 +8,31 @@
 #include "common/lanes.h"
 #include "common/narrow.h"
 
-// First column of a tile. The last tiles of a row are moved back so that none reaches beyond column N.
-#define COLUMN(j) min(origin + (int)starts[j] * GRANULE, last)
+// First column of a tile. None may reach beyond the end of the row: where places count in more than one column,
+// the last tiles are moved back. PoCL compiles min() to a call.
+#if GRANULE == 1
+#define COLUMN(j) (origin + (int)starts[j])
+#else
+#define PLACED(j) (origin + (int)starts[j] * GRANULE)
+#define COLUMN(j) (PLACED(j) < last ? PLACED(j) : last)
+#endif
+
+// The scale that the numbers of tile j share: 5 bits of exponent and 3 of fraction.
+#if VALUES == 3
+#define SCALE(j) *as_float(((uint)scales[j] + 112 * 8) << 20)
+#define SCALE8(j) *as_float8((convert_uint8(LOAD8_UCHAR(scales + (j))) + 112 * 8) << 20)
+#else
+#define SCALE(j)
+#define SCALE8(j)
+#endif
 
 // Every `step`-th number from number `n` of the tiles on.
 inline void tile_add(
-    real *sum, global const place *starts, global const narrow *values, int origin, int last,
-    global const real *x, int stride, int n, int end, int step)
+    real *sum, global const place *starts, global const narrow *values, global const uchar *scales, int origin,
+    int last, global const real *x, int stride, int n, int end, int step)
 {
     for (; n < end; n += step) {
-        const real v = WIDEN(values + n);
+        const real v = WIDEN(values + n) SCALE(n / WIDTH);
         const int i = (COLUMN(n / WIDTH) + n % WIDTH) * stride;
         for (int c = 0; c < K; ++c)
             sum[c] = v * x[i + c] + sum[c];
@@ -37,45 +52,55 @@ typedef union {
         x[(i) + 6 * (step)], x[(i) + 7 * (step)]))
 
 inline tile_sums tile_sum(
-    global const place *starts, global const narrow *values, int origin, int last, global const real *x, int stride,
-    int j, int end)
+    global const place *starts, global const narrow *values, global const uchar *scales, int origin, int last,
+    global const real *x, int stride, int j, int end)
 {
-    real8 even = 0, odd = 0;
+    real8 s0 = 0, s1 = 0, s2 = 0, s3 = 0;  // four sums hide the latency of the addition
 #if WIDTH == 1
     for (; j + 8 <= end; j += 8) {
         const real8 y = (real8)(
             x[COLUMN(j) * stride], x[COLUMN(j + 1) * stride], x[COLUMN(j + 2) * stride], x[COLUMN(j + 3) * stride],
             x[COLUMN(j + 4) * stride], x[COLUMN(j + 5) * stride], x[COLUMN(j + 6) * stride],
             x[COLUMN(j + 7) * stride]);
-        even = WIDEN8(values + j) * y + even;
+        s0 = WIDEN8(values + j) SCALE8(j) * y + s0;
     }
 #else
     if (stride == 1) {
+#define PART(s, j, part) s = WIDEN8(values + (j) * WIDTH + (part)) SCALE(j) * LOAD8(x + COLUMN(j) + (part)) + s
 #if WIDTH == 8
-        for (; j + 2 <= end; j += 2) {
-            even = WIDEN8(values + j * 8) * LOAD8(x + COLUMN(j)) + even;
-            odd = WIDEN8(values + j * 8 + 8) * LOAD8(x + COLUMN(j + 1)) + odd;
+        for (; j + 4 <= end; j += 4) {
+            PART(s0, j, 0);
+            PART(s1, j + 1, 0);
+            PART(s2, j + 2, 0);
+            PART(s3, j + 3, 0);
         }
         for (; j < end; ++j)
-            even = WIDEN8(values + j * 8) * LOAD8(x + COLUMN(j)) + even;
+            PART(s0, j, 0);
 #else
-        for (; j < end; ++j) {
-            const int column = COLUMN(j);
-            even = WIDEN8(values + j * 16) * LOAD8(x + column) + even;
-            odd = WIDEN8(values + j * 16 + 8) * LOAD8(x + column + 8) + odd;
+        for (; j + 2 <= end; j += 2) {
+            PART(s0, j, 0);
+            PART(s1, j, 8);
+            PART(s2, j + 1, 0);
+            PART(s3, j + 1, 8);
+        }
+        if (j < end) {
+            PART(s0, j, 0);
+            PART(s1, j, 8);
         }
 #endif
+#undef PART
     } else
-        for (int n = j * (WIDTH / 8); n < end * (WIDTH / 8); ++n) {
-            const int i = (COLUMN(n / (WIDTH / 8)) + n % (WIDTH / 8) * 8) * stride;
-            even = WIDEN8(values + n * 8) * EIGHT(i, stride) + even;
-        }
+        for (; j < end; ++j)
+            for (int part = 0; part < WIDTH; part += 8) {
+                const int i = (COLUMN(j) + part) * stride;
+                s0 = WIDEN8(values + j * WIDTH + part) SCALE(j) * EIGHT(i, stride) + s0;
+            }
 #endif
     tile_sums sum;
-    sum.vector = sum8(even + odd);
+    sum.vector = sum8((s0 + s1) + (s2 + s3));
 #if WIDTH == 1
     for (; j < end; ++j)
-        sum.vector = WIDEN(values + j) * x[COLUMN(j) * stride] + sum.vector;
+        sum.vector = WIDEN(values + j) SCALE(j) * x[COLUMN(j) * stride] + sum.vector;
 #endif
     return sum;
 }
@@ -86,24 +111,24 @@ typedef lanes_items tile_sums;
 
 // The K values of a pixel lie side by side: one wide load a number, whose neighbours are widened together.
 inline tile_sums tile_sum(
-    global const place *starts, global const narrow *values, int origin, int last, global const real *x, int stride,
-    int j, int end)
+    global const place *starts, global const narrow *values, global const uchar *scales, int origin, int last,
+    global const real *x, int stride, int j, int end)
 {
     lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;
 #if WIDTH == 1
     for (; j + 4 <= end; j += 4) {
-        s0 = (lanes)(WIDEN(values + j)) * LOAD(x + COLUMN(j) * stride) + s0;
-        s1 = (lanes)(WIDEN(values + j + 1)) * LOAD(x + COLUMN(j + 1) * stride) + s1;
-        s2 = (lanes)(WIDEN(values + j + 2)) * LOAD(x + COLUMN(j + 2) * stride) + s2;
-        s3 = (lanes)(WIDEN(values + j + 3)) * LOAD(x + COLUMN(j + 3) * stride) + s3;
+        s0 = (lanes)(WIDEN(values + j) SCALE(j)) * LOAD(x + COLUMN(j) * stride) + s0;
+        s1 = (lanes)(WIDEN(values + j + 1) SCALE(j + 1)) * LOAD(x + COLUMN(j + 1) * stride) + s1;
+        s2 = (lanes)(WIDEN(values + j + 2) SCALE(j + 2)) * LOAD(x + COLUMN(j + 2) * stride) + s2;
+        s3 = (lanes)(WIDEN(values + j + 3) SCALE(j + 3)) * LOAD(x + COLUMN(j + 3) * stride) + s3;
     }
     for (; j < end; ++j)
-        s0 = (lanes)(WIDEN(values + j)) * LOAD(x + COLUMN(j) * stride) + s0;
+        s0 = (lanes)(WIDEN(values + j) SCALE(j)) * LOAD(x + COLUMN(j) * stride) + s0;
 #else
     for (; j < end; ++j) {
         global const real *y = x + COLUMN(j) * stride;
         for (int part = 0; part < WIDTH; part += 8, y += 8 * stride) {
-            const real8 v = WIDEN8(values + j * WIDTH + part);
+            const real8 v = WIDEN8(values + j * WIDTH + part) SCALE(j);
             s0 = (lanes)(v.s0) * LOAD(y) + s0;
             s1 = (lanes)(v.s1) * LOAD(y + stride) + s1;
             s2 = (lanes)(v.s2) * LOAD(y + 2 * stride) + s2;

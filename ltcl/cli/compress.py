@@ -11,6 +11,7 @@ import typer
 
 from ltcl import checks, report
 from ltcl.cli import console, options, transports
+from ltcl.errors import InputError
 from ltcl.store import formats
 
 _COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
@@ -66,6 +67,8 @@ def run(
     from ltcl.compression import compress
 
     formats.find(out)  # refused before a long computation
+    if out.suffix.lower() != ".npz":
+        raise InputError(f"--out is {out}; a compressed transport must be a .npz file")
     T = transports.load(file, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
     with console.Steps(1) as steps:
         steps.item(str(file))

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ltcl import checks
 from ltcl.cli import console, info, options
-from ltcl.store import formats
+from ltcl.errors import InputError
+from ltcl.store import Parts, Record, formats
 
 _IN = Annotated[Path, typer.Argument(metavar="IN", help="Light transport: .npz, .npy or .mtx.")]
 _OUT = Annotated[Path, typer.Argument(metavar="OUT", help="The new file; its extension names the format.")]
@@ -29,10 +30,7 @@ def run(
     record = formats.read(source)
     with formats.about(source):
         rows, columns = record.shape
-        if grid is not None:
-            record = dataclasses.replace(record, grid=checks.grid("grid", grid, columns))
-        if camera_grid is not None:
-            record = dataclasses.replace(record, camera_grid=checks.grid("camera_grid", camera_grid, rows))
+        record = _with_grids(record, grid, camera_grid)
         facts = info.describe(target, record)  # refuses what could not be loaded again
     formats.write(target, record)
     if record.grid is None:
@@ -46,3 +44,18 @@ def run(
         console.answer({"source": source, **facts})
     else:
         typer.echo(f"{target}: {facts['stored']}, {checks.size(target.stat().st_size)} on disk")
+
+
+def _with_grids(record: Record | Parts, grid: Any, camera_grid: Any) -> Record | Parts:
+    """The record with the grids that were given; that of a compressed one is part of what it is."""
+    rows, columns = record.shape
+    if isinstance(record, Parts):
+        for name, given in (("grid", grid), ("camera_grid", camera_grid)):
+            if given is not None and checks.grid(name, given, columns) != record.grid:
+                raise InputError(f"{name} is {given}; this transport is compressed on its own, {record.grid}")
+        return record
+    if grid is not None:
+        record = dataclasses.replace(record, grid=checks.grid("grid", grid, columns))
+    if camera_grid is not None:
+        record = dataclasses.replace(record, camera_grid=checks.grid("camera_grid", camera_grid, rows))
+    return record

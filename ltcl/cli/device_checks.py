@@ -12,11 +12,12 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+import pywt
 import scipy.sparse
 
 from ltcl.device import Device, cache, list_devices, sources, trial
 from ltcl.errors import DeviceError, FileError
-from ltcl.operators import CSR, Dense, IdentityPlus, Operator, Tiles
+from ltcl.operators import CSR, Dense, IdentityPlus, Operator, Tiles, Wavelet
 from ltcl.operators.base import WIDTHS
 from ltcl.solvers import solve
 
@@ -66,6 +67,7 @@ def on_device(device: Device) -> dict[str, Callable[[], str]]:
         "sparse product": lambda: _product(CSR(device, scipy.sparse.csr_array(R)), R),
         "products of tiles": lambda: _tiles(device, scipy.sparse.csr_array(R)),
         "dense product": lambda: _product(Dense(device, R), R),
+        "wavelets": lambda: _product(Wavelet(device, (8, 8), "db2", levels=1), _wavelets()),
         "solve": lambda: _solve(IdentityPlus(Dense(device, R)), R),
     }
 
@@ -88,10 +90,17 @@ def _product(A: Operator, truth: np.ndarray) -> str:
     """A x and A^T x agree with NumPy for one and for five right-hand sides."""
     worst = 0.0
     for k in (1, 5):
-        x = np.random.default_rng(k).standard_normal((_SIZE, k))
+        x = np.random.default_rng(k).standard_normal((len(truth), k))
         for found, wanted in ((A @ x, truth @ x), (A.T @ x, truth.T @ x)):
             worst = max(worst, float(np.linalg.norm(found - wanted) / np.linalg.norm(wanted)))
     return _agrees(worst, 1e-5, "NumPy")
+
+
+def _wavelets() -> np.ndarray:
+    """What PyWavelets makes of pictures of 8 x 8 pixels, a column each of which has one pixel lit."""
+    pictures = np.eye(64).reshape(64, 8, 8)
+    coefficients = [pywt.dwt2(picture, "db2", "periodization") for picture in pictures]
+    return np.stack([pywt.coeffs_to_array(list(c))[0].ravel() for c in coefficients], axis=1)
 
 
 def _tiles(device: Device, R: scipy.sparse.csr_array) -> str:

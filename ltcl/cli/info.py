@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import typer
 from ltcl import checks
 from ltcl.cli import console, options
 from ltcl.errors import InputError, LtclError
-from ltcl.store import Record, formats
+from ltcl.store import Parts, Record, formats
 
 
 def run(files: options.Matrices, json: options.Json = False) -> None:
@@ -77,8 +78,13 @@ def _show(found: list[dict[str, Any]]) -> None:
     )
 
 
-def describe(file: Path, record: Record) -> dict[str, Any]:
-    """Facts about a transport file, in plain types; refuses what could not be loaded."""
+def describe(file: Path, record: Record | Parts) -> dict[str, Any]:
+    """Facts about a transport file, in plain types; refuses what could not be loaded.
+
+    Of a compressed one the operators are not made: that takes a device.
+    """
+    if isinstance(record, Parts):
+        return _of_parts(file, record)
     parts = [_values(T) for T in record.matrices]
     for values in parts:
         checks.finite("T", values)
@@ -98,6 +104,27 @@ def describe(file: Path, record: Record) -> dict[str, Any]:
         "first_bounce_from": "diagonal" if record.first_bounce is None else "file",
         "mixing": record.mixing,
         "dark_pixels": None if F is None else int(np.count_nonzero((F <= 0).any(axis=0))),
+        "solution_error": 0.0,
+    }
+
+
+def _of_parts(file: Path, parts: Parts) -> dict[str, Any]:
+    F = parts.first_bounce
+    return {
+        "file": str(file),
+        "shape": parts.shape,
+        "channels": len(F),
+        "grid": parts.grid,
+        "camera_grid": parts.camera_grid,
+        "stored": "compressed",
+        "dtype": f"{', '.join(parts.kinds)}; error {parts.error:.2g}",
+        "entries": parts.entries,
+        "nbytes": parts.nbytes,
+        "first_bounce": (float(F.min()), float(F.max())),
+        "first_bounce_from": "file",
+        "mixing": parts.mixing,
+        "dark_pixels": int(np.count_nonzero((F <= 0).any(axis=0))),
+        "solution_error": parts.error if math.isfinite(parts.error) else None,
     }
 
 

@@ -26,6 +26,7 @@ from ltcl.cli import (
     devices,
     doctor,
     info,
+    invert,
     relight,
     separate,
 )
@@ -98,7 +99,19 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (devices, doctor, demo, info, analyze, convert, compress, compensate, separate, relight):
+for command in (
+    devices,
+    doctor,
+    demo,
+    info,
+    analyze,
+    convert,
+    compress,
+    invert,
+    compensate,
+    separate,
+    relight,
+):
     app.command(command.__name__.rpartition(".")[2])(command.run)
 
 

@@ -4,8 +4,21 @@
 from __future__ import annotations
 
 from ltcl.compression.inverse_norm import inverse_norm
+from ltcl.compression.inversion import invert
+from ltcl.compression.iterated import Iterated
+from ltcl.compression.iteration import invert_coefficients
 from ltcl.compression.result import ChannelCompression, Compression, Trial
 from ltcl.compression.sources import RowSource
 from ltcl.compression.task import compress
 
-__all__ = ["ChannelCompression", "Compression", "RowSource", "Trial", "compress", "inverse_norm"]
+__all__ = [
+    "ChannelCompression",
+    "Compression",
+    "Iterated",
+    "RowSource",
+    "Trial",
+    "compress",
+    "inverse_norm",
+    "invert",
+    "invert_coefficients",
+]

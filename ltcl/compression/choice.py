@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 from ltcl import checks
 from ltcl.compression import cores, fit, kinds
@@ -29,6 +30,7 @@ DROPPING, ROUNDING = 0.9, 0.05  # of the goal, for what is dropped and for the r
 GATHER = 0.7  # of the goal: Frobenius norm of what need not even be looked at
 _MOST = 512  # numbers a row, beyond which a basis is no use unless all are
 _ALIKE = 2.0  # of the goal: a Frobenius norm at which bases are compared before more is measured
+_SPARE = 0.95  # of the budget, where a tolerance is proposed for it
 _WORSE = 3  # times the numbers of the best then: left
 Find = Callable[[str], Kind]  # a kind by its name, on the grid of the problem
 
@@ -162,19 +164,47 @@ def inverse_bound(problem: Problem, fitted: Fit) -> float:
     return inverse_norm(IdentityPlus(problem.operator)).upper
 
 
-def refuse(problem: Problem, candidate: Candidate, rtol: float, budget: float, parts: float = 1.0) -> None:
+class TooLarge(InputError):
+    """No core of one channel is within its share of the budget.
+
+    Attributes
+    ----------
+    needed : float
+        The whole budget that this tolerance takes.
+    allows : float
+        A tolerance that the budget allows; 1 or more where it allows none.
+    """
+
+    def __init__(self, budget: float, rtol: float, needed: float, allows: float) -> None:
+        self.budget, self.rtol, self.needed, self.allows = budget, rtol, needed, allows
+        advice = f"it allows rtol {_up(allows)}" if allows < 1.0 else "no rtol below 1 fits into it"
+        super().__init__(
+            f"budget is {budget:.0f} bytes, but rtol {rtol:g} needs {math.ceil(needed)} "
+            f"({checks.size(needed)}); {advice}"
+        )
+
+
+def refuse(problem: Problem, candidate: Candidate, rtol: float, budget: float, parts: float) -> NoReturn:
     """Say which budget this tolerance needs, and which tolerance the budget allows."""
-    core, found = candidate.core, candidate.found
-    sizes = Magnitudes.of(found.core.data)
-    count = int(0.95 * budget * candidate.fit.coefficients.core.nnz / core.nbytes)
-    kept = found.above(sizes.at_most(max(count, 0)))
-    fitted = fit.measure(problem, candidate.fit.kind, kept)
-    error = 1.1 * inverse_bound(problem, fitted) * fitted.norm.upper / DROPPING
-    advice = f"it allows rtol {_up(error)}" if error < 1.0 else "no rtol below 1 fits into it"
-    raise InputError(
-        f"budget is {parts * budget:.0f} bytes, but rtol {rtol:g} needs {math.ceil(parts * core.nbytes)} "
-        f"({checks.size(parts * core.nbytes)}); {advice}"
-    )
+    needed = candidate.core.nbytes
+    raise TooLarge(parts * budget, rtol, parts * needed, _allowed(problem, candidate, rtol, budget))
+
+
+def _allowed(problem: Problem, candidate: Candidate, rtol: float, budget: float) -> float:
+    """A tolerance within the budget: guessed from as many numbers as fit, then raised until it holds."""
+    core, found, kind = candidate.core, candidate.found, candidate.fit.kind
+    count = int(budget * candidate.fit.coefficients.core.nnz / core.nbytes)
+    fitted = fit.measure(problem, kind, found.above(Magnitudes.of(found.core.data).at_most(count)))
+    inverse = inverse_bound(problem, fitted)
+    allowed = max(inverse * fitted.norm.upper / DROPPING, 1.1 * rtol)
+    while allowed < 1.0:
+        goal = allowed / inverse
+        fitted = fit.fit(problem, kind, found, DROPPING * goal, fitted.coefficients.dropped)
+        core = cores.best(problem.device, fitted.coefficients.core, ROUNDING * goal, budget)
+        if core.nbytes <= _SPARE * budget:
+            break
+        allowed *= 1.2
+    return allowed
 
 
 def _up(error: float) -> str:

@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from ltcl.compression import choice, cores, fit
 from ltcl.compression.choice import Candidate, Choice
 from ltcl.compression.coefficients import Coefficients
@@ -20,12 +22,13 @@ from ltcl.compression.inverse_norm import inverse_norm
 from ltcl.compression.kinds import Kind
 from ltcl.compression.result import ChannelCompression
 from ltcl.errors import InputError
-from ltcl.operators import Compressed, IdentityPlus
+from ltcl.operators import CSR, Compressed, IdentityPlus, Operator, Tiles
 from ltcl.theory import TwoNorm, two_norm
 
 _TRIES = 6
 _AIM = 0.96  # of the tolerance
 _LOOSE = 0.8  # of it: so far below, a larger threshold is tried once
+_MOST = 3.0  # times: no threshold grows by more
 _FRESH = 1  # seed of the random starts
 _MORE = 4  # times the numbers kept on the window, which the whole may need
 
@@ -44,6 +47,18 @@ class Confirmed:
     def solution_error(self) -> float:
         """Bound on ||x~ - x|| / ||x||."""
         return self.norm.upper * self.inverse.upper
+
+    def fresh(self, kind: Kind, diagonal: np.ndarray | None) -> Compressed:
+        """R~ again, of the same numbers but without what measuring it has left on the device.
+
+        `kind` is fresh, too; `diagonal` is that of R.
+        """
+        core = self.core.operator
+        if isinstance(core, Tiles):
+            again: Operator = Tiles(core.device, core.packed)
+        else:
+            again = CSR(core.device, self.fit.coefficients.core)
+        return Compressed(again, kind.out, kind.into, error=self.norm.upper, diagonal=diagonal)
 
     def report(self, made: Choice) -> ChannelCompression:
         """What is told of this channel."""
@@ -100,26 +115,26 @@ def confirm(
         found, fitted = made.best.found, made.best.fit
     else:
         found, fitted = _whole(problem, kind, made, progress)
-    loosened, result = False, None
+    good: Confirmed | None = None
+    reached = math.inf
     for _ in range(_TRIES):
         core = cores.best(problem.device, fitted.coefficients.core, choice.ROUNDING * goal, budget)
         if core.nbytes > budget:
             choice.refuse(problem, Candidate(fitted, core, None, found), rtol, budget, parts)
         result = _measured(problem, fitted, core)
         reached = result.solution_error / rtol
-        if reached <= 1.0 and (loosened or reached >= _LOOSE or not core.nbytes):
+        if reached <= 1.0 and (reached >= _LOOSE or not fitted.coefficients.core.nnz):
             return result
-        loosened |= reached <= 1.0
-        start = fitted.coefficients.dropped * _AIM / reached
-        goal *= _AIM / reached
+        if good is not None:  # the larger threshold was too large, or gained little
+            return result if reached <= 1.0 else good
+        good = result if reached <= 1.0 else None
+        change = _AIM / max(reached, _AIM / _MOST)
+        start, goal = change * fitted.coefficients.dropped, change * goal
         if found.dropped > choice.DROPPING * goal:
             found = fit.gather(problem, kind, choice.GATHER * choice.DROPPING * goal, progress=progress)
         fitted = fit.fit(problem, kind, found, choice.DROPPING * goal, start)
-    assert result is not None  # noqa: S101 - there was an attempt
-    if result.solution_error <= rtol:
-        return result
     raise InputError(
-        f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by {result.solution_error:.2g}; "
+        f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by {reached * rtol:.2g}; "
         "it must be larger"
     )
 
@@ -144,7 +159,7 @@ def _measured(problem: Problem, fitted: Fit, core: Core) -> Confirmed:
     R = fitted.operator(core.operator)
     total = fit.certain(fitted.coefficients) + core.quantisation
     norm = two_norm(problem.operator, R, factor=1.05, frobenius=total, seed=_FRESH)
-    inverse = inverse_norm(IdentityPlus(R), seed=_FRESH + 1)
+    inverse = inverse_norm(IdentityPlus(R), factor=1.05, seed=_FRESH + 1)
     R.error = norm.upper
     timed = core if core.seconds is None or R.two_sided else cores.seconds(R)
     core = timed if isinstance(timed, Core) else dataclasses.replace(core, seconds=timed)

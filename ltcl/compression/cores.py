@@ -19,7 +19,7 @@ from ltcl.theory import two_norm
 
 _WIDTHS = (1, 8, 16)
 _MORE = 1.5  # times the fewest bytes: what takes more is not timed
-_ALIKE = 1.15  # times the least seconds: noise, and bytes decide
+_ALIKE, _LAUNCH = 1.15, 2e-5  # times the least seconds, and seconds more: noise, and bytes decide
 _REPEATS = 7
 
 
@@ -60,10 +60,14 @@ def best(device: Device, matrix: Any, allowance: float, budget: float = float("i
     options = list(_within(device, matrix, allowance))
     smallest = min(packed.nbytes for _, packed in options)
     fits = [option for option in options if option[1].nbytes <= budget] or options
-    cores = [_tiles(device, *option) for option in fits if option[1].nbytes <= _MORE * smallest]
-    csr = CSR(device, matrix)
-    if not cores or csr.nbytes <= min(_MORE * smallest, budget):
-        cores.append(Core(csr, "csr", 1, "float32", csr.nbytes, 0.0, seconds(csr)))
+    fits = [option for option in fits if option[1].nbytes <= _MORE * smallest]
+    if _untimed():
+        fits = sorted(fits, key=lambda option: option[1].nbytes)[:1]
+    cores = [_tiles(device, *option) for option in fits]
+    csr = 8 * matrix.nnz + 4 * (matrix.shape[0] + 1)
+    if csr <= min(_MORE * smallest, budget):
+        operator = CSR(device, matrix)
+        cores.append(Core(operator, "csr", 1, "float32", operator.nbytes, 0.0, seconds(operator)))
     return choose(cores)
 
 
@@ -71,13 +75,14 @@ def choose(cores: list[Core]) -> Core:
     """The fastest, of those alike the smallest; the smallest where one was not timed."""
     times = [core.seconds for core in cores if core.seconds is not None]
     if len(times) == len(cores):
-        cores = [core for core in cores if (core.seconds or 0.0) <= _ALIKE * min(times)]
+        most = max(_ALIKE * min(times), min(times) + _LAUNCH)
+        cores = [core for core in cores if (core.seconds or 0.0) <= most]
     return min(cores, key=lambda core: core.nbytes)
 
 
 def seconds(operator: Operator) -> float | None:
     """Least seconds of a few products on the device; None under ``LTCL_TUNE=0``."""
-    if os.environ.get("LTCL_TUNE", "1") == "0":
+    if _untimed():
         return None
     x = operator.device.upload(np.ones(operator.shape[1], np.float32))
     out = operator.apply(x)
@@ -89,6 +94,10 @@ def seconds(operator: Operator) -> float | None:
         operator.device.finish()
         times.append(time.perf_counter() - start)
     return min(times)
+
+
+def _untimed() -> bool:
+    return os.environ.get("LTCL_TUNE", "1") == "0"
 
 
 def _within(device: Device, matrix: Any, allowance: float) -> Iterator[tuple[int, Packed]]:

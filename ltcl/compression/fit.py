@@ -24,6 +24,7 @@ from ltcl.theory import TwoNorm, two_norm
 _STEPS = 6
 _CLOSE = 0.85  # of the goal is good enough
 _AIM = 0.94
+_FACTOR = 1.06  # between the bounds of a norm
 _ROUNDING = 1e-6  # of coefficients that went through transforms in float32
 
 
@@ -101,7 +102,7 @@ def fit(problem: Problem, kind: Kind, found: Coefficients, goal: float, start: f
     low, high, f = 0.0, math.inf, 2.0 * goal if start is None else start
     for _ in range(_STEPS):
         threshold = sizes.threshold(math.sqrt(max(f * f - found.dropped**2, 0.0)))
-        trial = measure(problem, kind, found.above(threshold), below=goal)
+        trial = measure(problem, kind, found.above(threshold))
         if trial.norm.upper <= goal:
             best, low = trial, f
             if trial.norm.upper >= _CLOSE * goal or trial.coefficients.core.nnz == 0:
@@ -113,15 +114,13 @@ def fit(problem: Problem, kind: Kind, found: Coefficients, goal: float, start: f
         f = _next(f, _AIM * goal / trial.norm.upper, low, high)
         if high < 1.05 * low:
             break
-    return best if best is not None else measure(problem, kind, found, below=goal)
+    return best if best is not None else measure(problem, kind, found)
 
 
-def measure(problem: Problem, kind: Kind, kept: Coefficients, below: float | None = None) -> Fit:
-    """The 2-norm of R~ - R with these coefficients, or just whether it is well `below` something."""
+def measure(problem: Problem, kind: Kind, kept: Coefficients) -> Fit:
+    """The 2-norm of R~ - R with these coefficients."""
     R = Compressed(CSR(problem.device, kept.core), kind.out, kind.into)
-    enough = None if below is None else _CLOSE * below
-    norm = two_norm(problem.operator, R, factor=1.15, below=enough, frobenius=certain(kept))
-    return Fit(kind, kept, norm)
+    return Fit(kind, kept, two_norm(problem.operator, R, factor=_FACTOR, frobenius=certain(kept)))
 
 
 def certain(kept: Coefficients) -> float:

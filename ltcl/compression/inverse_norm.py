@@ -22,16 +22,17 @@ _RTOL = 1e-3
 _MAXITER = 400
 
 
-def inverse_norm(S: IdentityPlus, *, confidence: float = CONFIDENCE, seed: int = 0) -> TwoNorm:
+def inverse_norm(
+    S: IdentityPlus, *, confidence: float = CONFIDENCE, factor: float = 1.1, seed: int = 0
+) -> TwoNorm:
     """||S^-1||_2 = 1 / smallest singular value of S = I + R, with an upper bound.
 
     Parameters
     ----------
     S : IdentityPlus, (N, N)
         Between two equal orthonormal bases, the solves are with its core.
-    confidence : float
-        Of the bound; see `ltcl.theory.two_norm`.
-    seed : int
+    confidence, factor, seed : float, float, int
+        As of `ltcl.theory.two_norm`.
 
     Raises
     ------
@@ -46,7 +47,7 @@ def inverse_norm(S: IdentityPlus, *, confidence: float = CONFIDENCE, seed: int =
     (2.0, True)
     """
     core = S.R.core if isinstance(S.R, Compressed) and S.R.two_sided else S.R
-    found = two_norm(_Inverse(core, S.sign), confidence=confidence, seed=seed)
+    found = two_norm(_Inverse(core, S.sign), confidence=confidence, factor=factor, seed=seed)
     widened = found.upper / (1.0 - _RTOL * math.sqrt(found.products))
     return dataclasses.replace(found, upper=widened)
 

@@ -21,85 +21,38 @@ The solution x~ = (I - s D) b of (I + s C) x = b is off by -s G x, so relatively
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl import checks
+from ltcl.compression import elimination
 from ltcl.compression.extent import extent
-from ltcl.compression.residual import Residual
+from ltcl.compression.iterated import Iterated
+from ltcl.compression.residual import Residual, certify
+from ltcl.compression.row_blocks import cuts
 from ltcl.compression.thresholds import above, norm_2, random_start, threshold_for
 from ltcl.compression.weights import Chebyshev
 from ltcl.device import Device, open_device
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
-from ltcl.operators import Host
 from ltcl.solvers.result import Status
-from ltcl.theory import TwoNorm, two_norm
+from ltcl.theory import TwoNorm
 
 _SHARE = 0.7  # of the tolerance, that the first threshold is to cost
 _FINE = 0.1  # of the threshold: what of a correction is too small to be added
 _AIM = 0.8  # of the tolerance, at which a lower threshold aims
 _LEAST, _MOST = 0.1, 0.7  # what a threshold is lowered by
 _GROWTH = 10.0  # times the first residual
-_FILL = 1 << 22  # numbers in the product of one block, at most
+METHODS = ("auto", "iteration", "elimination")
+
 Progress = Callable[[int, float], object]
-
-
-@dataclass(frozen=True, eq=False)
-class Iterated:
-    """What `invert_coefficients` returns.
-
-    Attributes
-    ----------
-    D : csr_array, (N, N)
-        (I + sign C)^-1 = I - sign D.
-    error : float
-        Bound on ``||I - (I - sign D)(I + sign C)||_2``: of every solution, relative to itself.
-    confidence : float
-        Of that bound, over the random starts of `theory.two_norm`.
-    status : Status
-    products : int
-        Of sparse matrices, D C each.
-    residuals : tuple of float
-        Estimates of the same norm, from D = 0 on.
-    dropped : tuple of float
-        Frobenius norm of what each step dropped.
-    threshold : float
-        All of D is at least this large.
-    spectrum : (lower, upper)
-        Of I + sign C, that the iteration took.
-    seconds : float
-    """
-
-    D: Any
-    error: float
-    confidence: float
-    status: Status
-    products: int
-    residuals: tuple[float, ...]
-    dropped: tuple[float, ...]
-    threshold: float
-    spectrum: tuple[float, float]
-    seconds: float
-
-    @property
-    def converged(self) -> bool:
-        """Whether the bound is within the tolerance."""
-        return self.status is Status.CONVERGED
-
-    def __str__(self) -> str:
-        n = self.D.shape[0]
-        return (
-            f"{self.status.name.lower()} after {self.products} products, error {self.error:.2g}, "
-            f"{self.D.nnz / n:.3g} numbers a row: {self.status.value}"
-        )
 
 
 def invert_coefficients(
@@ -107,6 +60,7 @@ def invert_coefficients(
     sign: float = 1.0,
     *,
     rtol: float = 1e-2,
+    method: str = "auto",
     spectrum: tuple[float, float] | None = None,
     maxiter: int = 60,
     callback: Progress | None = None,
@@ -122,6 +76,8 @@ def invert_coefficients(
     sign : 1 or -1
     rtol : float
         Relative error that a solution with I - sign D may have, for every right-hand side.
+    method : str
+        "iteration"; "elimination", dense, on the host; or "auto": whichever is estimated to take less time.
     spectrum : (lower, upper), optional
         Between which the real parts of the eigenvalues of I + sign C lie; found by Arnoldi's method when
         not given. (1, 1) is eq. 21.
@@ -161,23 +117,17 @@ def invert_coefficients(
         raise InputError(f"sign is {sign!r}; it must be 1 for I + C or -1 for I - C")
     if callback is not None and not callable(callback):
         raise InputTypeError(f"callback is {callback!r}; it must be callable(products, residual)")
-    C = _square(C)
-    bounds = extent(C, sign) if spectrum is None else _given(spectrum)
-    run = _Run(C, float(sign), bounds, rtol, device if device is not None else open_device())
-    status = run.until(maxiter, callback)
-    bound = run.bound if run.bound is not None and status is Status.CONVERGED else run.certify()
-    found = Iterated(
-        run.D,
-        bound.upper,
-        bound.confidence,
-        status,
-        len(run.dropped),
-        tuple(run.residuals),
-        tuple(run.dropped),
-        run.threshold,
-        bounds,
-        time.perf_counter() - start,
-    )
+    checks.one_of("method", method, METHODS)
+    C, sign = _square(C), float(sign)
+    device = device if device is not None else open_device()
+    if method == "elimination" or (method == "auto" and spectrum is None and elimination.pays(C)):
+        found = elimination.eliminate(C, sign, rtol, device)
+        if callback is not None:
+            callback(0, found.residuals[-1])
+    else:
+        bounds = extent(C, sign) if spectrum is None else _given(spectrum)
+        found = _Run(C, sign, bounds, rtol, device).until(maxiter, callback)
+    found = dataclasses.replace(found, seconds=time.perf_counter() - start)
     if throw and not found.converged:
         raise ConvergenceError(str(found), found)
     return found
@@ -190,10 +140,10 @@ class _Run:
         n, signed = C.shape[0], C.dtype.type(sign)
         self.C, self.sign, self.rtol, self.device = C, sign, rtol, device
         self.S: Any = scipy.sparse.csr_array(scipy.sparse.eye_array(n, dtype=C.dtype) + signed * C)
-        self.cuts = list(_cuts(C))
+        self.cuts = list(cuts(C))
         self.D: Any = scipy.sparse.csr_array(C.shape, dtype=C.dtype)
         self.added: list[Any] = [None] * len(self.cuts)
-        self.weights = Chebyshev(bounds)
+        self.bounds, self.weights = bounds, Chebyshev(bounds)
         self.threshold = threshold_for(C, _SHARE * rtol)
         self.witness = random_start(n)  # of the largest residual so far
         self.residuals: list[float] = []
@@ -201,26 +151,41 @@ class _Run:
         self.bound: TwoNorm | None = None
         self._look()
 
-    def until(self, maxiter: int, callback: Progress | None) -> Status:
-        """Iterate to the end; says how it ended."""
+    def until(self, maxiter: int, callback: Progress | None) -> Iterated:
+        """Iterate to the end."""
         while True:
             if callback is not None:
                 callback(len(self.dropped), self.residuals[-1])
             status = self._judge(maxiter)
             if status is not None:
-                return status
+                return self._found(status)
             self._step()
 
-    def certify(self) -> TwoNorm:
-        """The bound on the residual of D as it is now."""
-        G = Host(self.device, Residual(self.C, self.D, self.sign))
-        self.bound = two_norm(G, below=self.rtol)
-        return self.bound
+    def _found(self, status: Status) -> Iterated:
+        if self.bound is None or status is not Status.CONVERGED:
+            self.bound = self._certify()
+        return Iterated(
+            self.D,
+            self.bound.upper,
+            self.bound.confidence,
+            status,
+            len(self.dropped),
+            tuple(self.residuals),
+            tuple(self.dropped),
+            self.threshold,
+            "iteration",
+            self.bounds,
+        )
+
+    def _certify(self) -> TwoNorm:
+        return certify(Residual(self.C, self.D, self.sign), self.device, self.rtol)
 
     def _judge(self, maxiter: int) -> Status | None:
         last = self.residuals[-1]
-        if last <= self.rtol and self.certify().upper <= self.rtol:
-            return Status.CONVERGED
+        if last <= self.rtol:
+            self.bound = self._certify()
+            if self.bound.upper <= self.rtol:
+                return Status.CONVERGED
         if not last <= _GROWTH * self.residuals[0]:
             return Status.DIVERGED
         if len(self.dropped) >= maxiter:
@@ -274,18 +239,3 @@ def _given(spectrum: Any) -> tuple[float, float]:
         raise InputError(f"spectrum is {spectrum!r}; it must be (lower, upper)") from None
     lower = checks.number("spectrum[0]", lower, above=0.0)
     return lower, checks.number("spectrum[1]", upper, least=lower)
-
-
-def _cuts(C: Any) -> Iterator[tuple[int, int]]:
-    """Blocks of rows (start, stop) whose product C C has no more than `_FILL` numbers, or a single row."""
-    n = C.shape[0]
-    lengths = np.diff(C.indptr)
-    through = np.concatenate([[0], np.cumsum(lengths[C.indices], dtype=np.int64)])
-    fill = np.minimum(np.diff(through[C.indptr]), n)
-    ends = np.concatenate([[0], np.cumsum(fill)])
-    start = 0
-    while start < n:
-        stop = int(np.searchsorted(ends, ends[start] + _FILL, side="right")) - 1
-        stop = min(max(stop, start + 1), n)
-        yield start, stop
-        start = stop

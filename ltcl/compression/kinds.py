@@ -10,7 +10,7 @@ import numpy as np
 
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import Basis, basis
+from ltcl.operators import Basis, Chained, Ordered, Wavelet, basis, relatives
 from ltcl.operators.wavelets import filters
 
 PIXELS, HILBERT, ROWS = "pixels", "hilbert", " rows"
@@ -54,6 +54,8 @@ def kind(device: Device, grid: tuple[int, int], name: str) -> Kind:
     (24, 24)
     """
     W = basis(device, grid, check(name).removesuffix(ROWS))
+    if isinstance(W, Wavelet):  # large coefficients then lie side by side, in fewer tiles
+        W = Chained(Ordered(device, grid, relatives(grid, W.levels), "relatives"), W)
     return Kind(name, None if name.endswith(ROWS) else W, W)
 
 

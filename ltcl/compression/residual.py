@@ -8,6 +8,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse.linalg
 
+from ltcl.device import Device
+from ltcl.operators import Host
+from ltcl.theory import TwoNorm, two_norm
+
 
 class Residual(scipy.sparse.linalg.LinearOperator):
     """G = C - D (I + sign C), without forming it."""
@@ -24,3 +28,8 @@ class Residual(scipy.sparse.linalg.LinearOperator):
     def _rmatmat(self, X: np.ndarray) -> np.ndarray:
         Y = X - self.sign * (self._DT @ X)
         return self._CT @ Y - self._DT @ X
+
+
+def certify(G: Residual, device: Device, below: float) -> TwoNorm:
+    """||G||_2 with its upper bound; `below` is what it matters to be below."""
+    return two_norm(Host(device, G), below=below)

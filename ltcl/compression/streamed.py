@@ -29,7 +29,7 @@ class Streamed(Operator):
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64: one reading of the rows."""
         found = np.zeros(min(self.shape))
-        for start, rows in self._blocks():
+        for start, rows in self._blocks(np.float64):  # not rounded: a first bounce may be made of it
             here = np.diagonal(rows, start)
             found[start : start + len(here)] = here
         return found
@@ -45,6 +45,6 @@ class Streamed(Operator):
         product = scale * product.reshape(out.shape)
         out.set(product if add is None else product + add.get())
 
-    def _blocks(self):
+    def _blocks(self, dtype: type = np.float32):
         for start, stop in cut(self.shape[0], at_once(self.shape[1], self.memory)):
-            yield start, np.asarray(self.matrix.rows(start, stop), np.float32)
+            yield start, np.asarray(self.matrix.rows(start, stop), dtype)

@@ -9,8 +9,10 @@ measured.
 from __future__ import annotations
 
 import functools
+import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -103,54 +105,83 @@ def compress(
     limit = None if budget is None else checks.count("budget", budget)
     names = _names(basis)
     if isinstance(T, Transport):
-        given = {"grid": grid, "first_bounce": first_bounce, "device": device}
-        channels, F = _of_transport(T, memory, given), np.atleast_2d(T.first_bounce)
-        masked, mixing, shape = bool(T.masked.any()), T.mixing, T.grid
+        given = _of_transport(T, memory, {"grid": grid, "first_bounce": first_bounce, "device": device})
     else:
-        channels, F, shape = _of_rows(T, grid, first_bounce, device, memory)
-        masked, mixing = False, None
-    find = functools.cache(functools.partial(kinds.kind, channels[0].device))
-    share = float("inf") if limit is None else limit / len(channels)
-    made = [
-        _channel(problem, names, rtol, share, len(channels), find, _note(progress, index, len(channels)))
-        for index, problem in enumerate(channels)
-    ]
-    C = Transport(
+        given = _of_rows(T, grid, first_bounce, device, memory)
+    parts = len(given.problems)
+    wanted = _Wanted(names, rtol, math.inf if limit is None else limit / parts, parts)
+    find = functools.cache(functools.partial(kinds.kind, given.problems[0].device))
+    made = _each(
         [
-            ScaledColumns(IdentityPlus(one.operator, solution_error=one.solution_error), f)
-            for (one, _), f in zip(made, F, strict=True)
-        ],
-        shape,
-        first_bounce=F,
-        on_dark="mask" if masked else "raise",
-        mixing=mixing,
+            functools.partial(_channel, problem, wanted, find, note)
+            for problem, note in zip(given.problems, _notes(progress, parts), strict=True)
+        ]
     )
-    reports = tuple(report for _, report in made)
-    spent = time.perf_counter() - started
-    C.compression = Compression(rtol, limit, pixels(shape)[1], spent, reports)
+    C = _transport(given, [found for found, _ in made])
+    spent, reports = time.perf_counter() - started, tuple(report for _, report in made)
+    C.compression = Compression(rtol, limit, pixels(given.grid)[1], spent, reports)
     return C
 
 
+@dataclass(frozen=True)
+class _Given:
+    """R of every channel, and what else a transport is made of."""
+
+    problems: list[Problem]
+    F: np.ndarray
+    grid: tuple[int, int]
+    masked: bool = False
+    mixing: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """Kinds to try, tolerance, and the share that each of so many `parts` has of the budget."""
+
+    names: Sequence[str]
+    rtol: float
+    budget: float
+    parts: int
+
+
+def _transport(given: _Given, found: Sequence[Confirmed]) -> Transport:
+    """What was found, on operators that hold nothing but what they need; equal bases are shared."""
+    fresh = functools.cache(functools.partial(kinds.kind, given.problems[0].device, given.grid))
+    matrices = []
+    for problem, one, f in zip(given.problems, found, given.F, strict=True):
+        R = one.fresh(fresh(one.fit.kind.name), _diagonal(problem))
+        matrices.append(ScaledColumns(IdentityPlus(R, solution_error=one.solution_error), f))
+    on_dark = "mask" if given.masked else "raise"
+    return Transport(matrices, given.grid, first_bounce=given.F, on_dark=on_dark, mixing=given.mixing)
+
+
+def _each(tasks: Sequence[Callable[[], Any]]) -> list[Any]:
+    """What the tasks of all channels give; refused by the one that needs the largest budget."""
+    made, refused = [], []
+    for task in tasks:
+        try:
+            made.append(task())
+        except choice.TooLarge as error:
+            refused.append(error)
+    if refused:
+        needed, allows = (max(getattr(error, name) for error in refused) for name in ("needed", "allows"))
+        raise choice.TooLarge(refused[0].budget, refused[0].rtol, needed, allows)
+    return made
+
+
 def _channel(
-    problem: Problem,
-    names: Sequence[str],
-    rtol: float,
-    budget: float,
-    parts: int,
-    find: Callable[[tuple[int, int], str], kinds.Kind],
-    note: Note,
+    problem: Problem, wanted: _Wanted, find: Callable[[tuple[int, int], str], kinds.Kind], note: Note
 ) -> tuple[Confirmed, ChannelCompression]:
     part = window(problem)
-    share = part.pixels / problem.pixels
-    tried = iter(range(len(names)))
+    share, tried = part.pixels / problem.pixels, iter(range(len(wanted.names)))
     made = choice.choose(
         part,
-        names,
-        rtol,
-        budget * share,
+        wanted.names,
+        wanted.rtol,
+        wanted.budget * share,
         functools.partial(find, part.grid),
-        lambda name: note(f"trying {name}", 0.5 * next(tried, len(names)) / len(names)),
-        parts / share,
+        lambda name: note(f"trying {name}", 0.5 * next(tried, len(wanted.names)) / len(wanted.names)),
+        wanted.parts / share,
     )
     name = made.best.fit.kind.name
     found = confirm(
@@ -158,13 +189,20 @@ def _channel(
         find(problem.grid, name),
         made,
         part is problem,
-        rtol,
-        budget,
-        parts,
+        wanted.rtol,
+        wanted.budget,
+        wanted.parts,
         lambda done: note(f"all of it in {name}", 0.5 + 0.5 * done),
     )
     note("done", 1.0)
     return found, found.report(made)
+
+
+def _diagonal(problem: Problem) -> np.ndarray | None:
+    try:
+        return problem.operator.diagonal()
+    except InputError:  # somebody's own operator, which does not tell it
+        return None
 
 
 def _names(basis: str | Sequence[str] | None) -> Sequence[str]:
@@ -176,8 +214,8 @@ def _names(basis: str | Sequence[str] | None) -> Sequence[str]:
     return [kinds.check(name) for name in names]
 
 
-def _of_transport(T: Transport, memory: int | None, given: dict[str, Any]) -> list[Problem]:
-    for name, value in given.items():
+def _of_transport(T: Transport, memory: int | None, others: dict[str, Any]) -> _Given:
+    for name, value in others.items():
         if value is not None:
             raise InputError(f"{name} is given, but T is a Transport, which has its own; leave it out")
     require(T)
@@ -191,12 +229,11 @@ def _of_transport(T: Transport, memory: int | None, given: dict[str, Any]) -> li
         operators = [S.R for S in T.systems]
     except MemoryLimitError:
         operators = [Streamed(T.device, R, memory) for R in rows]
-    return [Problem(R, A, T.grid, memory) for R, A in zip(rows, operators, strict=True)]
+    problems = [Problem(R, A, T.grid, memory) for R, A in zip(rows, operators, strict=True)]
+    return _Given(problems, F, T.grid, bool(T.masked.any()), T.mixing)
 
 
-def _of_rows(
-    T: Any, grid: Any, first_bounce: Any, device: Device | str | None, memory: int | None
-) -> tuple[list[Problem], np.ndarray, tuple[int, int]]:
+def _of_rows(T: Any, grid: Any, first_bounce: Any, device: Device | str | None, memory: int | None) -> _Given:
     if isinstance(T, (list, tuple)) and len(T) not in (1, 3):
         raise InputError(f"T has {len(T)} channels; it must be one, or three for RGB")
     parts = [source("T", part) for part in (T if isinstance(T, (list, tuple)) else [T])]
@@ -210,7 +247,7 @@ def _of_rows(
     chosen = device if isinstance(device, Device) else open_device(device)
     F = _first_bounce(parts, first_bounce, chosen, memory)
     rows = [Interreflection(part, f) for part, f in zip(parts, F, strict=True)]
-    return [Problem(R, Streamed(chosen, R, memory), shape, memory) for R in rows], F, shape
+    return _Given([Problem(R, Streamed(chosen, R, memory), shape, memory) for R in rows], F, shape)
 
 
 def _first_bounce(parts: Sequence[RowSource], given: Any, device: Device, memory: int | None) -> np.ndarray:
@@ -231,9 +268,15 @@ def _first_bounce(parts: Sequence[RowSource], given: Any, device: Device, memory
     return F
 
 
-def _note(progress: Note | None, index: int, count: int) -> Note:
-    """`progress` for one of several channels."""
-    if progress is None:
-        return lambda text, share: None
-    name = f"{('red', 'green', 'blue')[index]}: " if count == 3 else ""
-    return lambda text, share: progress(name + text, (index + share) / count)
+def _notes(progress: Note | None, count: int) -> list[Note]:
+    """`progress` for each of several channels."""
+    names = ("red: ", "green: ", "blue: ") if count == 3 else ("",)
+    reached = 0.0
+
+    def note(index: int, text: str, share: float) -> None:
+        nonlocal reached
+        reached = max(reached, (index + share) / count)  # a part that is done again does not count back
+        if progress is not None:
+            progress(names[index] + text, reached)
+
+    return [functools.partial(note, index) for index in range(count)]

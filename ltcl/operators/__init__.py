@@ -17,7 +17,8 @@ from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
 from ltcl.operators.named_bases import basis, basis_of
-from ltcl.operators.packing import smallest
+from ltcl.operators.orders import hilbert, relatives
+from ltcl.operators.packing import smallest, spread
 from ltcl.operators.pyramid import Pyramid
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
@@ -45,8 +46,11 @@ __all__ = [
     "as_operator",
     "basis",
     "basis_of",
+    "hilbert",
     "interreflections",
+    "relatives",
     "smallest",
+    "spread",
 ]
 
 

@@ -16,6 +16,9 @@ from ltcl.device import Array, Device
 from ltcl.errors import InputError
 
 WIDTHS = (8, 4, 3, 2, 1)  # right-hand sides one launch of a product kernel takes
+MOST = (
+    1 << 14
+)  # items along the second and third dimension where kernels stride: GPUs take 65535 groups there
 
 
 @dataclass(frozen=True)
@@ -193,7 +196,7 @@ class Transposed(Operator):
     def __init__(self, base: Operator) -> None:
         super().__init__(base.device, base.shape[::-1])
         self.base = base
-        self.error = base.error
+        self.error, self.solution_error = base.error, base.solution_error
 
     @property
     def nbytes(self) -> int:
@@ -223,3 +226,14 @@ def widths(columns: int) -> list[tuple[int, int]]:
         pieces.append((offset, width))
         offset += width
     return pieces
+
+
+def lanes_of(run: int) -> int:
+    """Neighbouring values that a work-item takes together, of a stretch of `run`; one of `WIDTHS`."""
+    return next(width for width in WIDTHS if width <= run)
+
+
+def group_of(pieces: int) -> tuple[int, int]:
+    """A work-group of 64: side by side as many as there are pieces, the others one below the other."""
+    across = min(64, 1 << (pieces - 1).bit_length())
+    return across, 64 // across

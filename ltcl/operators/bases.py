@@ -13,7 +13,8 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import InputError
-from ltcl.operators.base import Operator
+from ltcl.operators.base import MOST, Operator, group_of, lanes_of
+from ltcl.operators.orders import hilbert
 
 
 class Basis(Operator):
@@ -55,10 +56,10 @@ class Ordered(Basis):
     ----------
     device : Device
     grid : (h, w)
-    order : (N,) of int
-        The pixel at each place, every one once.
-    name : str
-        What it is called.
+    order : (N,) of int, or "hilbert"
+        The pixel at each place, every one once; or a curve through all pixels that keeps neighbours together.
+    name : str, optional
+        What it is called: "hilbert", or "ordered" when not given.
 
     Examples
     --------
@@ -69,8 +70,14 @@ class Ordered(Basis):
     [30.0, 10.0, 20.0]
     """
 
-    def __init__(self, device: Device, grid: tuple[int, int], order: Any, name: str = "ordered") -> None:
-        super().__init__(device, grid, name)
+    def __init__(
+        self, device: Device, grid: tuple[int, int], order: Any = "hilbert", name: str | None = None
+    ) -> None:
+        named = isinstance(order, str)
+        super().__init__(device, grid, name or (order if named else "ordered"))
+        if named:
+            checks.one_of("order", order, ["hilbert"])
+            order = hilbert(self.grid)
         self.order = _permutation(order, self.shape[1])
         self._orders = [device.upload(o, np.int32) for o in (self.order, np.argsort(self.order))]
 
@@ -88,11 +95,15 @@ class Ordered(Basis):
         return {**super().to_arrays(), "order": self.order}
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        kernel = self.device.kernel("ordered", "ordered_gather")
         rows, k = x.shape[0], x.columns
-        across, group = (1, (1, 64)) if self.device.is_cpu else (k, (min(k, 8), 8))
+        if k == 0:
+            return
+        lanes = lanes_of(k)
+        kernel = self.device.kernel("ordered", "ordered_gather", K=lanes)
+        pieces = -(-k // lanes)
+        across, group = (1, (1, 64)) if self.device.is_cpu else (pieces, group_of(pieces))
         adds, added = (0, out) if add is None else (1, add)
-        kernel((across, rows), group, rows, k, scale, adds, self._orders[transpose], x, added, out)
+        kernel((across, min(rows, MOST)), group, rows, k, scale, adds, self._orders[transpose], x, added, out)
 
 
 class Chained(Basis):

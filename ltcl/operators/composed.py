@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -100,6 +101,7 @@ class ScaledColumns(Operator):
         self.d = checks.finite("d", checks.shape("d", checks.real("d", d), A.shape[1:]))
         self._d = A.device.upload(self.d)
         self.error = A.error * float(np.max(np.abs(self.d), initial=0.0))
+        self.solution_error = A.solution_error and A.solution_error * spread(self.d)
 
     @property
     def nbytes(self) -> int:
@@ -122,6 +124,17 @@ class ScaledColumns(Operator):
             out.copy_from(product)
         else:
             vectors.axpby(1.0, product, 1.0, add, out)
+
+
+def spread(d: np.ndarray) -> float:
+    """max |d| / min |d|, what a diagonal may change relative errors by; infinite where some d is 0.
+
+    >>> spread(np.array([0.5, -2.0])), spread(np.array([0.0, 1.0]))
+    (4.0, inf)
+    """
+    sizes = np.abs(np.asarray(d, np.float64))
+    least = float(np.min(sizes, initial=np.inf))
+    return float(np.max(sizes, initial=0.0)) / least if least > 0.0 else math.inf
 
 
 class Shifted(Operator):

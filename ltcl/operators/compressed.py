@@ -17,7 +17,7 @@ from ltcl import checks
 from ltcl.device import Array
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
-from ltcl.operators.bases import Basis
+from ltcl.operators.bases import Basis, Ordered
 
 _FEW = 4096  # pixels: the diagonal of no more is found by as many products
 
@@ -51,10 +51,12 @@ class Compressed(Operator):
     Examples
     --------
     >>> import ltcl, numpy
-    >>> from ltcl.operators import Compressed, Dense
-    >>> R = Compressed(Dense(ltcl.open_device(), [[0.0, 0.5], [0.5, 0.0]]), None, None, error=1e-3)
-    >>> (R @ numpy.array([1.0, 0.0])).tolist(), R.error
-    ([0.0, 0.5], 0.001)
+    >>> from ltcl.operators import Compressed, Dense, Wavelet
+    >>> device = ltcl.open_device()
+    >>> W = Wavelet(device, (2, 2), "haar")
+    >>> R = Compressed(Dense(device, numpy.diag([0.5, 0, 0, 0])), W, W, error=1e-3)  # of each the mean, half
+    >>> (R @ numpy.array([1.0, 2.0, 3.0, 6.0])).round(6).tolist(), R.error
+    ([1.5, 1.5, 1.5, 1.5], 0.001)
     """
 
     def __init__(
@@ -83,7 +85,7 @@ class Compressed(Operator):
         return self.core.nbytes + sum(W.nbytes for W in {self.out, self.into} if W is not None)
 
     def diagonal(self) -> np.ndarray:
-        """The main diagonal, (min(M, N),) float64: as given, that of a core of pixels, or by products.
+        """The main diagonal, (min(M, N),) float64: as given, of a core of pixels, or by products.
 
         Raises
         ------
@@ -91,11 +93,14 @@ class Compressed(Operator):
             It was not given, and there are too many pixels for a product each.
         """
         if self.known_diagonal is None:
-            pixels = self.out is None and self.into is None
-            self.known_diagonal = self.core.diagonal() if pixels else self._by_products()
+            self.known_diagonal = self._find_diagonal()
         return self.known_diagonal
 
-    def _by_products(self) -> np.ndarray:
+    def _find_diagonal(self) -> np.ndarray:
+        if self.out is None and self.into is None:
+            return self.core.diagonal()
+        if self.out is self.into and isinstance(self.out, Ordered):
+            return self.core.diagonal()[np.argsort(self.out.order)]
         n = min(self.shape)
         if n > _FEW:
             raise InputError(

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +14,7 @@ from ltcl.device import Device, open_device
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import Basis
-from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted, spread
 from ltcl.operators.compressed import Compressed, Sum
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
@@ -95,9 +94,7 @@ def _carried(matrix: Any, f: np.ndarray) -> float:
     S = made_with(matrix)
     if S is None or S.solution_error == 0.0:
         return 0.0
-    ratio = matrix.d[f > 0] / f[f > 0]
-    least = float(np.min(np.abs(ratio)))
-    return S.solution_error * float(np.max(np.abs(ratio))) / least if least > 0.0 else math.inf
+    return S.solution_error * spread(matrix.d[f > 0] / f[f > 0])
 
 
 def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Pattern | None) -> Operator:

@@ -14,7 +14,9 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import InputError
 from ltcl.operators.covers import PLACES, WIDTHS, Cover, Layout, cover
-from ltcl.operators.narrow import PRECISIONS, Narrow, decoded, narrow, scaled_rows
+from ltcl.operators.narrow import PRECISIONS, Narrow, narrow
+
+_STORED = ("shape", "layout", "pointers", "starts", "precision", "codes", "scales", "unit", "difference")
 
 
 class Difference(NamedTuple):
@@ -31,93 +33,80 @@ class Packed:
     Attributes
     ----------
     shape : (M, N)
-    precision : str
-        Of the numbers; see `ltcl.operators.narrow`.
     layout : Layout
     pointers : (M * pages + 1,) int64
         First tile of each page of each row.
     starts : (tiles,)
         Place of each tile in its page.
-    values : (tiles, width)
-        Codes of its numbers, zeros where no nonzero is.
-    unit, scales : float, (M,) or (0,) float32
-        What codes are to be multiplied by; no scales stand for ones.
+    stored : Narrow
+        The numbers of tiles, zeros where no nonzero is.
     difference : Difference
         From the matrix that was given.
     """
 
     shape: tuple[int, int]
-    precision: str
     layout: Layout
     pointers: np.ndarray
     starts: np.ndarray
-    values: np.ndarray
-    unit: float
-    scales: np.ndarray
+    stored: Narrow
     difference: Difference
 
     @property
     def nbytes(self) -> int:
         """Bytes of it, with 32-bit pointers as the device has them."""
-        tiles = self.layout.nbytes(self.shape[0], len(self.starts))
-        return tiles + self.values.nbytes + self.scales.nbytes
+        return self.layout.nbytes(self.shape[0], len(self.starts)) + self.stored.nbytes
 
-    def numbers(self) -> scipy.sparse.csr_array:
-        """The codes as numbers, without unit and scales: (M, N) float64, exact."""
-        page = np.repeat(np.arange(len(self.pointers) - 1), np.diff(self.pointers))
-        row, page = np.divmod(page, self.layout.pages)
+    def columns(self) -> np.ndarray:
+        """First column of each tile, (tiles,) int64."""
+        page = np.repeat(np.arange(len(self.pointers) - 1), np.diff(self.pointers)) % self.layout.pages
         columns = (page * PLACES + self.starts) * self.layout.granule
-        columns = np.minimum(columns, self.layout.last(self.shape[1]))
-        tile, lane = np.nonzero(self.values)
-        data = PRECISIONS[self.precision].decode(self.values[tile, lane])
-        return scipy.sparse.csr_array((data, (row[tile], columns[tile] + lane)), shape=self.shape)
+        # Where places count single columns, kernels do not look whether a tile ends within the matrix.
+        return columns if self.layout.granule == 1 else np.minimum(columns, self.layout.last(self.shape[1]))
 
     def matrix(self) -> scipy.sparse.csr_array:
         """What it stands for: (M, N) float64, exact."""
-        matrix = self.numbers()
-        matrix.data = scaled_rows(matrix.data * self.unit, matrix.indptr, self.scales)
-        return matrix
+        tile, lane = np.nonzero(self.stored.codes)
+        row = np.repeat(np.arange(len(self.pointers) - 1) // self.layout.pages, np.diff(self.pointers))
+        data = self.stored.decoded()[tile, lane]
+        return scipy.sparse.csr_array((data, (row[tile], self.columns()[tile] + lane)), shape=self.shape)
 
     def transposed(self) -> Packed:
-        """The same numbers transposed, without the scales, in tiles of the width that takes fewest bytes."""
-        turned = scipy.sparse.csr_array(self.numbers().T)
-        codes = PRECISIONS[self.precision].encode(turned.data)
-        covers = [cover(turned, width) for width in WIDTHS]
-        return _filled(
-            turned,
-            min(covers, key=lambda found: found.nbytes(codes.itemsize)),
-            self.precision,
-            Narrow(codes, self.unit, np.zeros(0, np.float32)),
-            self.difference,
-        )
+        """The same numbers transposed, without scales, in tiles of the width that takes fewest bytes."""
+        precision = PRECISIONS[self.stored.precision].exact
+        turned = scipy.sparse.csr_array(self.matrix().T)
+        size = np.dtype(PRECISIONS[precision].dtype).itemsize
+        found = min((cover(turned, width) for width in WIDTHS), key=lambda found: found.nbytes(size))
+        return _packed(found, narrow(_tiles(turned, found), precision, self.stored.unit), self.difference)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays, of which `from_arrays` makes the same again, to the bit."""
         return {
             "shape": np.array(self.shape, np.int64),
-            "precision": np.array(self.precision),
             "layout": np.array(dataclasses.astuple(self.layout), np.int64),
             "pointers": self.pointers,
             "starts": self.starts,
-            "values": self.values,
-            "unit": np.array(self.unit),
-            "scales": self.scales,
+            "precision": np.array(self.stored.precision),
+            "codes": self.stored.codes,
+            "scales": self.stored.scales,
+            "unit": np.array(self.stored.unit),
             "difference": np.array(self.difference),
         }
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Packed:
         """Of what `to_arrays` gave; what does not fit together is refused."""
+        lacking = [name for name in _STORED if name not in arrays]
+        if lacking:
+            raise InputError(f"stored tiles lack {', '.join(lacking)}; they must be what to_arrays gave")
+        precision = checks.one_of("precision", str(arrays["precision"]), PRECISIONS)
         width, granule, pages, long = (int(n) for n in arrays["layout"])
+        codes, scales = np.asarray(arrays["codes"]), np.asarray(arrays["scales"])
         packed = cls(
             (int(arrays["shape"][0]), int(arrays["shape"][1])),
-            str(arrays["precision"]),
             Layout(width, granule, pages, bool(long)),
             np.asarray(arrays["pointers"]),
             np.asarray(arrays["starts"]),
-            np.asarray(arrays["values"]),
-            float(arrays["unit"]),
-            np.asarray(arrays["scales"]),
+            Narrow(precision, codes, scales, float(arrays["unit"])),
             Difference(*(float(n) for n in arrays["difference"])),
         )
         _check(packed)
@@ -134,77 +123,12 @@ def pack(matrix: Any, width: int = 8, precision: str = "bfloat16") -> Packed:
     matrix = given(matrix)
     checks.one_of("precision", precision, PRECISIONS)
     found = cover(matrix, width)
-    stored = narrow(matrix.data, matrix.indptr, precision)
-    return _filled(matrix, found, precision, stored, difference(matrix, stored, precision))
-
-
-def given(matrix: Any) -> scipy.sparse.csr_array:
-    """A matrix as users hold it, sparse or dense, as a checked `csr_array`."""
-    if scipy.sparse.issparse(matrix):
-        return checks.csr("matrix", matrix)
-    dense = checks.finite("matrix", checks.real("matrix", matrix))
-    if dense.ndim != 2:
-        raise InputError(f"matrix has shape {dense.shape}; it must be (M, N)")
-    return checks.csr("matrix", scipy.sparse.csr_array(dense))
-
-
-def difference(matrix: Any, stored: Narrow, precision: str) -> Difference:
-    """Between a `csr_array` and its numbers as they are stored."""
-    data = np.abs(matrix.data - decoded(stored, matrix.indptr, precision))
-    lost = scipy.sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
-    frobenius = float(np.linalg.norm(data))
-    one, inf = (float(np.max(lost.sum(axis=axis), initial=0.0)) for axis in (0, 1))
-    return Difference(frobenius, min(frobenius, (one * inf) ** 0.5))
-
-
-def _filled(matrix: Any, found: Cover, precision: str, stored: Narrow, lost: Difference) -> Packed:
-    """The tiles of a cover with the codes of the nonzeros in them."""
-    layout = found.layout
-    page, places = (
-        np.divmod(-(-found.columns // layout.granule), PLACES) if not layout.long else (0, found.columns)
-    )
-    values = np.zeros((len(found.columns), layout.width), stored.codes.dtype)
-    values[found.tile, matrix.indices - found.columns[found.tile]] = stored.codes
-    counts = np.bincount(found.rows * layout.pages + page, minlength=matrix.shape[0] * layout.pages)
-    return Packed(
-        matrix.shape,
-        precision,
-        layout,
-        np.concatenate([[0], np.cumsum(counts)]),
-        places.astype(layout.place),
-        values,
-        stored.unit,
-        stored.scales,
-        lost,
-    )
-
-
-def _check(packed: Packed) -> None:
-    """Refuse arrays that a kernel could read beyond, of other types than it reads, or not finite."""
-    layout, (rows, columns) = packed.layout, packed.shape
-    tiles, kind = len(packed.starts), PRECISIONS[checks.one_of("precision", packed.precision, PRECISIONS)]
-    pointers, starts, values, scales = packed.pointers, packed.starts, packed.values, packed.scales
-    wanted = {
-        "width": layout.width in WIDTHS and layout.width <= max(columns, 1),
-        "granule": 1 <= layout.granule <= layout.width,
-        "pages": layout.pages >= 1,
-        "starts": starts.dtype == layout.place and starts.ndim == 1 and np.all(starts >= 0),
-        "values": values.dtype == kind.dtype and values.shape == (tiles, layout.width),
-        "scales": scales.dtype == np.float32 and scales.shape in ((0,), (rows,)),
-        "pointers": pointers.dtype == np.int64
-        and pointers.shape == (rows * layout.pages + 1,)
-        and (pointers[0], pointers[-1]) == (0, tiles)
-        and np.all(np.diff(pointers) >= 0),
-        "numbers": np.all(np.isfinite([packed.unit, *packed.difference])) and np.all(np.isfinite(scales)),
-    }
-    bad = [name for name, fits in wanted.items() if not fits]
-    if bad:
-        raise InputError(f"{', '.join(bad)} of stored tiles do not fit; they must be what to_arrays gave")
-    checks.finite("values of stored tiles", kind.decode(values))
+    stored = narrow(_tiles(matrix, found), precision)
+    return _packed(found, stored, _difference(matrix, found, stored))
 
 
 def smallest(matrix: Any, tolerance: float) -> tuple[int, str]:
-    """Width and precision of the tiles that take fewest bytes, nothing of which is built.
+    """Width and precision of the tiles that take fewest bytes; nothing goes to a device.
 
     Parameters
     ----------
@@ -218,11 +142,98 @@ def smallest(matrix: Any, tolerance: float) -> tuple[int, str]:
     """
     matrix = given(matrix)
     most = checks.number("tolerance", tolerance, least=0) * float(np.linalg.norm(matrix.data))
-    covers = {width: cover(matrix, width) for width in reversed(WIDTHS)}
     sizes = {}
-    for name, kind in PRECISIONS.items():
-        stored = narrow(matrix.data, matrix.indptr, name)
-        if name == "float32" or difference(matrix, stored, name).frobenius <= most:
-            for width, found in covers.items():
-                sizes[width, name] = found.nbytes(np.dtype(kind.dtype).itemsize) + stored.scales.nbytes
+    for width in reversed(WIDTHS):
+        found = cover(matrix, width)
+        tiles = _tiles(matrix, found)
+        for precision in PRECISIONS:
+            stored = narrow(tiles, precision)
+            if precision == "float32" or np.linalg.norm(tiles - stored.decoded()) <= most:
+                sizes[width, precision] = found.layout.nbytes(matrix.shape[0], len(tiles)) + stored.nbytes
     return min(sizes, key=sizes.__getitem__)
+
+
+def spread(kept: Any, matrix: Any, width: int) -> scipy.sparse.csr_array:
+    """All that `matrix` has in the tiles that cover `kept`: what else lies in them costs nothing to keep.
+
+    >>> kept = scipy.sparse.csr_array(([1.0], ([0], [2])), shape=(1, 20))
+    >>> spread(kept, np.ones((1, 20)), 8).indices.tolist()
+    [2, 3, 4, 5, 6, 7, 8, 9]
+    """
+    kept, matrix = given(kept), given(matrix)
+    if kept.shape != matrix.shape:
+        raise InputError(f"kept has shape {kept.shape}; it must be that of matrix, {matrix.shape}")
+    found = cover(kept, width)
+    columns = (found.columns[:, None] + np.arange(found.layout.width)).ravel()
+    rows = np.repeat(found.rows, found.layout.width)
+    mask = scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=kept.shape)
+    mask.data[:] = 1  # where the last two tiles of a row overlap, it was 2
+    return given(matrix * mask)
+
+
+def given(matrix: Any) -> scipy.sparse.csr_array:
+    """A matrix as users hold it, sparse or dense, as a checked `csr_array`."""
+    if scipy.sparse.issparse(matrix):
+        checked = checks.csr("matrix", matrix)
+        if np.all(checked.data):
+            return checked
+        checked = checked.copy()
+        checked.eliminate_zeros()  # they would claim tiles
+        return checked
+    dense = checks.finite("matrix", checks.real("matrix", matrix))
+    if dense.ndim != 2:
+        raise InputError(f"matrix has shape {dense.shape}; it must be (M, N)")
+    return checks.csr("matrix", scipy.sparse.csr_array(dense))
+
+
+def _tiles(matrix: Any, found: Cover) -> np.ndarray:
+    """The numbers of the tiles of a cover, (tiles, width) float64."""
+    tiles = np.zeros((len(found.rows), found.layout.width))
+    tiles[found.tile, matrix.indices - found.columns[found.tile]] = matrix.data
+    return tiles
+
+
+def _difference(matrix: Any, found: Cover, stored: Narrow) -> Difference:
+    """Between a `csr_array` and its numbers as they are stored."""
+    kept = stored.decoded()[found.tile, matrix.indices - found.columns[found.tile]]
+    data = np.abs(matrix.data - kept)
+    lost = scipy.sparse.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+    frobenius = float(np.linalg.norm(data))
+    one, inf = (float(np.max(lost.sum(axis=axis), initial=0.0)) for axis in (0, 1))
+    return Difference(frobenius, min(frobenius, (one * inf) ** 0.5))
+
+
+def _packed(found: Cover, stored: Narrow, difference: Difference) -> Packed:
+    layout, rows = found.layout, found.shape[0]
+    places = -(-found.columns // layout.granule)
+    page, places = (0, places) if layout.long else np.divmod(places, PLACES)
+    counts = np.bincount(found.rows * layout.pages + page, minlength=rows * layout.pages)
+    pointers = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Packed(found.shape, layout, pointers, places.astype(layout.place), stored, difference)
+
+
+def _check(packed: Packed) -> None:
+    """Refuse arrays that a kernel could read beyond, of other types than it reads, or not finite."""
+    layout, (rows, columns), stored = packed.layout, packed.shape, packed.stored
+    pointers, starts, codes, scales = packed.pointers, packed.starts, stored.codes, stored.scales
+    tiles = len(starts)
+    wanted = {
+        "layout": layout.width in WIDTHS
+        and layout.width <= max(columns, 1)
+        and 1 <= layout.granule <= layout.width
+        and layout.pages >= 1,
+        "starts": starts.dtype == layout.place and starts.ndim == 1 and np.all(starts >= 0),
+        "codes": codes.dtype == PRECISIONS[stored.precision].dtype and codes.shape == (tiles, layout.width),
+        "scales": scales.dtype == np.uint8 and scales.shape == (tiles if stored.precision == "int8" else 0,),
+        "pointers": pointers.dtype == np.int64
+        and pointers.shape == (rows * layout.pages + 1,)
+        and (pointers[0], pointers[-1]) == (0, tiles)
+        and np.all(np.diff(pointers) >= 0),
+        "unit, difference": np.all(np.isfinite([stored.unit, *packed.difference])),
+    }
+    bad = [name for name, fits in wanted.items() if not fits]
+    if bad:
+        raise InputError(f"{', '.join(bad)} of stored tiles do not fit; they must be what to_arrays gave")
+    checks.finite("the numbers of stored tiles", stored.decoded())
+    if np.max(packed.columns(), initial=0) > layout.last(columns):
+        raise InputError("a stored tile reaches beyond the matrix; starts must be what to_arrays gave")

@@ -14,6 +14,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, Device
+from ltcl.operators.base import MOST, group_of, lanes_of
 from ltcl.operators.bases import Basis
 
 
@@ -69,24 +70,27 @@ class Pyramid(Basis):
         return np.ones(self.shape[1])
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        epilogue = scale, int(add is not None)
-        if transpose:
-            self._launch("spread", self.grid, len(self.cells), *epilogue, x, add or out, out)
+        if x.columns == 0:
             return
+        levels = range(len(self.cells))
+        name, levels = ("spread", reversed(levels)) if transpose else ("gather", levels)
         with self._lock:
-            if self._sums.size < self.shape[0] * x.columns:
-                self._sums = self.device.empty(self.shape[0] * x.columns)
-            for level, cells in enumerate(self.cells):
-                self._launch("gather", cells, level, *epilogue, x, self._sums, add or out, out)
+            needed = (self.shape[0] + len(self.cells)) * x.columns  # a spare cell a level
+            if self._sums.size < needed:
+                self._sums = self.device.empty(needed)
+            for level in levels:
+                self._launch(name, level, scale, int(add is not None), x, self._sums, add or out, out)
 
-    def _launch(self, name: str, cells: tuple[int, int], level: int, *arguments: Any) -> None:
-        (h, w), k = cells, arguments[-1].columns
-        kernel = self.device.kernel("pyramid", f"pyramid_{name}")
+    def _launch(self, name: str, level: int, *arguments: Any) -> None:
+        (h, w), k = self.cells[level], arguments[-1].columns
+        lanes = lanes_of(k)
+        kernel = self.device.kernel("pyramid", f"pyramid_{name}", K=lanes)
+        pieces = -(-k // lanes)
         if self.device.is_cpu:
-            size, group = (min(k, 1), min(w, -(-64 // h)), h), (1, 1, 1)
+            size, group = (1, min(w, -(-64 // h)), min(h, MOST)), (1, 1, 1)
         else:
-            size, group = (k, w, h), (min(k, 8), 8, 1)
-        kernel(size, group, *self.grid, level, k, *arguments)
+            size, group = (pieces, min(w, MOST), min(h, MOST)), (*group_of(pieces), 1)
+        kernel(size, group, *self.grid, level, len(self.cells), k, *arguments)
 
 
 def _cells(grid: tuple[int, int]) -> tuple[tuple[int, int], ...]:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Operators S = I + R as plain arrays by name, and made of such again: what files hold of compressed ones.
 
-    system_0.sign, .solution_error, .weights       of each channel; weights where S has them
-    system_0.R.kind                                "csr", "dense", "tiles", "compressed" or "sum"
-    system_0.R.error                               of what was dropped
-    system_0.R.core.kind, ...                      of "compressed", with .out and .into, numbers of bases or -1
-    system_0.R.part_0.kind, ...                    of "sum"
-    basis_0.name, ...                              as `Basis.to_arrays` has it; a basis that is shared is there once
+    system_0.sign, .solution_error, .weights    of each channel; weights where S has them
+    system_0.R.kind                             "csr", "dense", "tiles", "compressed" or "sum"
+    system_0.R.error                            of what was dropped
+    system_0.R.core.kind, ...                   of "compressed", with .out and .into: bases, -1 of pixels
+    system_0.R.part_0.kind, ...                 of "sum"
+    basis_0.name, ...                           as `Basis.to_arrays` has it; one that is shared is there once
 
 Nothing is believed that these say: constructors check every size and index, before anything is uploaded.
 """
@@ -31,7 +31,7 @@ from ltcl.operators.named_bases import basis_of
 from ltcl.operators.tiles import Tiles
 
 Arrays = dict[str, np.ndarray]
-_CORES = {"csr": CSR, "dense": Dense, "tiles": Tiles}
+_KINDS = {"csr": CSR, "dense": Dense, "tiles": Tiles, "compressed": Compressed, "sum": Sum}
 _DEEPEST = 4  # sums within sums
 
 
@@ -80,23 +80,26 @@ def from_arrays(device: Device, arrays: Mapping[str, np.ndarray]) -> tuple[Ident
         raise
     except KeyError as error:
         raise InputError(f"the parts of the operators lack {error.args[0]!r}") from None
-    except (IndexError, TypeError, ValueError, OverflowError) as error:
+    except (IndexError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"the parts of the operators do not fit: {str(error)!a:.150}") from None
 
 
 def _operator(A: Operator, bases: list[Basis]) -> Arrays:
-    own: Arrays = {"error": np.array(float(A.error))}
-    for kind, core in _CORES.items():
-        if type(A) is core:
-            return own | {"kind": np.array(kind)} | A.to_arrays()
-    if type(A) is Compressed:
-        sides = {"out": np.array(_number(A.out, bases)), "into": np.array(_number(A.into, bases))}
-        known = {} if A.known_diagonal is None else {"diagonal": A.known_diagonal}
-        return own | {"kind": np.array("compressed")} | sides | known | _named("core", _operator(A.core, bases))
-    if type(A) is Sum:
-        parts = [_named(f"part_{i}", _operator(B, bases)) for i, B in enumerate(A.operators)]
-        return own | {"kind": np.array("sum")} | {name: value for part in parts for name, value in part.items()}
-    raise InputTypeError(f"R holds a {type(A).__name__}, which cannot be kept as arrays")
+    kind = next((kind for kind, known in _KINDS.items() if type(A) is known), None)
+    if kind is None:
+        raise InputTypeError(f"R holds a {type(A).__name__}, which cannot be kept as arrays")
+    own: Arrays = {"kind": np.array(kind), "error": np.array(float(A.error))}
+    if isinstance(A, Compressed):
+        own |= {"out": np.array(_number(A.out, bases)), "into": np.array(_number(A.into, bases))}
+        if A.known_diagonal is not None:
+            own["diagonal"] = A.known_diagonal
+        return own | _named("core", _operator(A.core, bases))
+    if isinstance(A, Sum):
+        for place, part in enumerate(A.operators):
+            own |= _named(f"part_{place}", _operator(part, bases))
+        return own
+    assert isinstance(A, CSR | Dense | Tiles)  # noqa: S101 - the other kinds
+    return own | A.to_arrays()
 
 
 def _number(W: Basis | None, bases: list[Basis]) -> int:
@@ -130,27 +133,27 @@ class _Reader:
         return IdentityPlus(R, sign, weights, solution_error=error)
 
     def _operator(self, own: Mapping[str, np.ndarray], depth: int = 0) -> Operator:
-        kind = str(own["kind"])
+        kind = checks.one_of("kind of a stored operator", str(own["kind"]), _KINDS)
         if depth > _DEEPEST:
             raise InputError(f"operators are nested more than {_DEEPEST} deep")
         error = checks.number("error of a stored operator", float(own["error"]), least=0.0)
         if kind == "compressed":
             core = self._operator(_under(own, "core"), depth + 1)
-            sides = (self._basis(int(own[name])) for name in ("out", "into"))
-            return Compressed(core, *sides, error, diagonal=own.get("diagonal"))
+            out, into = (self._basis(int(own[name])) for name in ("out", "into"))
+            return Compressed(core, out, into, error, diagonal=own.get("diagonal"))
         if kind == "sum":
             names = sorted({name.split(".")[0] for name in own if name.startswith("part_")}, key=_trailing)
             return Sum(*(self._operator(_under(own, name), depth + 1) for name in names))
-        found = self._core(checks.one_of("kind of a stored operator", kind, [*_CORES, "compressed", "sum"]), own)
+        found = self._core(kind, own)
         found.error = error
         return found
 
     def _core(self, kind: str, own: Mapping[str, np.ndarray]) -> Operator:
-        if kind != "csr":
-            return _CORES[kind].from_arrays(self.device, own)
-        found = CSR.from_arrays(self.device, own, self._pattern)
-        self._pattern = found.pattern
-        return found
+        if kind == "csr":
+            found = CSR.from_arrays(self.device, own, self._pattern)
+            self._pattern = found.pattern
+            return found
+        return (Dense if kind == "dense" else Tiles).from_arrays(self.device, own)
 
     def _basis(self, number: int) -> Basis | None:
         if number == -1:

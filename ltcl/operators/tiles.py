@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device import Array, Device, vectors
+from ltcl.device import Array, Device
 from ltcl.operators import slabs
 from ltcl.operators.base import Norms
 from ltcl.operators.narrow import PRECISIONS
@@ -35,7 +35,7 @@ class Tiles(RowOperator):
     width : 1, 8 or 16
         Neighbouring columns of a tile, which begins where the nonzeros do; 1 is for scattered ones.
     precision : str
-        "float32", "bfloat16" (8 significant bits), "float16" (11) or "int8" (7, with a scale a row).
+        "float32", "bfloat16" (8 significant bits), "float16" (11) or "int8" (7, with a scale a tile).
 
     Attributes
     ----------
@@ -65,10 +65,9 @@ class Tiles(RowOperator):
     def __init__(self, device: Device, matrix: Any, width: int = 8, precision: str = "bfloat16") -> None:
         self.packed = matrix if isinstance(matrix, Packed) else pack(matrix, width, precision)
         super().__init__(device, self.packed.shape)
-        device.require(self.packed.nbytes, f"a matrix of {self.packed.values.size} numbers in tiles")
+        device.require(self.packed.nbytes, f"a matrix of {self.packed.stored.codes.size} numbers in tiles")
         self.quantisation, self.error = self.packed.difference
         self.defines = _defines(self.packed)
-        self._scales = device.upload(self.packed.scales) if self.packed.scales.size else None
         self.slabs = [self._slab(start, stop) for start, stop in _cuts(self.packed, slabs.largest(device))]
         self._transposed_copy: Tiles | None = None
 
@@ -76,15 +75,14 @@ class Tiles(RowOperator):
         packed, pages = self.packed, self.packed.layout.pages
         pointers = packed.pointers[start * pages : stop * pages + 1]
         tiles = slice(pointers[0], pointers[-1])
-        places = self.device.upload(pointers - pointers[0], np.int32)
-        arguments = (
-            packed.layout.last(self.shape[1]),
-            places,
-            self.device.upload(packed.starts[tiles], packed.starts.dtype),
-            self.device.upload(packed.values[tiles], packed.values.dtype),
-            places if self._scales is None else self._scales,  # not read where there are none
+        counts = self.device.upload(pointers - pointers[0], np.int32)
+        starts, codes = (
+            self.device.upload(array[tiles], array.dtype) for array in (packed.starts, packed.stored.codes)
         )
-        return Slab(start, stop - start, arguments)
+        scales = packed.stored.scales
+        # Not read where there are none, but a kernel needs a buffer.
+        scales = self.device.upload(scales[tiles], np.uint8) if scales.size else starts
+        return Slab(start, stop - start, (packed.layout.last(self.shape[1]), counts, starts, codes, scales))
 
     @property
     def width(self) -> int:
@@ -94,7 +92,7 @@ class Tiles(RowOperator):
     @property
     def precision(self) -> str:
         """Of the numbers."""
-        return self.packed.precision
+        return self.packed.stored.precision
 
     @property
     def nbytes(self) -> int:
@@ -143,16 +141,11 @@ class Tiles(RowOperator):
         return cls(device, Packed.from_arrays(arrays))
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        if not transpose:
-            self._forward(x, out, scale * self.packed.unit, add)
-            return
-        if self._scales is not None:  # A^T = C^T diag(scales)
-            x = vectors.scale_rows(self._scales, x, x.like())
-        turned = self.transposed_copy()
-        turned._forward(x, out, scale * turned.packed.unit, add)
+        tiles = self.transposed_copy() if transpose else self
+        tiles._forward(x, out, scale * tiles.packed.stored.unit, add)
 
     def transposed_copy(self) -> Tiles:
-        """A^T, but for the scales of rows of A, in tiles of its own, made at the first call."""
+        """A^T in tiles of its own, made at the first call."""
         if self._transposed_copy is None:
             self._transposed_copy = Tiles(self.device, self.packed.transposed())
         return self._transposed_copy
@@ -161,18 +154,17 @@ class Tiles(RowOperator):
 def _defines(packed: Packed) -> dict[str, int]:
     layout = packed.layout
     chosen = {
-        "SCALED": 1 if packed.scales.size else None,
         "LONG": 1 if layout.long else None,
         "GRANULE": layout.granule if layout.granule > 1 else None,
         "PAGES": layout.pages if layout.pages > 1 else None,
     }
     defines = {name: value for name, value in chosen.items() if value is not None}
-    return {"WIDTH": layout.width, "VALUES": PRECISIONS[packed.precision].number, **defines}
+    return {"WIDTH": layout.width, "VALUES": PRECISIONS[packed.stored.precision].number, **defines}
 
 
 def _cuts(packed: Packed, limit: int) -> list[tuple[int, int]]:
     """Rows of the slabs: pointers, places and values of each fit a buffer and are counted in 32 bits."""
-    layout, size = packed.layout, packed.values.itemsize
+    layout, size = packed.layout, packed.stored.codes.itemsize
     tiles = np.diff(packed.pointers[:: layout.pages])
     per_tile = max(layout.width * size, packed.starts.itemsize)
     row_bytes = np.maximum(per_tile * tiles, 4 * layout.pages)

@@ -20,8 +20,9 @@ import pywt
 
 from ltcl import checks
 from ltcl.device import Array, Device, vectors
+from ltcl.device.kernels import Kernel
 from ltcl.errors import InputError
-from ltcl.operators.base import widths
+from ltcl.operators.base import MOST, group_of, lanes_of, widths
 from ltcl.operators.bases import Basis
 
 _pywt: Any = pywt  # compiled, so that no type checker knows its names
@@ -62,6 +63,7 @@ class Wavelet(Basis):
         taps = filters(name)
         super().__init__(device, grid, name)
         self.levels = _levels(self.grid, levels)
+        self._large = sum(h * w > _SMALL for h, w in map(self.sides, range(self.levels)))
         self._defines = {"TAPS": taps.shape[1]}
         self._taps = device.upload(taps)
         self._scratch = device.empty(0), device.empty(0)
@@ -114,16 +116,10 @@ class _Task:
     add: Array
     out: Array
 
-    @property
-    def large(self) -> int:
-        """Levels that get launches of their own."""
-        sizes = [np.prod(self.W.sides(level)) for level in range(self.W.levels)]
-        return sum(bool(size > _SMALL) for size in sizes)
-
     def split(self) -> None:
         W, k, taps = self.W, self.k, self.W._taps
         source = self.x
-        for level in range(self.large):
+        for level in range(W._large):
             (h, w), run, split_at, pitch = self._geometry(level)
             self._rows("split", h, w, h, W.grid[1], level, k, taps, source, self.lines)
             self._columns(
@@ -136,11 +132,11 @@ class _Task:
     def join(self) -> None:
         W, k, taps = self.W, self.k, self.W._taps
         plain = (1.0, 0)
-        if self.large:
+        if W._large:
             self._all("join", plain, self.x, self.near, self.near)
         else:
             self._all("join", self.scaled, self.x, self.add, self.out)
-        for level in reversed(range(self.large)):
+        for level in reversed(range(W._large)):
             (h, w), run, split_at, pitch = self._geometry(level)
             self._columns(
                 "join", h, run, split_at, W.grid[0], level, run, split_at, pitch, taps,
@@ -157,30 +153,29 @@ class _Task:
         split_at = -(-w // 2) * self.k if level + 1 < self.W.levels else 0
         return (h, w), w * self.k, split_at, self.W.grid[1] * self.k
 
-    def _kernel(self, name: str, lanes: int):
+    def _kernel(self, name: str, lanes: int) -> Kernel:
         return self.W.device.kernel("wavelet", f"wavelet_{name}", K=lanes, **self.W._defines)
 
-    def _rows(self, name: str, h: int, w: int, *arguments) -> None:
-        lanes = _lanes(self.k)
+    def _rows(self, name: str, h: int, w: int, *arguments: Any) -> None:
+        lanes = lanes_of(self.k)
         kernel = self._kernel(f"{name}_rows", lanes)
         pieces, pairs = -(-self.k // lanes), -(-w // 2)
         if self.W.device.is_cpu:
-            kernel((1, min(pairs, -(-_ITEMS // h)), h), (1, 1, 1), *arguments)
+            kernel((1, min(pairs, -(-_ITEMS // h)), min(h, MOST)), (1, 1, 1), *arguments)
         else:
-            group = _group(pieces)
-            kernel((pieces, pairs, h), (*group, 1), *arguments)
+            kernel((pieces, min(pairs, MOST), min(h, MOST)), (*group_of(pieces), 1), *arguments)
 
-    def _columns(self, name: str, h: int, run: int, split_at: int, *arguments) -> None:
-        lanes = _lanes(min(part for part in (split_at, run - split_at) if part))
+    def _columns(self, name: str, h: int, run: int, split_at: int, *arguments: Any) -> None:
+        lanes = lanes_of(min(part for part in (split_at, run - split_at) if part))
         kernel = self._kernel(f"{name}_columns", lanes)
         pieces, pairs = -(-split_at // lanes) + -(-(run - split_at) // lanes), -(-h // 2)
         if self.W.device.is_cpu:
-            kernel((min(pieces, -(-_ITEMS // pairs)), pairs), (1, 1), *arguments)
+            kernel((min(pieces, -(-_ITEMS // pairs)), min(pairs, MOST)), (1, 1), *arguments)
         else:
-            kernel((pieces, pairs), _group(pieces), *arguments)
+            kernel((pieces, min(pairs, MOST)), group_of(pieces), *arguments)
 
     def _all(self, name: str, scaled: tuple[float, int], source: Array, add: Array, out: Array) -> None:
-        first, last = self.large, self.W.levels
+        first, last = self.W._large, self.W.levels
         if first == last:
             return
         group = 1 if self.W.device.is_cpu else 16
@@ -234,17 +229,6 @@ def _levels(grid: tuple[int, int], levels: int | None) -> int:
     if checks.count("levels", levels, least=0) > most:
         raise InputError(f"levels is {levels}; it must be at most {most} on a {grid[0]} x {grid[1]} grid")
     return int(levels)
-
-
-def _lanes(run: int) -> int:
-    """Neighbouring values that an item takes together, of stretches of `run`."""
-    return 8 if run >= 8 else min(run, 4)
-
-
-def _group(pieces: int) -> tuple[int, int]:
-    """A work-group of 64: as many side by side as there are pieces, the others on other pairs."""
-    across = min(64, 1 << (pieces - 1).bit_length())
-    return across, 64 // across
 
 
 def _pieces(k: int) -> list[tuple[int, int, int]]:

@@ -31,6 +31,7 @@ class Status(enum.Enum):
         "the samples are spent, what is left is noise, told by .standard_error; try more "
         "samples=, or gather=True"
     )
+    PRECOMPUTED = "one product with an inverse whose error is bounded; no residual was computed"
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
@@ -78,6 +79,8 @@ class Solution:
         are no iterate's.
     standard_error : like x, optional
         Of a method that samples, where it knows it.
+    error : float, optional
+        Bound on the relative error of x, where one is known: of a precomputed inverse.
     """
 
     x: np.ndarray
@@ -90,11 +93,12 @@ class Solution:
     reason: str = ""
     lowest: float | None = None
     standard_error: np.ndarray | None = None
+    error: float | None = None
 
     @property
     def converged(self) -> bool:
-        """Whether the tolerance was met by a true residual."""
-        return self.status is Status.CONVERGED
+        """Whether the tolerance was met, by a true residual or by a bound on the error of x."""
+        return self.status in (Status.CONVERGED, Status.PRECOMPUTED)
 
     @property
     def residual(self) -> float:
@@ -105,6 +109,8 @@ class Solution:
         return min(finite) if self.lowest is None else self.lowest
 
     def __str__(self) -> str:
+        if self.error is not None:
+            return f"{self.method}: relative error at most {self.error:.2g}: {self.status.value}"
         best, last = self.residual, self.residuals[-1]
         residual = f"{best:.2g}"
         if np.isnan(last) and self.status is Status.SAMPLED:

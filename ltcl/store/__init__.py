@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import checks
+from ltcl import checks, parts
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import as_path
 from ltcl.store import arrays, formats
+from ltcl.store.compressed import Parts
+from ltcl.store.inverses import load_inverse, save_inverse
 from ltcl.store.record import Matrix, Record
 from ltcl.transport import Transport
 
-__all__ = ["Record", "load", "save"]
+__all__ = ["Parts", "Record", "load", "load_inverse", "save", "save_inverse"]
 
 
 def load(
@@ -37,7 +39,7 @@ def load(
     ----------
     path
         A .npz file (SciPy's sparse layouts, or arrays: `T` (M, N) or (3, M, N), and perhaps `grid`,
-        `camera_grid`, `first_bounce`, `mixing`), a .npy or a .mtx file.
+        `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy or a .mtx file.
     grid, camera_grid
         (h, w) of projector and camera; needed where the file does not tell, and preferred to what it tells.
     first_bounce
@@ -48,7 +50,8 @@ def load(
     Returns
     -------
     Transport
-        float32 values stay float32; 8- and 16-bit values become float32, all others float64.
+        float32 values stay float32; 8- and 16-bit values become float32, all others float64. A compressed
+        one is on its device at once, with the same bits as it was saved.
 
     Raises
     ------
@@ -69,6 +72,9 @@ def load(
     path = as_path(path)
     record = formats.read(path)
     with formats.about(path):
+        if isinstance(record, Parts):
+            same = {"grid": grid or camera_grid, "first_bounce": first_bounce}
+            return parts.assemble(record.arrays, **same, on_dark=on_dark, device=device)
         rows, columns = record.shape
         grid = checks.grid("grid", grid or record.grid or _unknown("grid", columns, "projector"), columns)
         camera_grid = camera_grid or record.camera_grid
@@ -96,16 +102,17 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     Parameters
     ----------
     path
-        .npz keeps everything; .npy (dense only) the matrix; .mtx (one channel only) matrix and grids.
+        .npz keeps everything, and alone compressed operators; .npy (dense only) the matrix; .mtx (one
+        channel only) matrix and grids.
     T
-        A transport made of matrices.
+        A transport made of matrices, or compressed.
 
     Raises
     ------
     FileError
         An unknown extension, a format that cannot hold this transport, or the file cannot be written.
     InputTypeError
-        T is no Transport, of 3 x 3 blocks, or made of operators whose entries are not at hand.
+        T is no Transport, of 3 x 3 blocks, or made of operators that are no compressed S F.
 
     Notes
     -----
@@ -123,6 +130,9 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
         raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport")
     if T.blocks is not None:
         raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
+    if not any(isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) for matrix in T.matrices):
+        formats.write(as_path(path), Parts(parts.of(T)))
+        return
     matrices = tuple(_entries(matrix) for matrix in T.matrices)
     bounce = T.first_bounce if T.is_square else None
     formats.write(as_path(path), Record(matrices, T.grid, T.camera_grid, bounce, T.mixing))

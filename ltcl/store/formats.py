@@ -17,6 +17,7 @@ import numpy as np
 from ltcl.errors import FileError, InputError, InputTypeError, MemoryLimitError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.store import mtx, npy, npz
+from ltcl.store.compressed import Parts
 from ltcl.store.record import Record
 
 logger = logging.getLogger(__name__)
@@ -24,8 +25,8 @@ logger = logging.getLogger(__name__)
 FORMATS: dict[str, ModuleType] = {".npz": npz, ".npy": npy, ".mtx": mtx}
 
 
-def read(path: str | Path) -> Record:
-    """Read a transport file.
+def read(path: str | Path) -> Record | Parts:
+    """Read a transport file; of a compressed transport its parts.
 
     Raises
     ------
@@ -49,7 +50,7 @@ def read(path: str | Path) -> Record:
         return module.read(path)
 
 
-def write(path: str | Path, record: Record) -> None:
+def write(path: str | Path, record: Record | Parts) -> None:
     """Write a transport file whole or not at all.
 
     Raises
@@ -61,9 +62,12 @@ def write(path: str | Path, record: Record) -> None:
     """
     path = as_path(path)
     module = find(path)
-    if record.mixing is not None and module is not npz:
+    if isinstance(record, Parts):
+        if module is not npz:
+            raise FileError(f"{path}: {path.suffix} does not keep compressed transports; .npz does")
+    elif record.mixing is not None and module is not npz:
         raise FileError(f"{path}: {path.suffix} does not keep how the projector's colours mix; .npz does")
-    if not module.KEEPS_FIRST_BOUNCE and not _is_diagonal(record):
+    elif not module.KEEPS_FIRST_BOUNCE and not _is_diagonal(record):
         logger.warning("%s: %s does not keep the first bounce; .npz does", path, path.suffix)
     with replace_file(path) as temporary, about(path):
         module.write(temporary, record)

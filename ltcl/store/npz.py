@@ -5,6 +5,7 @@ What is read:
 
 - SciPy's own `save_npz` layouts: `format` (csr, csc, coo, bsr, dia), `shape`, `data` and indices;
 - named arrays: `T` of (M, N) or (3, M, N), or the only array of such a shape under another name;
+- compressed transports: `format` = "ltcl-compressed-1"; see `ltcl.store.compressed`;
 - three sparse channels: `format` = "ltcl-rgb-csr-1", `shape`; with one pattern for all, `indptr`, `indices`
   and `data` (3, nnz); else `indptr_0`, `indices_0`, `data_0` and so on to 2.
 
@@ -25,8 +26,9 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.errors import FileError
-from ltcl.store import arrays, sparse
+from ltcl.store import arrays, compressed, sparse
 from ltcl.store.archive import Archive
+from ltcl.store.compressed import Parts
 from ltcl.store.npy import channels, check_shape, is_matrix_shape
 from ltcl.store.record import Matrix, Record
 
@@ -36,9 +38,11 @@ _SPARSE_PARTS = {"format", "indptr", "indices", "offsets"}
 _EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
 
 
-def read(path: Path) -> Record:
+def read(path: Path) -> Record | Parts:
     """Read a transport from an archive; messages come without the file's name."""
     with Archive(path) as archive:
+        if compressed.is_layout(archive):
+            return compressed.read(archive)
         matrices = _dense(archive) if _SPARSE_PARTS.isdisjoint(archive.names) else _sparse(archive)
         bounce, mixing = (
             arrays.as_floats(name, archive.numbers(name)) if name in archive.names else None
@@ -47,8 +51,11 @@ def read(path: Path) -> Record:
         return Record(matrices, _grid(archive, "grid"), _grid(archive, "camera_grid"), bounce, mixing)
 
 
-def write(path: Path, record: Record) -> None:
+def write(path: Path, record: Record | Parts) -> None:
     """Write everything in `record`."""
+    if isinstance(record, Parts):
+        compressed.write(path, record)
+        return
     csr = [T for T in record.matrices if isinstance(T, scipy.sparse.csr_array)]
     small = _sparse_members(csr, record.shape) if csr else {}
     for name in _EXTRAS:
@@ -90,12 +97,13 @@ def _only_candidate(archive: Archive) -> str:
 
 
 def _sparse(archive: Archive) -> tuple[Matrix, ...]:
-    layout, shape = archive.text("format"), _shape(archive)
+    layout = archive.text("format")
+    if layout not in (*sparse.LAYOUTS, RGB_LAYOUT):
+        known = ", ".join([*sparse.LAYOUTS, RGB_LAYOUT, compressed.LAYOUT])
+        raise FileError(f"the layout of the archive is {layout!a:.60}; it must be one of {known}")
+    shape = _shape(archive)
     if layout == RGB_LAYOUT:
         return _rgb(archive, shape)
-    if layout not in sparse.LAYOUTS:
-        known = ", ".join([*sparse.LAYOUTS, RGB_LAYOUT])
-        raise FileError(f"the layout of the archive is {layout!a:.60}; it must be one of {known}")
     names = sparse.LAYOUTS[layout]
     if layout == "coo" and "coords" in archive.names:
         names = ("data", "coords")

@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse
 
-from ltcl import images, scenes, store
+from ltcl import images, operators, scenes, store
 from ltcl.cli.main import main
 from ltcl.device import Device
+from ltcl.transport import Transport
 
 
 @dataclass(frozen=True)
@@ -103,4 +105,20 @@ def dark_transport(tmp_path: Path) -> Path:
     T[2, 2] = T[4, 4] = 0.0
     path = tmp_path / "dark.npz"
     np.savez(path, T=T, grid=(2, 3))
+    return path
+
+
+@pytest.fixture(scope="session")
+def compressed_transport(folder: Path, device: Device) -> Path:
+    """The corner of two walls as wavelet coefficients, of which the least are dropped."""
+    scene = scenes.dihedral(5, albedo=0.6)
+    T = scene.transport(first_bounce=scene.first_bounce, device=device)
+    W = operators.Wavelet(device, T.grid, "db2")
+    R = T.systems[0].to_dense() - np.eye(50)
+    C = W.to_dense() @ R @ W.to_dense().T
+    core = operators.CSR(device, scipy.sparse.csr_array(np.where(np.abs(C) < 1e-3, 0.0, C)))
+    S = operators.IdentityPlus(operators.Compressed(core, W, W), solution_error=0.0041)
+    path = folder / "corner compressed.npz"
+    F = T.first_bounce
+    store.save(path, Transport(operators.ScaledColumns(S, F), T.grid, first_bounce=F))
     return path

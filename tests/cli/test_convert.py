@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from ltcl.store import formats
+from ltcl.store import Record, formats
 
 from .conftest import Program
 
@@ -18,6 +18,8 @@ def test_values_survive(program: Program, transport: Path, tmp_path: Path, exten
     assert program("convert", transport, there).code == 0
     assert program("convert", there, back, "--grid", "5x10").code == 0
     before, after = formats.read(transport), formats.read(back)
+    assert isinstance(before, Record)
+    assert isinstance(after, Record)
     assert after.grid == (5, 10)
     np.testing.assert_array_equal(np.asarray(before.matrices[0]), np.asarray(after.matrices[0]))
 
@@ -62,3 +64,14 @@ def test_a_grid_that_nobody_told_is_missed(program: Program, tmp_path: Path) -> 
     assert "give --camera-grid HxW" in outcome.err
     outcome = program("convert", tmp_path / "T.npy", there, "--grid", "2x2", "--camera-grid", "2x3")
     assert outcome.err == ""
+
+
+def test_compressed_ones_stay_what_they_are(
+    program: Program, compressed_transport: Path, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy.npz"
+    assert program("convert", compressed_transport, copy, "--grid", "5x10").code == 0
+    a, b = (program("info", path, "--json").json[0] for path in (compressed_transport, copy))
+    assert {**a, "file": None} == {**b, "file": None}
+    program("convert", compressed_transport, tmp_path / "T.mtx").refused(".mtx does not keep compressed")
+    program("convert", compressed_transport, copy, "--grid", "10x5").refused("compressed on its own, (5, 10)")

@@ -94,3 +94,18 @@ def test_a_bad_file_does_not_hide_the_good_ones(program: Program, transport: Pat
     assert good["shape"] == [50, 50]
     assert bad["file"] == str(bad_grid)
     assert "must be 32" in bad["error"]
+
+
+def test_compressed(
+    program: Program, transport: Path, compressed_transport: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LTCL_DEVICE", "nonsense")  # none is needed
+    exact, entry = program("info", transport, compressed_transport, "--json").json
+    assert (exact["solution_error"], entry["solution_error"]) == (0.0, 0.0041)
+    assert (entry["shape"], entry["grid"], entry["channels"]) == ([50, 50], [5, 10], 1)
+    assert (entry["stored"], entry["dtype"]) == ("compressed", "csr, db2; error 0.0041")
+    assert 0 < entry["entries"] < 2500
+    assert entry["nbytes"] < 2 * 8 * entry["entries"]
+    assert entry["first_bounce"] == exact["first_bounce"]
+    assert entry["dark_pixels"] == 0
+    assert "compressed" in program("info", compressed_transport).out

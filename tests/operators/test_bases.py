@@ -8,11 +8,12 @@ import pytest
 
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import Chained, Ordered, Pyramid, Wavelet, basis, basis_of
+from ltcl.operators import Chained, Ordered, Pyramid, Wavelet, basis, basis_of, hilbert
 from tests import gallery, reference
 from tests.operators import helpers
 
 GRIDS = ((1, 1), (3, 5), (1, 70), (9, 8))
+LONG = 20000  # more pixels than there are items
 
 
 def shuffled(n: int) -> np.ndarray:
@@ -38,11 +39,18 @@ def test_orders_meet_their_twin(device, monkeypatch, grid, kind):
 
 
 def test_orders_lose_no_bit(device):
-    x = gallery.vectors(72, 3)
-    W = Ordered(device, (9, 8), shuffled(72))
+    x = gallery.vectors(LONG, 3)
+    W = Ordered(device, (LONG, 1), shuffled(LONG))
     found = helpers.product(W, x)
     helpers.same_bits(found, x[W.order])
     helpers.same_bits(helpers.product(W.T, found), x)
+
+
+def test_hilberts_order_goes_by_its_name(device):
+    for W in (Ordered(device, (4, 6)), basis(device, (4, 6), "hilbert")):
+        assert isinstance(W, Ordered)
+        assert W.name == "hilbert"
+        np.testing.assert_array_equal(W.order, hilbert((4, 6)))
 
 
 @pytest.mark.parametrize(
@@ -53,6 +61,7 @@ def test_orders_lose_no_bit(device):
         ([0, 1, 2, 4], "leaves out pixel 3"),
         ([-1, 0, 1, 2], "leaves out pixel 3"),
         ([0.0, 1.0, 2.0, 3.0], "whole numbers"),
+        ("peano", "order is 'peano'; it must be one of hilbert"),
     ],
 )
 def test_what_is_no_order_is_refused(device, order, part):

@@ -49,6 +49,11 @@ def test_errors_of_compressed_operators_are_handed_on(device):
     A.error = 0.25
     assert A.T.error == IdentityPlus(A).error == Shifted(A).error == 0.25
     assert ScaledColumns(A, np.array([1, -4, 2, 0, 0])).error == 1.0
+    S = IdentityPlus(A, solution_error=0.01)
+    assert S.T.solution_error == S.T.T.solution_error == 0.01
+    assert ScaledColumns(S, np.array([1, -4, 2, 1, 1])).solution_error == 0.04
+    assert ScaledColumns(S, np.array([1, -4, 2, 0, 0])).solution_error == np.inf
+    assert ScaledColumns(A, np.array([1, -4, 2, 0, 0])).solution_error == 0.0
 
 
 def test_only_square_operators_have_an_identity_beside_them(device):

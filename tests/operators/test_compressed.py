@@ -8,7 +8,7 @@ import pytest
 import scipy.sparse
 
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Sum
+from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Ordered, Sum
 from ltcl.operators import compressed as module
 from tests import gallery, reference
 from tests.bases import Given, rotation, stands_for, two_sided
@@ -124,6 +124,10 @@ def test_a_diagonal_of_many_pixels_has_to_be_told(device, monkeypatch):
     told = Compressed(R.core, R.out, R.into, diagonal=np.arange(N))
     assert told.diagonal().tolist() == list(range(N))
     assert len(Compressed(Dense(device, np.eye(N)), None, None).diagonal()) == N  # of pixels, at hand
+    order = Ordered(device, (1, N), np.random.default_rng(0).permutation(N))
+    core = gallery.signed(N, N)
+    expected = (order.to_dense().T @ core @ order.to_dense()).diagonal()
+    np.testing.assert_array_equal(Compressed(Dense(device, core), order, order).diagonal(), expected)
 
 
 def test_parts_that_do_not_fit_are_refused(device, small_device):

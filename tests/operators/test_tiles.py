@@ -12,11 +12,14 @@ import scipy.sparse
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import CSR, Tiles, smallest
-from ltcl.operators.narrow import PRECISIONS
+from ltcl.operators.covers import cover
+from ltcl.operators.narrow import PRECISIONS, Narrow, narrow
+from ltcl.operators.packing import pack, spread
 from tests import gallery, reference
 from tests.operators import helpers
 
 WIDTHS = (1, 8, 16)
+KINDS = [(1, "float16"), (8, "bfloat16"), (16, "int8")]  # each width and each narrow type once
 BITS = {"float32": 24, "bfloat16": 8, "float16": 11}
 
 
@@ -27,10 +30,13 @@ def twin(A: Tiles):
     pointers = stored["pointers"]
     page = np.repeat(np.arange(len(pointers) - 1) % pages, np.diff(pointers))
     columns = np.minimum((page * 65536 + stored["starts"]) * granule, A.shape[1] - width)
-    values = stored["values"].astype(np.float64)
+    values = stored["codes"].astype(np.float64)
     if A.precision == "bfloat16":
-        values = np.ldexp(*_bfloat16(stored["values"].astype(np.int64)))
-    factors = stored["unit"] * (stored["scales"] if stored["scales"].size else np.ones(A.shape[0]))
+        values = np.ldexp(*_bfloat16(stored["codes"].astype(np.int64)))
+    if A.precision == "int8":
+        bits = stored["scales"].astype(np.int64)
+        values = np.ldexp(values * (8 + bits % 8)[:, None], (bits // 8 - 15 - 3)[:, None])
+    factors = np.full(A.shape[0], float(stored["unit"]))
     return lambda *operands: reference.tile_matvec(pointers[::pages], columns, values, factors, *operands)
 
 
@@ -41,9 +47,10 @@ def _bfloat16(bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", gallery.SPARSE)
-@pytest.mark.parametrize(("width", "precision"), [(1, "float16"), (8, "bfloat16"), (16, "int8")])
+@pytest.mark.parametrize(("width", "precision"), KINDS)
 @pytest.mark.parametrize("launch", ["item", "stream", "group7", "group32"])
 def test_products_meet_their_twin(device, monkeypatch, name, width, precision, launch):
+    monkeypatch.setattr(helpers, "COLUMNS", (None, 3, 9))  # launches of 1, 3 and 8, alone and among others
     A = Tiles(device, gallery.SPARSE[name], width, precision)
     helpers.force(monkeypatch, A, launch)
     helpers.meets_twin(A, A.to_dense(), twin(A))
@@ -52,7 +59,7 @@ def test_products_meet_their_twin(device, monkeypatch, name, width, precision, l
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_every_kind_and_its_transpose_is_the_matrix_it_stands_for(device, monkeypatch, width, precision):
-    monkeypatch.setattr(helpers, "COLUMNS", (None, 3))  # the others are built above
+    monkeypatch.setattr(helpers, "COLUMNS", (3,))  # the others are built above
     A = Tiles(device, gallery.SPARSE["stretches"], width, precision)
     matrix = A.matrix()
     assert matrix.dtype == np.float64
@@ -64,9 +71,8 @@ def test_every_kind_and_its_transpose_is_the_matrix_it_stands_for(device, monkey
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_transposes_are_exact_ones_of_the_same_numbers(device, name, precision):
     A = Tiles(device, gallery.SPARSE[name], 8, precision)
-    turned = A.transposed_copy().matrix().T.toarray()
-    scales = A.packed.scales if A.packed.scales.size else np.ones(A.shape[0])
-    np.testing.assert_array_equal(scales[:, None].astype(np.float64) * turned, A.to_dense())
+    np.testing.assert_array_equal(A.transposed_copy().matrix().T.toarray(), A.to_dense())
+    assert A.transposed_copy().precision == ("float16" if precision == "int8" else precision)
 
 
 @pytest.mark.parametrize("name", gallery.SPARSE)
@@ -81,17 +87,26 @@ def test_floats_are_rounded_to_nearest(device, name, width, precision):
 
 
 def test_ties_go_to_even():
-    from ltcl.operators.packing import pack
-
     ties = scipy.sparse.csr_array([[1 + 2.0**-8, 1 + 3 * 2.0**-8, -1 - 2.0**-8]])
     assert pack(ties, 1, "bfloat16").matrix().toarray().tolist() == [[1, 1 + 2.0**-6, -1]]
 
 
-def test_int8_is_within_half_a_step_of_its_row(device):
-    matrix = gallery.SPARSE["strong rows"].toarray().astype(np.float64)
-    found = Tiles(device, gallery.SPARSE["strong rows"], 16, "int8").to_dense()
-    step = np.abs(matrix).max(axis=1, keepdims=True) / 127
-    assert np.all(np.abs(found - matrix) <= step / 2 * (1 + 1e-5))
+@pytest.mark.parametrize("width", WIDTHS)
+def test_int8_is_within_half_a_step_of_its_tile(width):
+    packed = pack(gallery.SPARSE["stretches"], width, "int8")
+    exact = pack(gallery.SPARSE["stretches"], width, "float32").stored.decoded()
+    found = packed.stored.decoded()
+    step = np.abs(exact).max(axis=1, keepdims=True) / 127 * 1.125  # of 3 bits of fraction, rounded up
+    assert np.all(np.abs(found - exact) <= step / 2)
+    assert np.abs(packed.stored.codes).max() <= 127
+
+
+def test_products_of_all_scales_and_codes_are_exact_in_float16():
+    bits = np.arange(8, 23 * 8, dtype=np.uint8)  # numbers end below 2^15
+    codes = np.broadcast_to(np.arange(-127, 128, dtype=np.int8), (len(bits), 255))
+    numbers = Narrow("int8", codes, bits, 1.0).decoded()
+    again = narrow(numbers, "float16", 1.0).decoded()
+    np.testing.assert_array_equal(numbers[np.abs(numbers) < 2.0**15], again[np.abs(numbers) < 2.0**15])
 
 
 @pytest.mark.parametrize("exponent", [-149, -126, -60, 0, 60, 127])
@@ -119,8 +134,6 @@ def test_what_is_lost_is_known(device, name, precision):
 
 
 def test_tiles_are_the_fewest():
-    from ltcl.operators.covers import cover
-
     rng = np.random.default_rng(5)
     for columns, width in itertools.product((1, 7, 8, 17, 23), WIDTHS):
         pattern = scipy.sparse.csr_array((rng.random((40, columns)) < 0.3).astype(np.float32))
@@ -162,28 +175,24 @@ def test_places_of_wide_matrices_stay_short_where_that_pays(device, columns, wid
     A = Tiles(device, given, width, "float32")
     assert tuple(A.to_arrays()["layout"]) == layout
     assert abs(A.matrix() - given).nnz == 0
-    for k in (1, 3):
-        x = rng.standard_normal((columns, k)).astype(np.float32)
-        limit = 1e-5 * (abs(given) @ np.abs(x))
-        assert np.all(np.abs(A @ x - given.astype(np.float64) @ x) <= limit)
-        y = rng.standard_normal((len(counts), k)).astype(np.float32)
-        assert np.all(np.abs(A.T @ y - given.T.astype(np.float64) @ y) <= 1e-5 * (abs(given.T) @ np.abs(y)))
+    x = rng.standard_normal((columns, 3)).astype(np.float32)
+    assert np.all(np.abs(A @ x - given.astype(np.float64) @ x) <= 1e-5 * (abs(given) @ np.abs(x)))
+    y = rng.standard_normal((len(counts), 3)).astype(np.float32)
+    assert np.all(np.abs(A.T @ y - given.T.astype(np.float64) @ y) <= 1e-5 * (abs(given.T) @ np.abs(y)))
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(("width", "precision"), KINDS)
 def test_slabs_give_the_same_as_one_buffer(device, small_device, width, precision):
     matrix = gallery.SPARSE["129x129"] + gallery.SPARSE["129x129"].T
     whole, cut = Tiles(device, matrix, width, precision), Tiles(small_device, matrix, width, precision)
     assert len(cut.slabs) > len(whole.slabs) == 1
-    for k in (None, 1, 3):
+    for k in (None, 3):
         x = gallery.vectors(129, k)
         one, many = (A.apply(A.device.upload(x)).get() for A in (whole, cut))
         helpers.same_rows(device, one, many, reference.product_error(whole.to_dense(), x))
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(("width", "precision"), KINDS)
 def test_stored_arrays_make_the_same_again(device, width, precision):
     A = Tiles(device, gallery.SPARSE["stretches"], width, precision)
     B = Tiles.from_arrays(device, {name: np.array(array) for name, array in A.to_arrays().items()})
@@ -202,10 +211,13 @@ def test_stored_arrays_make_the_same_again(device, width, precision):
         ("pointers", lambda a: a + 1),
         ("starts", lambda a: a.astype(np.int64)),
         ("starts", lambda a: a[:-1]),
-        ("values", lambda a: a[:, :-1]),
-        ("values", lambda a: a.astype(np.float32)),
+        ("starts", lambda a: a + np.uint16(90)),
+        ("codes", lambda a: a[:, :-1]),
+        ("codes", lambda a: a.astype(np.float32)),
         ("scales", lambda a: a[:-1]),
-        ("scales", lambda a: a * np.nan),
+        ("scales", lambda a: a.astype(np.float32)),
+        ("precision", lambda a: np.array("int9")),
+        ("precision", lambda a: np.array("float16")),
         ("unit", lambda a: a * np.nan),
         ("difference", lambda a: a + np.inf),
         ("layout", lambda a: a * 2),
@@ -217,12 +229,26 @@ def test_stored_arrays_that_do_not_fit_are_refused(device, name, spoil):
         Tiles.from_arrays(device, {**arrays, name: spoil(arrays[name])})
 
 
+def test_stored_arrays_that_lack_one_are_refused(device):
+    arrays = Tiles(device, gallery.SPARSE["53x7"]).to_arrays()
+    for name in arrays:
+        with pytest.raises(InputError, match=f"lack {name}"):
+            Tiles.from_arrays(device, {other: array for other, array in arrays.items() if other != name})
+
+
+def test_zeros_that_are_stored_claim_no_tiles():
+    matrix = scipy.sparse.csr_array(np.ones((2, 40)))
+    matrix.data[1:] = 0
+    assert len(pack(matrix, 8).starts) == 1
+    assert matrix.nnz == 80  # the user's matrix is left alone
+
+
 def test_bytes_are_those_of_the_buffers(device, small_device):
     A = Tiles(device, gallery.SPARSE["stretches"], 8, "int8")
     tiles = len(A.packed.starts)
-    assert A.nbytes == tiles * (8 + 2) + 4 * 25 + 4 * 24
+    assert A.nbytes == tiles * (8 + 1 + 2) + 4 * 25
     A.apply_transpose(device.upload(np.ones(24)))
-    assert A.nbytes == tiles * (8 + 2) + 4 * 25 + 4 * 24 + A.transposed_copy().nbytes
+    assert A.nbytes == tiles * (8 + 1 + 2) + 4 * 25 + A.transposed_copy().nbytes
     cut = Tiles(small_device, gallery.SPARSE["129x129"], 1, "float32")
     buffers = {id(a): a.nbytes for slab in cut.slabs for a in slab.arguments if not isinstance(a, int)}
     assert cut.nbytes == sum(buffers.values())
@@ -259,6 +285,20 @@ def test_the_smallest_that_is_good_enough_is_named(device):
         assert chosen.packed.nbytes == min(A.packed.nbytes for A in good)
     assert smallest(scattered, 0.1)[0] == 1
     assert smallest(runs, 0.1)[0] > 1
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_what_lies_in_kept_tiles_is_kept(width):
+    matrix = gallery.SPARSE["stretches"]
+    kept = scipy.sparse.csr_array(matrix * (abs(matrix) > 0.9))
+    found = spread(kept, matrix, width)
+    assert len(cover(found, width).rows) == len(cover(kept, width).rows)
+    some, all_of, given = kept.toarray(), found.toarray(), matrix.toarray()
+    np.testing.assert_array_equal(all_of[some != 0], some[some != 0])
+    np.testing.assert_array_equal(all_of[all_of != 0], given[all_of != 0])
+    assert found.nnz > kept.nnz or width == 1
+    with pytest.raises(InputError, match="kept has shape"):
+        spread(kept, matrix.T, width)
 
 
 def test_memory_is_asked_before_anything_is_allocated(device, monkeypatch):

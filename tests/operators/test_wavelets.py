@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import pywt
@@ -142,6 +144,23 @@ def test_many_right_hand_sides_at_once(device):
     expected = twin(W)(x)
     np.testing.assert_allclose(helpers.product(W, x), expected, rtol=0, atol=1e-5)
     np.testing.assert_allclose(helpers.product(W.T, expected), x, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("grid", [(20000, 1), (1, 40000)])
+def test_long_lines_need_more_than_an_item_has(device, grid):
+    W = Wavelet(device, grid, "haar")
+    x = gallery.vectors(grid[0] * grid[1], None)
+    a = helpers.product(W, x)
+    assert a[0] == pytest.approx(x.sum(dtype=np.float64) / np.sqrt(x.size), abs=1e-4)
+    np.testing.assert_allclose(helpers.product(W.T, a), x, rtol=0, atol=1e-5)
+
+
+def test_threads_share_a_basis(device):
+    W = Wavelet(device, (70, 90))
+    pictures = [gallery.vectors(6300, 2, seed) for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda x: helpers.product(W.T, helpers.product(W, x)), pictures))
+    np.testing.assert_allclose(found, pictures, rtol=0, atol=1e-5)
 
 
 def test_no_right_hand_side_is_none(device):

@@ -9,7 +9,7 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import InputError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Sum
+from ltcl.operators import CSR, Chained, Compressed, Dense, IdentityPlus, Ordered, Sum, Tiles, Wavelet
 from ltcl.solvers import coefficients
 from ltcl.solvers.cg import CG
 from ltcl.solvers.jacobi import Jacobi
@@ -215,3 +215,47 @@ def test_solutions_are_off_by_no_more_than_they_say(device, seed):
     assert off.max() > 0.05 * error  # the worst right-hand side is near it
     if error < 0.5:
         assert ltcl.solve(S, b, rtol=error).converged
+
+
+def _corner(device, basis):
+    """Two walls in wavelets, 578 pixels: too many for a direct solve of `auto`."""
+    scene = ltcl.scenes.dihedral(17, albedo=0.7)
+    T = scene.transport(first_bounce=scene.first_bounce, device=device)
+    R = T.systems[0].to_dense() - np.eye(T.shape[0])
+    W = basis(device, T.grid)
+    C = W.apply(device.upload(W.apply(device.upload(R)).get().T)).get().T
+    return R, W, scipy.sparse.csr_array(np.where(np.abs(C) > 2e-3, C, 0.0))
+
+
+def _ordered_wavelet(device, grid):
+    n = grid[0] * grid[1]
+    return Chained(Ordered(device, (1, n), np.arange(n)[::-1]), Wavelet(device, grid, "haar"))
+
+
+@pytest.mark.parametrize("columns", [(), (3,)])
+@pytest.mark.parametrize("kind", [CSR, Tiles])
+@pytest.mark.parametrize("basis", [Wavelet, _ordered_wavelet])
+def test_auto_plans_in_pixels_and_runs_on_coefficients(device, basis, kind, columns, monkeypatch):
+    R, W, C = _corner(device, basis)
+    core = kind(device, C)
+    S = IdentityPlus(Compressed(core, W, W))
+    truth = np.eye(len(R)) + W.to_dense().T @ core.to_dense() @ W.to_dense()
+    b = rng.uniform(0.0, 1.0, (len(R), *columns))
+    first = ltcl.solve(S, b, rtol=1e-3)  # makes the survey
+    assert first.method != "direct"
+    assert residual(truth, first.x, b) <= 1e-3 * (1 + 1e-2)
+    made = _counted(monkeypatch, ("W", W), ("core", core))
+    again = ltcl.solve(S, b, rtol=1e-3)
+    assert again.method == first.method
+    assert made == {"W": 2, "core": again.products}
+    exact = np.eye(len(R)) + R
+    refined = ltcl.solve(S, b, rtol=1e-5, exact=exact)
+    assert residual(exact, refined.x, b) <= 1e-5 * (1 + 5e-2)
+
+
+def test_sweeps_over_coefficients_need_rows(device):
+    _, W, C = _corner(device, Wavelet)
+    b = rng.uniform(0.0, 1.0, len(C.indptr) - 1)
+    assert ltcl.solve(IdentityPlus(Compressed(CSR(device, C), W, W)), b, "gauss_seidel").converged
+    with pytest.raises(InputError, match="reads S row by row, which Tiles does not allow"):
+        ltcl.solve(IdentityPlus(Compressed(Tiles(device, C), W, W)), b, "gauss_seidel")

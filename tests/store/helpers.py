@@ -52,6 +52,13 @@ def as_dense(T: Matrix) -> np.ndarray:
     return T if isinstance(T, np.ndarray) else T.toarray()
 
 
+def record_in(path: Path) -> Record:
+    """The matrices in a file."""
+    record = formats.read(path)
+    assert isinstance(record, Record)
+    return record
+
+
 def refusal(path: Path, kind: type[LtclError]) -> str:
     """Text behind the file's name of the error that reading `path` gives; it is one line."""
     with pytest.raises(kind) as error:

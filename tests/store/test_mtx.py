@@ -11,7 +11,7 @@ import scipy.sparse
 from ltcl.errors import FileError, MemoryLimitError
 from ltcl.store import formats
 from ltcl.store.record import Record
-from tests.store.helpers import as_dense, dense, refusal, same, sparse
+from tests.store.helpers import as_dense, dense, record_in, refusal, same, sparse
 
 COORDINATE = b"%%MatrixMarket matrix coordinate real general\n"
 ARRAY = b"%%MatrixMarket matrix array real general\n"
@@ -26,12 +26,12 @@ def test_records_come_back(tmp_path, matrix, grids, name):
     record = Record((matrix,), *grids)
     formats.write(tmp_path / name, record)
     assert [p.name for p in tmp_path.iterdir()] == [name]
-    same(formats.read(tmp_path / name), record)
+    same(record_in(tmp_path / name), record)
 
 
 def test_float32_comes_back_exactly_as_float64_would_round_to_it(tmp_path):
     formats.write(tmp_path / "T.mtx", Record((sparse(),)))
-    (result,) = formats.read(tmp_path / "T.mtx").matrices
+    (result,) = record_in(tmp_path / "T.mtx").matrices
     assert result.dtype == np.float64
     np.testing.assert_array_equal(as_dense(result).astype(np.float32), sparse().toarray())
 
@@ -45,7 +45,7 @@ def test_files_of_others_are_read(tmp_path, make, symmetry, field):
     scipy.io.mmwrite(
         tmp_path / "T.mtx", make(T), symmetry=symmetry, field=field, comment="ltcl knows nothing of me"
     )
-    (result,) = formats.read(tmp_path / "T.mtx").matrices
+    (result,) = record_in(tmp_path / "T.mtx").matrices
     np.testing.assert_array_equal(as_dense(result), T)
 
 

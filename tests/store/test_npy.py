@@ -11,7 +11,7 @@ import pytest
 from ltcl.errors import FileError, MemoryLimitError
 from ltcl.store import formats
 from ltcl.store.record import Record
-from tests.store.helpers import dense, refusal, same, sparse
+from tests.store.helpers import dense, record_in, refusal, same, sparse
 
 
 def header(descr: str, shape: str, fortran: str = "False", body: bytes = b"") -> bytes:
@@ -24,7 +24,7 @@ def header(descr: str, shape: str, fortran: str = "False", body: bytes = b"") ->
 def test_matrices_come_back(tmp_path, channels, M, dtype):
     record = Record(tuple(dense(M, 12, dtype, seed) for seed in range(channels)))
     formats.write(tmp_path / "T.npy", record)
-    same(formats.read(tmp_path / "T.npy"), record)
+    same(record_in(tmp_path / "T.npy"), record)
     assert np.load(tmp_path / "T.npy").shape == ((M, 12) if channels == 1 else (3, M, 12))  # NumPy agrees
 
 
@@ -45,7 +45,7 @@ def test_matrices_come_back(tmp_path, channels, M, dtype):
 def test_foreign_byte_orders_and_types_become_native_floats(tmp_path, stored, read, order):
     T = np.asarray(dense(4, 6).astype(stored), order=order)
     np.save(tmp_path / "T.npy", T)
-    (result,) = formats.read(tmp_path / "T.npy").matrices
+    (result,) = record_in(tmp_path / "T.npy").matrices
     assert result.dtype == np.dtype(read)
     assert result.dtype.isnative
     np.testing.assert_array_equal(result, T.astype(read))
@@ -59,7 +59,7 @@ def test_large_matrices_are_written_in_blocks(tmp_path):
 
 def test_a_single_channel_in_front_is_dropped(tmp_path):
     np.save(tmp_path / "T.npy", dense()[None])
-    same(formats.read(tmp_path / "T.npy"), Record((dense(),)))
+    same(record_in(tmp_path / "T.npy"), Record((dense(),)))
 
 
 def test_sparse_matrices_are_refused(tmp_path):
@@ -117,4 +117,4 @@ def test_an_honest_giant_is_a_matter_of_memory(tmp_path, monkeypatch):
     monkeypatch.setattr("ltcl.checks.host_memory", lambda: 79_999)
     assert "float32 (100, 100), needs 78.12 KiB" in refusal(tmp_path / "T.npy", MemoryLimitError)
     monkeypatch.setattr("ltcl.checks.host_memory", lambda: 80_000)
-    assert formats.read(tmp_path / "T.npy").shape == (100, 100)
+    assert record_in(tmp_path / "T.npy").shape == (100, 100)

@@ -15,7 +15,7 @@ import scipy.sparse
 from ltcl.errors import FileError, MemoryLimitError
 from ltcl.store import formats
 from ltcl.store.record import Record
-from tests.store.helpers import as_dense, dense, refusal, same, sparse
+from tests.store.helpers import as_dense, dense, record_in, refusal, same, sparse
 
 CSR = {"format": np.array(b"csr"), "shape": np.array([2, 3])}
 
@@ -58,7 +58,7 @@ def test_records_come_back(tmp_path, matrices, dtype, extras):
         rows, columns = record.shape
         record = Record(record.matrices, (3, 4), (1, rows), np.arange(columns, dtype=np.float64))
     formats.write(tmp_path / "T.npz", record)
-    same(formats.read(tmp_path / "T.npz"), record)
+    same(record_in(tmp_path / "T.npz"), record)
 
 
 def test_one_sparse_channel_is_readable_by_scipy(tmp_path):
@@ -81,7 +81,7 @@ def test_one_pattern_is_stored_once(tmp_path):
 def test_every_layout_of_scipy_is_read(tmp_path, layout, kind, compressed):
     T = getattr(scipy.sparse, f"{layout}_{kind}")(sparse(dtype="float64"))
     scipy.sparse.save_npz(tmp_path / "T.npz", T, compressed=compressed)
-    (result,) = formats.read(tmp_path / "T.npz").matrices
+    (result,) = record_in(tmp_path / "T.npz").matrices
     assert isinstance(result, scipy.sparse.csr_array)
     np.testing.assert_array_equal(result.toarray(), T.toarray())
 
@@ -97,26 +97,26 @@ def test_indices_of_any_integer_type_are_read(tmp_path, index):
         indices=T.indices.astype(index),
         indptr=T.indptr.astype(index),
     )
-    same(formats.read(tmp_path / "T.npz"), Record((T,)))
+    same(record_in(tmp_path / "T.npz"), Record((T,)))
 
 
 def test_coo_with_coords_is_read(tmp_path):
     T = sparse().tocoo()
     parts = {"data": T.data, "coords": np.array([T.row, T.col]), "shape": np.array(T.shape)}
     np.savez(tmp_path / "T.npz", format=b"coo", **parts)
-    same(formats.read(tmp_path / "T.npz"), Record((sparse(),)))
+    same(record_in(tmp_path / "T.npz"), Record((sparse(),)))
 
 
 def test_named_arrays_are_read(tmp_path):
     np.savez_compressed(tmp_path / "T.npz", T=dense(), grid=[3, 4], first_bounce=np.ones(12), noise=dense())
-    same(formats.read(tmp_path / "T.npz"), Record((dense(),), (3, 4), None, np.ones(12)))
+    same(record_in(tmp_path / "T.npz"), Record((dense(),), (3, 4), None, np.ones(12)))
     np.savez(tmp_path / "T.npz", dense(), grid=[3, 4], camera_grid=[2, 6], names=np.array(["a"]))
-    same(formats.read(tmp_path / "T.npz"), Record((dense(),), (3, 4), (2, 6)))
+    same(record_in(tmp_path / "T.npz"), Record((dense(),), (3, 4), (2, 6)))
 
 
 def test_unreadable_neighbours_of_the_only_matrix_do_not_matter(tmp_path):
     np.savez(tmp_path / "T.npz", light=dense(), notes=np.array([{"by": "me"}], object))
-    same(formats.read(tmp_path / "T.npz"), Record((dense(),)))
+    same(record_in(tmp_path / "T.npz"), Record((dense(),)))
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_an_archive_without_arrays_is_refused(tmp_path):
 
 def test_a_transport_traced_by_others_is_read(shared_data):
     given = shared_data / "transport-dihedral" / "transport.npz"
-    record = formats.read(given)
+    record = record_in(given)
     assert (record.shape, record.grid, record.first_bounce) == ((4096, 4096), (64, 64), None)
     T = as_dense(record.matrices[0])
     assert T.dtype == np.float32

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Operators as plain arrays: the same bits come back, and nothing that arrays say is believed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import (
+    CSR,
+    Chained,
+    Compressed,
+    Dense,
+    IdentityPlus,
+    Ordered,
+    Pyramid,
+    Shifted,
+    Sum,
+    Tiles,
+    Wavelet,
+    stored,
+)
+from tests import gallery
+from tests.operators import helpers
+
+GRID = (5, 7)
+N = 35
+NNZ = gallery.sparse(N, N).nnz
+
+
+def _core(device, kind, rows=N, columns=N, seed=0):
+    matrix = gallery.sparse(rows, columns, seed=seed)
+    if kind == "csr":
+        return CSR(device, matrix)
+    if kind == "dense":
+        return Dense(device, matrix.toarray())
+    width, precision = kind
+    return Tiles(device, matrix, width, precision)
+
+
+CORES = ["csr", "dense", (8, "bfloat16"), (16, "int8"), (1, "float16"), (8, "float32")]
+
+
+def _systems(device, core: Any = "csr"):
+    """Every kind of operator that can be kept."""
+    W = Wavelet(device, GRID, "db2")
+    C = Chained(
+        Ordered(device, (1, N), np.random.default_rng(0).permutation(N)), Wavelet(device, GRID, "haar", 1)
+    )
+    P = Pyramid(device, GRID)
+    M = P.shape[0]
+    return {
+        "core": IdentityPlus(_core(device, core)),
+        "rows": IdentityPlus(Compressed(_core(device, core), None, W), -1),
+        "two-sided": IdentityPlus(Compressed(_core(device, core), W, W, 0.25), solution_error=0.5),
+        "chained": IdentityPlus(Compressed(_core(device, core), C, C), weights=np.arange(1.0, N + 1)),
+        "pyramid": IdentityPlus(Compressed(_core(device, core, M, M), P, P, 0.1, diagonal=np.arange(N))),
+        "two": IdentityPlus(Compressed(_core(device, core), W, C), solution_error=np.inf),
+        "sum": IdentityPlus(Sum(_core(device, core), Compressed(_core(device, core, seed=1), W, W))),
+    }
+
+
+def _same(a: IdentityPlus, b: IdentityPlus) -> None:
+    assert (a.shape, a.sign, a.error, a.solution_error) == (b.shape, b.sign, b.error, b.solution_error)
+    assert a.nbytes == b.nbytes
+    assert (a.weights is None) == (b.weights is None)
+    if a.weights is not None and b.weights is not None:
+        np.testing.assert_array_equal(a.weights, b.weights)
+    for x in (gallery.vectors(N, None), gallery.vectors(N, 3)):
+        on_device = a.device.upload(x)
+        helpers.same_bits(b.apply(on_device).get(), a.apply(on_device).get())
+        helpers.same_bits(b.apply_transpose(on_device).get(), a.apply_transpose(on_device).get())
+
+
+@pytest.mark.parametrize("core", CORES, ids=str)
+@pytest.mark.parametrize("name", ["core", "rows", "two-sided", "chained", "pyramid", "two", "sum"])
+def test_the_same_bits_come_back(device, name, core):
+    S = _systems(device, core)[name]
+    arrays = stored.to_arrays([S])
+    assert all(array.dtype.kind in "fiuU" for array in arrays.values())
+    (again,) = stored.from_arrays(device, arrays)
+    _same(S, again)
+    if isinstance(S.R, Compressed) and isinstance(again.R, Compressed):
+        assert again.R.two_sided == S.R.two_sided
+        assert (again.R.known_diagonal is None) == (S.R.known_diagonal is None)
+
+
+def test_what_channels_share_is_kept_and_made_once(device):
+    W = Wavelet(device, GRID, "db2")
+    matrix = gallery.sparse(N, N)
+    others = [CSR(device, matrix * scale) for scale in (1, 2, 3)]
+    arrays = stored.to_arrays([IdentityPlus(Compressed(core, W, W)) for core in others])
+    assert sum(name.startswith("basis_") and name.endswith(".name") for name in arrays) == 1
+    found = [S.R for S in stored.from_arrays(device, arrays)]
+    assert len({R.into for R in found if isinstance(R, Compressed)}) == 1
+    assert len({R.core.pattern for R in found if isinstance(R, Compressed) and isinstance(R.core, CSR)}) == 1
+
+
+def test_more_than_ten_parts_keep_their_order(device):
+    S = IdentityPlus(Sum(*(Dense(device, np.full((2, 2), float(i))) for i in range(12))))
+    (again,) = stored.from_arrays(device, stored.to_arrays([S]))
+    assert isinstance(again.R, Sum)
+    assert [A.to_dense()[0, 0] for A in again.R.operators] == list(range(12))
+
+
+def test_other_operators_cannot_be_kept(device):
+    with pytest.raises(InputTypeError, match="R holds a Shifted, which cannot be kept"):
+        stored.to_arrays([IdentityPlus(Shifted(Dense(device, np.eye(3))))])
+
+
+def _two_sided(device):
+    return stored.to_arrays([_systems(device)["two-sided"]])
+
+
+BAD = {
+    "no kind": ({"system_0.R.kind": None}, "lack 'kind'"),
+    "no core": ({"system_0.R.core.kind": None}, "lack 'kind'"),
+    "another kind": ({"system_0.R.core.kind": np.array("pickle")}, "kind of a stored operator is 'pickle'"),
+    "no values": ({"system_0.R.core.data": None}, "lack 'data'"),
+    "column beyond": ({"system_0.R.core.indices": np.full(NNZ, 35, np.int32)}, "holds 35; column indices"),
+    "column before": ({"system_0.R.core.indices": np.full(NNZ, -1, np.int32)}, "holds -1; column indices"),
+    "columns of reals": ({"system_0.R.core.indices": np.full(NNZ, 1.0)}, "vector of integers"),
+    "falling pointers": ({"system_0.R.core.indptr": np.r_[0, 5, 3, np.full(33, NNZ)]}, "falls after entry 1"),
+    "short pointers": ({"system_0.R.core.indptr": np.array([0])}, "indptr has 1 entries"),
+    "no pointers": ({"system_0.R.core.indptr": np.array([], np.int64)}, "indptr has 0 entries"),
+    "another length": ({"system_0.R.core.data": np.ones(3, np.float32)}, "the three must agree"),
+    "another shape": ({"system_0.R.core.shape": np.array([35, 1 << 62])}, "into has 35 coefficients"),
+    "a shape of one": ({"system_0.R.core.shape": np.array([35])}, "do not fit"),
+    "NaN": ({"system_0.R.core.data": np.full(NNZ, np.nan, np.float32)}, "NaN"),
+    "words for values": ({"system_0.R.core.data": np.full(NNZ, "a")}, "must hold real numbers"),
+    "basis that is not there": ({"system_0.R.out": np.array(7)}, "lack grid and name"),
+    "half a basis": ({"system_0.R.out": np.array([0, 0])}, "do not fit"),
+    "basis of another grid": ({"basis_0.grid": np.array([6, 6])}, "36 coefficients, but the core"),
+    "biorthogonal": ({"basis_0.name": np.array("bior2.2")}, "bior2.2"),
+    "too many levels": ({"basis_0.levels": np.array(99)}, "levels is 99"),
+    "sign": ({"system_0.sign": np.array(3.0)}, "sign is 3.0"),
+    "error below 0": ({"system_0.R.error": np.array(-1.0)}, "error of a stored operator is -1.0"),
+    "solution error NaN": ({"system_0.solution_error": np.array(np.nan)}, "solution_error is nan"),
+    "weights of no one": ({"system_0.weights": np.zeros(N)}, "not all positive"),
+    "weights of others": ({"system_0.weights": np.ones(3)}, r"weights has shape \(3,\)"),
+    "diagonal": ({"system_0.R.diagonal": np.ones(2)}, r"diagonal has shape \(2,\)"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_arrays_are_refused_in_one_line(device, name):
+    changes, part = BAD[name]
+    arrays = {**_two_sided(device), **{key: value for key, value in changes.items() if value is not None}}
+    for key, value in changes.items():
+        if value is None:
+            del arrays[key]
+    with pytest.raises((InputError, InputTypeError), match=part) as caught:
+        stored.from_arrays(device, arrays)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["pointers", "starts", "codes", "layout", "shape", "unit"])
+def test_bad_tiles_are_refused(device, name):
+    arrays = stored.to_arrays([_systems(device, (8, "int8"))["two-sided"]])
+    key = f"system_0.R.core.{name}"
+    with pytest.raises(InputError):
+        stored.from_arrays(device, {**arrays, key: arrays[key].ravel()[:0]})
+    with pytest.raises(InputError):
+        stored.from_arrays(device, {other: array for other, array in arrays.items() if other != key})
+
+
+def test_what_is_nested_without_end_is_refused(device):
+    deep = {"system_0.sign": np.array(1.0), "system_0.solution_error": np.array(0.0)}
+    prefix = "system_0.R"
+    for _ in range(50):
+        deep |= {f"{prefix}.kind": np.array("sum"), f"{prefix}.error": np.array(0.0)}
+        prefix += ".part_0"
+    with pytest.raises(InputError, match="nested more than 4 deep"):
+        stored.from_arrays(device, deep)
+    arrays = _two_sided(device)
+    chain = {f"basis_0.{'outer.' * 5000}name": np.array("db2")}
+    with pytest.raises(InputError):
+        stored.from_arrays(device, {**arrays, **chain})
+    odd = {f"system_0.R.part_{i}": np.array(1.0) for i in ("x", "1.y")}
+    with pytest.raises(InputError):
+        stored.from_arrays(device, {**arrays, **odd, "system_0.R.kind": np.array("sum")})
