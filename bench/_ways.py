@@ -34,7 +34,7 @@ DROPPED = 0.7e-2  # of the error, what compression may take; the iteration has t
 TOLERANCES = 0.5 ** np.arange(1, 12, 0.5)
 THRESHOLD, FINE = 1e-4, 5e-4  # of numbers of A; of R before it is thresholded
 MOST = 128  # wavelets a row from which the largest are chosen
-MEMORY, OFTEN = 1 << 31, 20.0  # bytes for a block; seconds from one word about progress to the next
+MEMORY, OFTEN = 1 << 28, 20.0  # bytes for a block; seconds from one word about progress to the next
 note = Console(stderr=True).print
 
 

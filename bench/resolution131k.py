@@ -43,7 +43,7 @@ THRESHOLD, RTOL = 1e-4, 5e-4  # of numbers of A; of solutions with R
 ERROR, SEPARATION = 1e-2, 2e-4  # wanted; of the solves from which bounces come, which are small beside them
 BOUNCES, PROBES = 2, 64
 PAPER_PRODUCT, PAPER_PICTURE, TARGET = 33.0, 3000.0, 17.0  # ms; the paper's of one colour channel
-MEMORY = 1 << 31
+MEMORY = 1 << 28  # bytes of a block of rows
 note = Console(stderr=True).print
 
 
