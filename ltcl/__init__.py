@@ -5,6 +5,7 @@ A projector lights a concave, coloured scene; light bounces before the camera se
 ltcl undoes the bounces with matrix-vector products only.
 
     T = ltcl.load("transport.npz")             # measured, or ltcl.scenes.box(40, sides=3).transport()
+    T = ltcl.compress(T, rtol=1e-2)            # few numbers instead of N^2, solutions within 1 %
     c = ltcl.compensate(T, desired)            # c.pattern makes the wall look like `desired`
     b = ltcl.separate(T, image)                # b.direct, b.bounces: each bounce as its own picture
 
@@ -15,6 +16,7 @@ The house, from the ground up; imports point down only:
     transport, theory, solvers      T = S F; what can be forecast; one algorithm per file
     exact, parts                    a compressed T beside the one it stands for; as the arrays of a file
     compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
+    compression                     T in few numbers, with a bound on what solutions lose
     images, layout, report          pictures, pictures as right-hand sides, JSON
     plots, batch, demo, cli         what people look at; many frames
 
@@ -30,11 +32,12 @@ from typing import TYPE_CHECKING, Any
 from ltcl import errors
 from ltcl.analysis import Analysis, analyze
 from ltcl.compensation import Compensation, compensate
+from ltcl.compression import Compression, compress, invert
 from ltcl.device import Device, list_devices, open_device
 from ltcl.relighting import relight
 from ltcl.separation import Separation, separate
-from ltcl.solvers import Solution, Status, solve
-from ltcl.store import load, save
+from ltcl.solvers import Inverse, Solution, Status, solve
+from ltcl.store import load, load_inverse, save, save_inverse
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
@@ -44,7 +47,9 @@ __version__ = "0.1.0"
 __all__ = [
     "Analysis",
     "Compensation",
+    "Compression",
     "Device",
+    "Inverse",
     "Separation",
     "Solution",
     "Status",
@@ -52,15 +57,19 @@ __all__ = [
     "analyze",
     "batch",
     "compensate",
+    "compress",
     "errors",
     "images",
+    "invert",
     "list_devices",
     "load",
+    "load_inverse",
     "open_device",
     "operators",
     "plots",
     "relight",
     "save",
+    "save_inverse",
     "scenes",
     "separate",
     "solve",

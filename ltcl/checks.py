@@ -6,6 +6,7 @@ Everything here runs on the host before anything is built, uploaded or overwritt
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable
 from typing import Any
@@ -198,6 +199,21 @@ def size(nbytes: float) -> str:
             return f"{nbytes:.4g} {unit}"
         nbytes /= 1024
     return f"{nbytes:.4g} TiB"
+
+
+def upwards(error: float) -> str:
+    """Two digits, rounded up, so that asking for what is shown is enough.
+
+    >>> upwards(0.00421), upwards(0.0042), upwards(2.0)
+    ('0.0043', '0.0042', '2')
+    """
+    if not 0.0 < error < math.inf:
+        return f"{error:g}"
+    shown = float(f"{error:.1e}")
+    if shown < error:
+        unit = 10.0 ** (math.floor(math.log10(error)) - 1)
+        shown += unit
+    return f"{shown:.2g}"
 
 
 def _as_float(value: Any) -> float:

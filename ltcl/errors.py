@@ -7,10 +7,7 @@ A message is one line: it names the argument, says what it was and what it must 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from ltcl.solvers.result import Solution
+from typing import Any
 
 
 class LtclError(Exception):
@@ -38,8 +35,11 @@ class DeviceError(LtclError, RuntimeError):
 
 
 class ConvergenceError(LtclError, ArithmeticError):
-    """A solve did not reach its tolerance. `solution` holds the best iterate and the history."""
+    """A solve did not reach its tolerance. `solution` holds the best iterate and the history.
 
-    def __init__(self, message: str, solution: Solution) -> None:
+    That is a `Solution`, or what else the function that raised returns.
+    """
+
+    def __init__(self, message: str, solution: Any) -> None:
         super().__init__(message)
         self.solution = solution

@@ -28,6 +28,19 @@ def find(matrices: Sequence[Any], wanted: Any) -> np.ndarray:
     return np.broadcast_to(F, (len(matrices), n))
 
 
+def undone(columns: Sequence[np.ndarray], F: np.ndarray, mixing: np.ndarray | None) -> list[np.ndarray]:
+    """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 where F is.
+
+    >>> undone([np.array([[0.2], [0.3]])], np.array([[0.5, 0.0]]), None)[0].tolist()
+    [[0.4], [0.0]]
+    """
+    light = [
+        np.divide(l_d, f[:, None], out=np.zeros(l_d.shape), where=f[:, None] > 0)
+        for l_d, f in zip(columns, F, strict=True)
+    ]
+    return light if mixing is None else list(np.einsum("ij,jnk->ink", np.linalg.inv(mixing), light))
+
+
 def too_large(matrix: Any) -> bool:
     """Whether "exact" would invert more than the host has memory for."""
     n = matrix.shape[0]

@@ -63,6 +63,7 @@ def solution(solved: Solution | tuple[Solution, ...]) -> list[dict[str, Any]]:
             "residuals": list(one.residuals),
             "seconds": one.seconds,
             "reason": one.reason,
+            "error": one.error,
             "standard_error": _spread(one.standard_error),
         }
         for one in (solved if isinstance(solved, tuple) else (solved,))

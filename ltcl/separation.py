@@ -17,23 +17,29 @@ light away, or that is far from reciprocal, gives such a scene away: the result 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks, layout
+from ltcl.errors import InputTypeError
 from ltcl.exact import beside
 from ltcl.single_view import negative_bounces
-from ltcl.solvers import Solution, sampled, solve_each
+from ltcl.solvers import Inverse, Solution, sampled, solve_each
+from ltcl.solvers.precomputed import require_inverse
 from ltcl.solvers.solve import SAMPLED
 from ltcl.transport import Transport, require
 
 logger = logging.getLogger(__name__)
+Parts = list[np.ndarray]  # (N, k) of each channel
 
 # Of a scene taken for Lambertian: noise of path tracing alone gives a defect of 0.05 and takes 0.0004.
 LARGEST_DEFECT = 0.1
 LARGEST_NEGATIVE = 0.005
+_RTOL = 1e-3
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -82,8 +88,9 @@ def separate(
     bounces: int = 4,
     *,
     method: str = "auto",
-    rtol: float = 1e-3,
+    rtol: float | None = None,
     exact: Transport | None = None,
+    inverse: Inverse | None = None,
     **options: Any,
 ) -> Separation:
     """Split an image of the scene into direct light and bounces.
@@ -97,9 +104,12 @@ def separate(
     bounces : int
         How many indirect bounces to tell apart.
     method, rtol, **options
-        Of `ltcl.solve`; rtol is per bounce.
+        Of `ltcl.solve`; rtol is per bounce, 1e-3 when not given, or what a compressed T or an inverse is
+        off by where that is more.
     exact : Transport, optional
         What a compressed T stands for: T then solves, to any `rtol`, and all that is told is of `exact`.
+    inverse : Inverse, optional
+        Of T, as `ltcl.invert` makes it: each bounce is then one product, and `rtol` the error it may have.
 
     Returns
     -------
@@ -109,7 +119,7 @@ def separate(
     ------
     InputError
         A rectangular T, shapes that do not fit, a negative number of bounces, an `rtol` below the error of
-        a compressed T without `exact`.
+        a compressed T without `exact`, or below that of `inverse`, or an inverse of another transport.
     ConvergenceError
         A solve did not reach `rtol`.
 
@@ -129,7 +139,12 @@ def separate(
     pictures = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
     true, judges = beside(T, exact)
-    chain = _chain(T, columns, bounces, method, {**options, "rtol": rtol, "exact": judges})
+    if inverse is not None:
+        _check_inverse(T, inverse, method, rtol, exact, options)
+    if rtol is None:
+        rtol = max(_RTOL, inverse.error if inverse is not None else T.error if exact is None else 0.0)
+    undo = partial(_undo, T, inverse, method, {"rtol": rtol, **options, "exact": judges})
+    chain = _chain(undo, columns, bounces)
 
     def picture(parts: list[np.ndarray]) -> np.ndarray:
         return shape.pack(parts, T.grid).astype(np.float32)
@@ -149,6 +164,16 @@ def separate(
         negative_bounce=negative,
         warning=warning,
     )
+
+
+def _check_inverse(
+    T: Transport, inverse: Any, method: str, rtol: float | None, exact: Any, options: dict[str, Any]
+) -> None:
+    require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
+    unknown = [name for name in options if name not in ("callback", "throw")]
+    if unknown:
+        name = unknown[0]
+        raise InputTypeError(f"option {name!r} is given, but with inverse there is no solve that takes it")
 
 
 def _warning(defect: float, negative: float, error: float) -> str:
@@ -178,12 +203,20 @@ class _Chain:
     solutions: list[tuple[Solution, ...]]
 
 
-def _chain(
-    T: Transport, columns: list[np.ndarray], bounces: int, method: str, options: dict[str, Any]
-) -> _Chain:
+def _undo(
+    T: Transport, inverse: Inverse | None, method: str, options: dict[str, Any], left: Parts, k: int
+) -> tuple[Solution, ...]:
+    """S^-1 of what is `left` of each channel, for bounce k."""
+    if inverse is not None:
+        return tuple(inverse.solve(l, channel) for channel, l in enumerate(left))
+    return solve_each(T.systems, left, method, **_fresh(method, options, k))
+
+
+def _chain(undo: Callable[[Parts, int], tuple[Solution, ...]], columns: Parts, bounces: int) -> _Chain:
+    """`undo` is S^-1 of what is left, for bounce k."""
     found, solutions, left = [], [], [l_out.astype(np.float64) for l_out in columns]
     for k in range(bounces + 1):
-        solutions.append(solve_each(T.systems, left, method, **_fresh(method, options, k)))
+        solutions.append(undo(left, k))
         found.append([solution.x.astype(np.float64) for solution in solutions[-1]])
         left = [l - b_k for l, b_k in zip(left, found[-1], strict=True)]
     return _Chain(found, left, solutions)

@@ -62,6 +62,8 @@ class Transport:
         Projector pixels dropped by ``on_dark="mask"``, in any channel.
     first_bounce_error : array like first_bounce, or None
         Standard error of an estimated first bounce.
+    compression : ltcl.Compression or None
+        How `ltcl.compress` made it.
 
     Raises
     ------
@@ -102,6 +104,7 @@ class Transport:
         self._device: Device | None = device_of(self.blocks or [self.matrices], device)
         self._systems: tuple[IdentityPlus, ...] | None = None
         self._forward: tuple[Operator, ...] | None = None
+        self.compression: Any = None
         self.masked: np.ndarray = np.zeros(self.shape[1], bool)
         self._first_bounce: np.ndarray | None = None
         self.first_bounce_error: np.ndarray | None = None
@@ -231,15 +234,7 @@ class Transport:
 
     def to_light(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 at masked pixels."""
-        light = [
-            np.divide(l_d, F[:, None], out=np.zeros(l_d.shape), where=F[:, None] > 0)
-            for l_d, F in zip(columns, self._require_first_bounce(), strict=True)
-        ]
-        return (
-            light
-            if self.mixing is None
-            else list(np.einsum("ij,jnk->ink", np.linalg.inv(self.mixing), light))
-        )
+        return first_bounces.undone(columns, self._require_first_bounce(), self.mixing)
 
     def _find_first_bounce(self, wanted: Any, probes: int, seed: int) -> np.ndarray:
         checks.count("probes", probes, least=2)

@@ -23,7 +23,9 @@ def test_the_examples_of(name, monkeypatch, tmp_path):
     assert failed == 0, "see the report above"
 
 
-@pytest.mark.parametrize("name", ["Transport", "analyze", "compensate", "relight", "separate", "solve"])
+@pytest.mark.parametrize(
+    "name", ["Transport", "analyze", "compensate", "invert", "relight", "separate", "solve"]
+)
 def test_the_public_tasks_have_an_example(name):
     examples = doctest.DocTestFinder(recurse=False).find(getattr(ltcl, name))
     assert sum(len(found.examples) for found in examples) > 0

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from ltcl.device import Device
+from ltcl.operators import Wavelet
 from ltcl.scenes import box, dihedral
 
 BENCH = Path(__file__).resolve().parents[1] / "bench"
@@ -116,3 +117,51 @@ def test_light_field_sums_every_bounce(load: Callable[[str], Any]) -> None:
     A = np.array([[0.1, 0.4], [0.2, 0.3]])
     found = load("fig6").LightField(A) @ np.array([1.0, 2.0])
     np.testing.assert_allclose(found, np.linalg.solve(np.eye(2) - A, [1.0, 2.0]), rtol=1e-7)
+
+
+def test_a_slope_is_that_above_the_launch_floor(load: Callable[[str], Any]) -> None:
+    pixels = np.array([2, 20, 200, 2000, 20000, 200000])
+    found = load("fig7").law(pixels, 1e-3 + 1e-9 * pixels**1.5)
+    # Only the largest takes five times the floor, which is the time of the smallest; three count at least.
+    assert (found.start, found.count) == (2000, 3)
+    assert found.slope == pytest.approx(1.5, abs=1e-4)
+    np.testing.assert_allclose(found(pixels), 1e-3 + 1e-9 * pixels**1.5, rtol=1e-4)
+
+
+def test_a_slope_begins_behind_the_last_time_near_the_floor(load: Callable[[str], Any]) -> None:
+    pixels = np.array([1, 10, 100, 1000, 10000, 100000])
+    spent = 1e-3 + 1e-3 * pixels**2.0
+    spent[0] = 1e-3
+    assert load("fig7").law(pixels, spent).count == 5
+    spent[2] = 2e-3  # a slow moment before it must not begin the slope
+    found = load("fig7").law(pixels, spent)
+    assert (found.start, found.count) == (1000, 3)
+    assert found.slope == pytest.approx(2.0)
+
+
+def test_what_does_not_rise_above_the_launch_floor_has_no_slope(load: Callable[[str], Any]) -> None:
+    found = load("fig7").law(np.array([2, 20, 200, 2000]), np.array([1e-3, 1.1e-3, 0.9e-3, 1e-3]))
+    assert (found.slope, found(np.array([5.0]))) == (0.0, 1e-3)
+
+
+def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any) -> None:
+    at = load("_ways").problem(3)
+    truth = at.l_out - dihedral(3, albedo=0.8).A @ at.l_out
+    np.testing.assert_allclose(at.l_d, truth, rtol=1e-6)
+    found = load("fig7").ways(given, at)
+    assert sorted(found) == ["both", "iteration", "peer", "rows", "series"]
+    for way in found.values():
+        l_d = way.run()
+        assert np.linalg.norm(l_d - truth) <= 1e-2 * np.linalg.norm(truth)
+        assert way.error == pytest.approx(np.linalg.norm(l_d - truth) / np.linalg.norm(truth), rel=1e-3)
+
+
+def test_rows_in_wavelets_are_those_of_R(load: Callable[[str], Any], given: Any) -> None:
+    ways = load("_ways")
+    at = ways.problem(3)
+    R = ways.dense(given, at).R.to_dense()
+    W = Wavelet(given.device, at.rows.grid, "db2").to_dense()
+    both = ways.of_both(given, at)
+    size = float(np.linalg.norm(R))
+    np.testing.assert_allclose(both.toarray(), W @ R @ W.T, atol=1e-3 * size)
+    np.testing.assert_allclose(ways.of_rows(given, at, both).toarray(), R @ W.T, atol=2e-3 * size)

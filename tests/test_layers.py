@@ -32,6 +32,7 @@ LAYERS: list[set[str]] = [
     {"solvers", "exact", "parts"},
     {
         "compensation",
+        "compression",
         "single_view",
         "separation",
         "relighting",

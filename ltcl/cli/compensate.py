@@ -44,6 +44,13 @@ _WEIGHTS = Annotated[
 ]
 _LOW = Annotated[float, typer.Option(metavar="LIGHT", help="Darkest light of the projector.")]
 _HIGH = Annotated[float, typer.Option(metavar="LIGHT", help="Brightest light of the projector.")]
+_CLAMP = Annotated[
+    bool,
+    typer.Option(
+        "--clamp",
+        help="Clamp what exceeds the projector's light, and do not make up for it elsewhere: quick.",
+    ),
+]
 _BACKGROUND = Annotated[
     Path | None,
     typer.Option(
@@ -113,6 +120,7 @@ def run(
     camera_grid: options.CameraGrid = None,
     method: options.Method = "auto",
     rtol: options.Rtol = 1e-2,
+    inverse: options.Inverse = None,
     samples: options.Samples = None,
     seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
@@ -121,6 +129,7 @@ def run(
     loss: _LOSS = None,
     low: _LOW = 0.0,
     high: _HIGH = 1.0,
+    clamp: _CLAMP = False,
     background: _BACKGROUND = None,
     weights: _WEIGHTS = None,
     resize: options.Resize = False,
@@ -158,6 +167,7 @@ def run(
         first_bounce=first_bounce,
         on_dark=on_dark,
     )
+    known = transports.load_inverse(inverse, T)
     reader = pictures.Reader(T.camera_grid, "the camera", encoding, resize)
     desired = {} if source else reader.read_all(picture)
     dark, counts = (None if file is None else reader.read(file) for file in (background, weights))
@@ -169,6 +179,7 @@ def run(
         camera_grid=camera_grid,
         method=method,
         rtol=rtol,
+        inverse=inverse,
         **drawn,
         first_bounce=first_bounce,
         on_dark=on_dark,
@@ -176,6 +187,7 @@ def run(
         loss=loss,
         low=low,
         high=high,
+        clamp=clamp,
         background=background,
         weights=weights,
         resize=resize,
@@ -184,6 +196,7 @@ def run(
     )
     settings: dict[str, Any] = {"bounds": (low, high), "gain": gain, "loss": loss, "method": method}
     settings |= {"rtol": rtol, **drawn, "background": dark, "weights": counts}
+    settings |= {"inverse": known, "clamp": clamp}
     if source:
         settings |= {"resize": resize, "encoding": encoding}
         done = compensate_frames.run(T, source, out, {**film, **settings})

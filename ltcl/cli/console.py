@@ -103,7 +103,7 @@ class Steps:
     def __init__(self, items: int, solves: int = 1, *, patient: bool = True) -> None:
         self._items, self._solves = items, solves
         self._item = self._solve = 0
-        self._name, self._said = "", 0.0
+        self._name, self._doing, self._said = "", "", 0.0
         self._quiet_until = time.monotonic() + _PATIENCE if patient else 0.0
         console = Console(stderr=True)
         self._is_terminal = console.is_terminal
@@ -133,6 +133,13 @@ class Steps:
         self._bar.update(self._task, description=counted, completed=done, text="")
         self._name = counted
         self._say(counted, 0.0)
+
+    def at(self, text: str, share: float) -> None:
+        """A `progress` for this item: what is being done, and the share that is."""
+        if text != self._doing:
+            self._say(text, 0.0)
+        self._doing = text
+        self._bar.update(self._task, completed=(self._item - 1 + share) * self._solves, text=text)
 
     def solve(self, rtol: float) -> Callable[[int, float], None]:
         """A `callback` for the solves of this item: moves the bar by the digits gained."""

@@ -16,7 +16,20 @@ import typer
 from typer.core import TyperGroup
 
 from ltcl import __version__
-from ltcl.cli import analyze, compensate, console, convert, demo, devices, doctor, info, relight, separate
+from ltcl.cli import (
+    analyze,
+    compensate,
+    compress,
+    console,
+    convert,
+    demo,
+    devices,
+    doctor,
+    info,
+    invert,
+    relight,
+    separate,
+)
 from ltcl.errors import LtclError
 
 
@@ -88,7 +101,19 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (devices, doctor, demo, info, analyze, convert, compensate, separate, relight):
+for command in (
+    devices,
+    doctor,
+    demo,
+    info,
+    analyze,
+    convert,
+    compress,
+    invert,
+    compensate,
+    separate,
+    relight,
+):
     app.command(command.__name__.rpartition(".")[2])(command.run)
 
 

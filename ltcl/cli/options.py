@@ -98,6 +98,14 @@ Device = Annotated[
 ]
 Method = Annotated[str, typer.Option(callback=_method, metavar="NAME", help=f"One of {', '.join(METHODS)}.")]
 Rtol = Annotated[float, typer.Option(metavar="FRACTION", help="Relative residual at which a solve is done.")]
+Inverse = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="What 'ltcl invert' made of the transport: then each picture takes one product and no solve.",
+        show_default=False,
+    ),
+]
 Samples = Annotated[
     int | None,
     typer.Option(

@@ -24,6 +24,7 @@ def run(
     grid: options.Grid = None,
     method: options.Method = "auto",
     rtol: options.Rtol = 1e-3,
+    inverse: options.Inverse = None,
     samples: options.Samples = None,
     seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
@@ -43,6 +44,7 @@ def run(
 
     drawn = options.sampling(method, samples, seed)
     T = transports.load(transport, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
+    known = transports.load_inverse(inverse, T)
     seen = pictures.Reader(T.grid, "the camera", encoding, resize).read_all(picture)
     text = transports.heading(
         "separate",
@@ -52,6 +54,7 @@ def run(
         grid=grid,
         method=method,
         rtol=rtol,
+        inverse=inverse,
         **drawn,
         first_bounce=first_bounce,
         on_dark=on_dark,
@@ -64,7 +67,7 @@ def run(
     with console.Steps(len(seen), solves) as steps, results.fill(out, text) as folder:
         for (name, image), file in zip(seen.items(), picture, strict=True):
             steps.item(file.name)
-            settings = {"method": method, "rtol": rtol, **drawn}
+            settings = {"method": method, "rtol": rtol, "inverse": known, **drawn}
             done = separate(T, image, bounces, callback=steps.solve(rtol), **settings)
             # Several pictures get a folder each.
             place = f"{name}/" if len(seen) > 1 else ""

@@ -10,6 +10,7 @@ from ltcl import report, store
 from ltcl.cli import console
 from ltcl.device import open_device
 from ltcl.errors import FileError
+from ltcl.solvers import Inverse
 from ltcl.store import formats
 from ltcl.transport import Transport
 
@@ -41,6 +42,11 @@ def load(
     if dark and needs != "T":  # relighting needs no first bounce
         console.note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
     return T
+
+
+def load_inverse(path: Path | None, T: Transport) -> Inverse | None:
+    """The inverse in a file, on the device of T; None where there is no file."""
+    return None if path is None else store.load_inverse(path, device=T.device)
 
 
 def _require_square(path: Path) -> None:

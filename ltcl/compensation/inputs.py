@@ -19,7 +19,7 @@ from ltcl.transport import Transport
 logger = logging.getLogger(__name__)
 
 Columns = list[np.ndarray]
-_OWN = ("bounds", "background", "gain", "loss", "weights", "method", "rtol", "exact")
+_OWN = ("bounds", "background", "gain", "loss", "weights", "exact", "inverse", "clamp", "method", "rtol")
 _OPTIONS = ("atol", "maxiter", "callback", "throw")  # of `ltcl.solve`, that a solve within bounds has, too
 
 _LEAST_LOSS = 1e-6
@@ -57,6 +57,14 @@ def gain(value: Any, loss: Any) -> float | None:
     if loss is not None:
         raise InputError(f"loss is {loss!r}, but gain is {value!r}; a loss is of use with gain='auto' only")
     return found
+
+
+def clamp(value: Any, T: Transport) -> None:
+    """Refuse what is no yes or no, and light that nothing but a solve within the bounds finds."""
+    if not isinstance(value, bool):
+        raise InputTypeError(f"clamp is {_shown(value)}; it must be True or False")
+    if value and not T.is_square:
+        raise InputError("clamp is True, but this T has no S; its light is found within the bounds only")
 
 
 def desired(value: Any, T: Transport) -> tuple[Columns, layout.Layout]:

@@ -16,7 +16,7 @@ import numpy as np
 from ltcl.compensation import gain as gains
 from ltcl.compensation.problem import Problem
 from ltcl.operators import IdentityPlus
-from ltcl.solvers import Solution, solve_each
+from ltcl.solvers import Inverse, Solution, solve_each
 from ltcl.transport import Transport
 
 Columns = list[np.ndarray]
@@ -38,13 +38,14 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Inverse:
-    """S^-1 of every channel of T, with the method and options of `ltcl.solve`."""
+class Backward:
+    """S^-1 of every channel of T: solves with a method and options, or an inverse that is kept."""
 
     T: Transport
     method: str
     options: dict[str, Any] = field(default_factory=dict)
     exact: tuple[IdentityPlus | None, ...] = ()  # what a compressed S stands for, in every channel
+    inverse: Inverse | None = None
 
     def light(self, parts: Columns) -> Columns:
         """Projector light, one array a system, of one solution a channel."""
@@ -53,10 +54,12 @@ class Inverse:
     def __call__(self, parts: Columns) -> tuple[Solution, ...]:
         """One solution a channel, of one target a system."""
         parts = self.T.split(parts)
+        if self.inverse is not None:
+            return tuple(self.inverse.solve(b, channel) for channel, b in enumerate(parts))
         return solve_each(self.T.systems, parts, self.method, exact=self.exact, **self.options)
 
 
-def at_gain(inverse: Inverse, problem: Problem, gain: float) -> Start:
+def at_gain(inverse: Backward, problem: Problem, gain: float) -> Start:
     """Of a given gain."""
     if not inverse.T.is_square:
         k = problem.desired[0].shape[1]
@@ -69,7 +72,7 @@ def at_gain(inverse: Inverse, problem: Problem, gain: float) -> Start:
     return Start(gain, light, solutions, meets=not counted)
 
 
-def at_largest_gain(inverse: Inverse, problem: Problem, loss: float | None, exactly: bool) -> Start:
+def at_largest_gain(inverse: Backward, problem: Problem, loss: float | None, exactly: bool) -> Start:
     """Of the largest gain within `loss`; where that is None, within reach `exactly` if there is one.
 
     Light is affine in the gain: desired and background are solved side by side, once.

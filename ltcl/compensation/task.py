@@ -17,10 +17,11 @@ from ltcl import layout
 from ltcl.compensation import inputs
 from ltcl.compensation.problem import Limits, Problem, systems
 from ltcl.compensation.result import Compensation
-from ltcl.compensation.start import Inverse, Start, at_gain, at_largest_gain
+from ltcl.compensation.start import Backward, Start, at_gain, at_largest_gain
 from ltcl.errors import ConvergenceError
 from ltcl.exact import beside
-from ltcl.solvers import Bounded, Status
+from ltcl.solvers import Bounded, Inverse, Status
+from ltcl.solvers.precomputed import require_inverse
 from ltcl.transport import Transport, require
 
 _EXPLAINED = 3.0  # times the root mean square of an error: few of a solve's are larger
@@ -39,6 +40,8 @@ def compensate(
     method: str = "auto",
     rtol: float = 1e-2,
     exact: Transport | None = None,
+    inverse: Inverse | None = None,
+    clamp: bool = False,
     **options: Any,
 ) -> Compensation:
     """Find the projector pattern under which the scene looks most like `desired`.
@@ -69,6 +72,12 @@ def compensate(
         `error` and `gap`, and makes the gain that gain="auto" finds smaller.
     exact : Transport, optional
         What a compressed T stands for: T then solves, to any `rtol`, and everything else is of `exact`.
+    inverse : Inverse, optional
+        Of T, as `ltcl.invert` makes it: the light without bounds is then one product, whatever the method.
+    clamp : bool
+        Clamp the light to the bounds where it exceeds them, and leave it at that: quick, for videos. What is
+        lost is the light by which other pixels would make up for it; `error` tells how far off that is, and
+        `gap` is the whole error, since nothing is proved.
 
     Returns
     -------
@@ -80,7 +89,7 @@ def compensate(
     InputError
         Shapes that do not fit, bounds in the wrong order, a gain that is not positive, weights below 0, no
         gain that keeps the picture within `loss`, or an `rtol` below the error of a compressed T without
-        `exact`.
+        `exact`, or below that of `inverse`, or an inverse of another transport.
     ConvergenceError
         A solve did not reach `rtol` in `maxiter` steps, or not at all. Within the bounds, where float32 is
         too coarse to prove it, the best that was found comes back, and `gap` tells what is proved.
@@ -107,24 +116,27 @@ def compensate(
     counts = inputs.weights(weights, T, shape, wanted)
     rules = inputs.rules(T, method, rtol, options)
     wanted, dark = T.join(wanted), T.join(dark)
+    if inverse is not None:
+        require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
+    inputs.clamp(clamp, T)
     true, judges = beside(T, exact)
     problem = Problem(systems(true), wanted, dark, None if counts is None else T.join(counts), limits, rules)
-    inverse = Inverse(T, method, {"rtol": rtol, **options}, judges)
+    backward = Backward(T, method, {"rtol": rtol, **options}, judges, inverse)
     if sought is not None:
-        start = at_gain(inverse, problem, sought)
+        start = at_gain(backward, problem, sought)
     else:
-        start = at_largest_gain(inverse, problem, loss, exactly=weights is None)
-    light, limited = _within(problem, start, options.get("throw", True))
+        start = at_largest_gain(backward, problem, loss, exactly=weights is None)
+    light, limited = _within(problem, start, options.get("throw", True), clamp)
     return _result(true, problem, shape, start, light, limited)
 
 
-def _within(problem: Problem, start: Start, throw: bool) -> tuple[Columns, list[Bounded | None]]:
+def _within(problem: Problem, start: Start, throw: bool, clamp: bool) -> tuple[Columns, list[Bounded | None]]:
     """Light within the limits, and the solve that it took of each system, None where it took none."""
     light: Columns = []
     limited: list[Bounded | None] = []
     for which, free in enumerate(start.light):
         nearest, found = problem.limits.clip(free), None
-        if not start.meets or problem.limits.exceeded(free).any():
+        if not clamp and (not start.meets or problem.limits.exceeded(free).any()):
             nearest, found = problem.nearest(which, start.gain, nearest)
             if throw and found.status is Status.MAXITER:
                 raise ConvergenceError(str(found), found)
@@ -146,7 +158,7 @@ def _result(
     missing = [wanted - found for wanted, found in zip(target, seen, strict=True)]
     solved = tuple(found for found in limited if found is not None)
     solutions = start.solutions or solved
-    held, frames = _held(light, limited, problem.limits), shape.frames or 1
+    held, frames = _held(light, start.light, limited, problem.limits), shape.frames or 1
     clipped = float(np.mean([part.mean() for part in held]))
     size, error = problem.norm(target) or 1.0, problem.norm(missing)
     sizes, errors = (problem.norms(parts, frames) for parts in (target, missing))
@@ -171,12 +183,13 @@ def _result(
     )
 
 
-def _held(light: Columns, limited: list[Bounded | None], limits: Limits) -> Columns:
+def _held(light: Columns, free: Columns, limited: list[Bounded | None], limits: Limits) -> Columns:
     """Where values at a bound want to go beyond it, of pixels that are lit."""
-    return [
-        (np.zeros(p.shape, bool) if found is None else found.held & limits.touched(p))[~limits.masked]
-        for p, found in zip(light, limited, strict=True)
-    ]
+    held = []
+    for p, wanted, found in zip(light, free, limited, strict=True):
+        beyond = limits.exceeded(wanted) if found is None else found.held & limits.touched(p)
+        held.append(beyond[~limits.masked])
+    return held
 
 
 def _beyond(problem: Problem, missing: Columns, target: Columns, clipped: float) -> Columns:

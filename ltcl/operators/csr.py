@@ -134,6 +134,11 @@ class CSR(RowOperator):
             lowest=float(np.min(self._host.data, initial=0.0)),
         )
 
+    def matrix(self) -> scipy.sparse.csr_array:
+        """What it stands for: (M, N), float32 values on the host."""
+        values = self._host.data.astype(np.float32)
+        return scipy.sparse.csr_array((values, self._host.indices, self._host.indptr), shape=self.shape)
+
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays, of which `from_arrays` makes the same again, to the bit."""
         return {

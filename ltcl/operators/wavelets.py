@@ -71,8 +71,8 @@ class Wavelet(Basis):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the filters and of the scratch."""
-        return self._taps.nbytes + sum(array.nbytes for array in self._scratch)
+        """Bytes of the filters. Scratch of 1.25 N k numbers, k of the widest picture so far, comes on top."""
+        return self._taps.nbytes
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Name, grid and levels."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from ltcl.solvers.bounded import Bounded
+from ltcl.solvers.inverse import Inverse
 from ltcl.solvers.matrices import matrix_iteration, matrix_series
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.solve import METHODS, solve, solve_each
@@ -11,6 +12,7 @@ from ltcl.solvers.solve import METHODS, solve, solve_each
 __all__ = [
     "METHODS",
     "Bounded",
+    "Inverse",
     "Solution",
     "Status",
     "matrix_iteration",

@@ -15,11 +15,11 @@ S and by S~ together.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
+from ltcl import checks
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError
 from ltcl.operators import Operator, as_operator
@@ -38,8 +38,8 @@ def refuse_beyond(S: Operator, rule: Rule, wanted: float) -> None:
     if wanted < error:
         atol = f" and atol {rule.atol:g}" if np.any(rule.atol) else ""
         raise InputError(
-            f"rtol is {rule.rtol:g}{atol}; S is compressed and its solutions may be off by {_up(error)}: "
-            "ask for no less, or give exact= the uncompressed S"
+            f"rtol is {rule.rtol:g}{atol}; S is compressed and its solutions may be off by "
+            f"{checks.upwards(error)}: ask for no less, or give exact= the uncompressed S"
         )
 
 
@@ -97,18 +97,3 @@ def _step(method: Any, S: Operator, r: Array, rule: Rule, system: System) -> Arr
     system.products += inner.system.products
     assert inner.status is not None  # noqa: S101 - iterate returns only when the monitor said so
     return step if inner.status is Status.CONVERGED or inner.lowest <= _HALF else inner.status
-
-
-def _up(error: float) -> str:
-    """Two digits, rounded up, so that asking for what is shown is enough.
-
-    >>> _up(0.00421), _up(0.0042), _up(2.0)
-    ('0.0043', '0.0042', '2')
-    """
-    if not 0.0 < error < math.inf:
-        return f"{error:g}"
-    shown = float(f"{error:.1e}")
-    if shown < error:
-        unit = 10.0 ** (math.floor(math.log10(error)) - 1)
-        shown += unit
-    return f"{shown:.2g}"

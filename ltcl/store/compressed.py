@@ -20,6 +20,7 @@ from ltcl.errors import FileError, InputError
 from ltcl.store.archive import Archive
 
 LAYOUT = "ltcl-compressed-1"
+INVERSE = "ltcl-inverse-1"  # of `ltcl.solvers.Inverse.to_arrays`; see `ltcl.store.inverses`
 _MAY_BE_INFINITE = ".solution_error"
 
 
@@ -110,10 +111,10 @@ def read(archive: Archive) -> Parts:
     return Parts({name: _array(archive, name) for name in names})
 
 
-def write(path: Path, parts: Parts) -> None:
+def write(path: Path, parts: Parts, layout: str = LAYOUT) -> None:
     """Write everything in `parts`, uncompressed: numbers of few bits hardly shrink."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-        for name, array in {"format": np.array(LAYOUT), **parts.arrays}.items():
+        for name, array in {"format": np.array(layout), **parts.arrays}.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
 
@@ -128,11 +129,11 @@ def _is_of_operator(name: str) -> bool:
     return name.startswith(("system_", "basis_"))
 
 
-def is_layout(archive: Archive) -> bool:
+def is_layout(archive: Archive, layout: str = LAYOUT) -> bool:
     """Whether an archive says that it is of this layout."""
     if "format" not in archive.names:
         return False
     try:
-        return archive.text("format") == LAYOUT
+        return archive.text("format") == layout
     except FileError:  # not a string: whoever reads it says so
         return False

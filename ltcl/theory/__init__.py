@@ -14,6 +14,7 @@ from ltcl.theory.forecast import (
     richardson_products,
     series_products,
 )
+from ltcl.theory.norms import TwoNorm, two_norm
 from ltcl.theory.series import (
     Terms,
     after_terms,
@@ -28,6 +29,7 @@ __all__ = [
     "Forecast",
     "SpectralRadius",
     "Terms",
+    "TwoNorm",
     "after_terms",
     "bounce_coefficients",
     "chebyshev_products",
@@ -40,4 +42,5 @@ __all__ = [
     "richardson_products",
     "series_products",
     "spectral_radius",
+    "two_norm",
 ]

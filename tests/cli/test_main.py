@@ -15,7 +15,10 @@ from ltcl.cli.main import as_options
 
 from .conftest import Program
 
-COMMANDS = ["devices", "doctor", "demo", "info", "analyze", "convert", "compensate", "separate", "relight"]
+COMMANDS = [
+    *("devices", "doctor", "demo", "info", "analyze"),
+    *("convert", "compress", "compensate", "separate", "relight"),
+]
 
 
 def test_version(program: Program) -> None:

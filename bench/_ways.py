@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Four ways to the direct light of a picture, for `fig7.py`: each ready to run.
+
+Dense R is (I - A)^-1 - I by factorization. Both compressed forms come from C of R = W^T C W, which eq. 21
+makes on coefficients from rows of A that stream by, as in `resolution131k.py`; rows in wavelets are
+R W^T = W^T C. So neither of these needs a dense R, and both go to any N.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from rich.console import Console
+
+import ltcl
+from _harness import Options
+from ltcl.compression.coefficients import coefficients
+from ltcl.compression.iteration import invert_coefficients
+from ltcl.compression.sources import source
+from ltcl.compression.thresholds import above
+from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Operator, Tiles, Wavelet
+from ltcl.scenes import CornerRows, landscape
+from ltcl.solvers import matrix_series
+from products import bisect
+
+ALBEDO, ERROR = 0.8, 1e-2
+DROPPED = 0.7e-2  # of the error, what compression may take; the iteration has the rest
+TOLERANCES = 0.5 ** np.arange(1, 12, 0.5)
+THRESHOLD, FINE = 1e-4, 5e-4  # of numbers of A; of R before it is thresholded
+MOST = 128  # wavelets a row from which the largest are chosen
+MEMORY, OFTEN = 1 << 28, 20.0  # bytes for a block; seconds from one word about progress to the next
+note = Console(stderr=True).print
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A corner, a picture of it, (N,) float32, and the direct light that makes it, (N,) float64."""
+
+    rows: CornerRows
+    l_out: np.ndarray
+    l_d: np.ndarray
+
+    def error(self, l: np.ndarray) -> float:
+        """Relative to the direct light."""
+        return float(np.linalg.norm(l - self.l_d) / np.linalg.norm(self.l_d))
+
+
+@dataclass(frozen=True)
+class Way:
+    """A method that is ready to run, and what its first run told."""
+
+    run: Callable[[], np.ndarray]
+    error: float
+    first: float
+    products: int
+    nbytes: int
+    kept: float
+
+
+def problem(n: int) -> Problem:
+    """The corner under a landscape."""
+    rows = CornerRows(n, ALBEDO)
+    l_out = 0.05 + 0.4 * landscape(*rows.grid).mean(axis=2).reshape(-1)
+    parts = [rows.rows(start, start + 2 * n) @ l_out for start in range(0, len(l_out), 2 * n)]
+    return Problem(rows, l_out, l_out - np.concatenate(parts).astype(np.float64))
+
+
+def iterated(S: IdentityPlus, at: Problem, rtol: float) -> ltcl.Solution:
+    """Eq. 20."""
+    return ltcl.solve(S, at.l_out, "jacobi", rtol=rtol)
+
+
+def by_steps(S: IdentityPlus, at: Problem, kept: float) -> Way:
+    """The iteration, with the loosest tolerance whose error is small enough."""
+    enough = (t for t in TOLERANCES if at.error(iterated(S, at, t).x) <= ERROR)
+    rtol = float(next(enough, TOLERANCES[-1]))
+    found = iterated(S, at, rtol)
+    return Way(
+        lambda: iterated(S, at, rtol).x, at.error(found.x), found.seconds, found.products, S.nbytes, kept
+    )
+
+
+def dense(given: Options, at: Problem) -> IdentityPlus:
+    """S with every number of R."""
+    n = len(at.l_out)
+    less = -at.rows.rows(0, n).T  # in Fortran's order, which LAPACK inverts in place
+    less[np.diag_indices(n)] += 1.0
+    R = scipy.linalg.inv(less, overwrite_a=True, check_finite=False).T
+    R[np.diag_indices(n)] -= 1.0
+    return IdentityPlus(Dense(given.device, R))
+
+
+def by_matrices(S: IdentityPlus, at: Problem, iteration: Way) -> Way:
+    """The series, of as many terms as the iteration has steps: their sums are the same."""
+    steps = iteration.products - 1
+    return _series(lambda: matrix_series(S, steps=steps).x, at, iteration)
+
+
+def by_numpy(S: IdentityPlus, at: Problem, iteration: Way) -> Way:
+    """The same by the products of NumPy's BLAS."""
+    less = -S.R.to_dense().astype(np.float32)
+
+    def inverse() -> np.ndarray:
+        term, total = less, np.eye(len(less), dtype=np.float32) + less
+        for _ in range(iteration.products - 2):
+            term = term @ less
+            total += term
+        return total
+
+    return _series(inverse, at, iteration)
+
+
+def _series(inverse: Callable[[], np.ndarray], at: Problem, like: Way) -> Way:
+    def run() -> np.ndarray:
+        return inverse() @ at.l_out.astype(np.float32)
+
+    start = time.perf_counter()
+    l_d = run()
+    spent = time.perf_counter() - start
+    return Way(run, at.error(l_d), spent, like.products - 1, like.nbytes, like.kept)
+
+
+def telling(what: str) -> Callable[[float], None]:
+    """Says how far it is, now and then."""
+    last = time.perf_counter()
+
+    def tell(share: float) -> None:
+        nonlocal last
+        if time.perf_counter() >= last + OFTEN:
+            last = time.perf_counter()
+            note(f"  {what}, {share:.0%}")
+
+    return tell
+
+
+def of_both(given: Options, at: Problem) -> Any:
+    """C of R = W^T C W in db2, far finer than needed."""
+    W = Wavelet(given.device, at.rows.grid, "db2")
+
+    def transform(x: np.ndarray) -> np.ndarray:
+        return W.apply(given.device.upload(x)).get()
+
+    A = coefficients(
+        at.rows,
+        transform,
+        transform,
+        THRESHOLD,
+        first=THRESHOLD / 4,
+        memory=MEMORY,
+        progress=telling(f"N = {len(at.l_out)}: compressing A"),
+    )
+    return invert_coefficients(A.core, -1, rtol=FINE).D
+
+
+def of_rows(given: Options, at: Problem, C: Any) -> Any:
+    """R W^T = W^T C, one column of C after the other."""
+    W = Wavelet(given.device, at.rows.grid, "db2")
+
+    def synthesis(a: np.ndarray) -> np.ndarray:
+        return W.apply_transpose(given.device.upload(a)).get()
+
+    columns = source("C", scipy.sparse.csr_array(C.T))
+    drop, most = FINE * float(np.linalg.norm(C.data)), MOST * C.shape[0]
+    say = telling(f"N = {len(at.l_out)}: rows of R")
+    found = coefficients(columns, None, synthesis, drop=drop, most=most, memory=MEMORY, progress=say)
+    return scipy.sparse.csr_array(found.core.T)
+
+
+def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
+    """The fewest numbers that will do, in 16 bits, and the iteration with these."""
+    W = Wavelet(given.device, at.rows.grid, "db2")
+
+    def system(core: Operator) -> IdentityPlus:
+        return IdentityPlus(Compressed(core, W if both else None, W))
+
+    def error(threshold: float) -> float:
+        return at.error(iterated(system(CSR(given.device, above(C, threshold)[0])), at, DROPPED / 10).x)
+
+    threshold = bisect(error, DROPPED, float(np.abs(C.data).max()))
+    core, _ = above(C, threshold)
+    return by_steps(system(Tiles(given.device, core, 1, "float16")), at, core.nnz / len(at.l_out))

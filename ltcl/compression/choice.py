@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which basis, threshold, tile and precision: by measurement on this operator and this device.
+
+Every basis is given the threshold at which the error just stays within the goal; of what then remains, the
+fastest product wins, and the fewest bytes of those alike. The goal is on the 2-norm of E = R~ - R:
+
+    ||x~ - x|| / ||x|| <= ||S~^-1|| ||E||    since    x~ - x = -S~^-1 E x
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NoReturn
+
+from ltcl import checks
+from ltcl.compression import cores, fit, kinds
+from ltcl.compression.coefficients import Coefficients
+from ltcl.compression.cores import Core
+from ltcl.compression.fit import Fit, Problem
+from ltcl.compression.inverse_norm import inverse_norm
+from ltcl.compression.kinds import Kind
+from ltcl.compression.magnitudes import Magnitudes
+from ltcl.compression.result import Trial
+from ltcl.errors import ConvergenceError, InputError
+from ltcl.operators import CSR, IdentityPlus
+
+DROPPING, ROUNDING = 0.9, 0.05  # of the goal, for what is dropped and for the rounding of the core
+GATHER = 0.7  # of the goal: Frobenius norm of what need not even be looked at
+_MOST = 512  # numbers a row, beyond which a basis is no use unless all are
+_ALIKE = 2.0  # of the goal: a Frobenius norm at which bases are compared before more is measured
+_SPARE = 0.95  # of the budget, where a tolerance is proposed for it
+_WORSE = 3  # times the numbers of the best then: left
+Find = Callable[[str], Kind]  # a kind by its name, on the grid of the problem
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A basis that was tried to the end."""
+
+    fit: Fit
+    core: Core
+    seconds: float | None
+    found: Coefficients
+
+    def trial(self, pixels: int) -> Trial:
+        """What the report says of it."""
+        core, kept = self.core, self.fit.coefficients.core.nnz / pixels
+        return Trial(
+            self.fit.kind.name,
+            core.format,
+            core.width,
+            core.precision,
+            kept,
+            core.nbytes,
+            self.fit.norm.upper,
+            self.seconds,
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The best candidate, what was tried, and the goal that it meets."""
+
+    best: Candidate
+    trials: tuple[Trial, ...]
+    goal: float
+
+
+def choose(
+    problem: Problem,
+    names: Sequence[str],
+    rtol: float,
+    budget: float = math.inf,
+    find: Find | None = None,
+    note: Callable[[str], object] = lambda text: None,
+    parts: float = 1.0,
+) -> Choice:
+    """The best of the kinds `names` for a solution within `rtol` and a core within `budget` bytes.
+
+    Of the whole budget this is one of so many `parts`.
+
+    Raises
+    ------
+    InputError
+        None is within the budget; it says which tolerance and which budget would do.
+    """
+    find = find or (lambda name: kinds.kind(problem.device, problem.grid, name))
+    for most in (_MOST * problem.pixels, None):
+        survey = _Survey(problem, find, rtol, budget, most)
+        for name in names:
+            note(name)
+            survey.add(name)
+        if survey.candidates:
+            break
+    if not survey.candidates:
+        raise InputError(
+            f"rtol is {rtol:g}, which float32 does not allow for this T: its error is above {survey.goal:.2g}"
+        )
+    fits = [one for one in survey.candidates if one.core.nbytes <= budget]
+    if not fits:
+        refuse(problem, min(survey.candidates, key=lambda one: one.core.nbytes), rtol, budget, parts)
+    chosen = cores.choose([_timed(one) for one in fits])
+    best = next(one for one in fits if one.core.operator is chosen.operator)
+    return Choice(best, tuple(survey.trials), survey.goal)
+
+
+class _Survey:
+    """Kinds, tried one after the other; the first also tells the norm of S^-1 and so the goal."""
+
+    def __init__(self, problem: Problem, find: Find, rtol: float, budget: float, most: int | None) -> None:
+        self.problem, self.find, self.rtol, self.budget, self.most = problem, find, rtol, budget, most
+        self.goal = 0.5 * rtol
+        self._known = False
+        self._least = math.inf  # numbers that the best basis keeps then
+        self.candidates: list[Candidate] = []
+        self.trials: list[Trial] = []
+
+    def add(self, name: str) -> None:
+        kind, dropping = self.find(name), DROPPING * self.goal
+        found = fit.gather(self.problem, kind, GATHER * dropping, self.most)
+        alike = _kept(found, _ALIKE * self.goal)
+        if alike > _WORSE * self._least:
+            why = f"{alike / self._least:.1f} times as many numbers at one Frobenius norm"
+            self._leave(name, alike, why)
+            return
+        self._least = min(self._least, alike)
+        fitted = fit.fit(self.problem, kind, found, dropping)
+        if not self._known:
+            self.goal, self._known = self.rtol / inverse_bound(self.problem, fitted), True
+            dropping = DROPPING * self.goal
+            if found.dropped > dropping:
+                found = fit.gather(self.problem, kind, GATHER * dropping, self.most)
+            start = fitted.coefficients.dropped * dropping / max(fitted.norm.upper, 1e-30)
+            fitted = fit.fit(self.problem, kind, found, dropping, start)
+        if fitted.norm.upper > dropping:
+            self._leave(name, found.core.nnz, "so many numbers are too few", fitted.norm.upper)
+            return
+        core = cores.best(self.problem.device, fitted.coefficients.core, ROUNDING * self.goal, self.budget)
+        candidate = Candidate(fitted, core, _seconds(fitted, core), found)
+        self.candidates.append(candidate)
+        self.trials.append(candidate.trial(self.problem.pixels))
+
+    def _leave(self, name: str, count: int, why: str, error: float | None = None) -> None:
+        kept = count / self.problem.pixels
+        self.trials.append(Trial(name, "csr", 1, "float32", kept, 8 * count, error, None, why))
+
+
+def _kept(found: Coefficients, frobenius: float) -> int:
+    """Numbers that are left where this Frobenius norm is dropped."""
+    sizes = Magnitudes.of(found.core.data)
+    return sizes.kept(sizes.threshold(math.sqrt(max(frobenius**2 - found.dropped**2, 0.0))))
+
+
+def inverse_bound(problem: Problem, fitted: Fit) -> float:
+    """Upper bound on ||S~^-1||, by the fit where it is good enough for that, else by R itself."""
+    if fitted.norm.upper < 0.1:
+        try:
+            core = CSR(problem.device, fitted.coefficients.core)
+            return inverse_norm(IdentityPlus(fitted.operator(core))).upper
+        except ConvergenceError:
+            pass
+    return inverse_norm(IdentityPlus(problem.operator)).upper
+
+
+class TooLarge(InputError):
+    """No core of one channel is within its share of the budget.
+
+    Attributes
+    ----------
+    needed : float
+        The whole budget that this tolerance takes.
+    allows : float
+        A tolerance that the budget allows; 1 or more where it allows none.
+    """
+
+    def __init__(self, budget: float, rtol: float, needed: float, allows: float) -> None:
+        self.budget, self.rtol, self.needed, self.allows = budget, rtol, needed, allows
+        advice = f"it allows rtol {_up(allows)}" if allows < 1.0 else "no rtol below 1 fits into it"
+        super().__init__(
+            f"budget is {budget:.0f} bytes, but rtol {rtol:g} needs {math.ceil(needed)} "
+            f"({checks.size(needed)}); {advice}"
+        )
+
+
+def refuse(problem: Problem, candidate: Candidate, rtol: float, budget: float, parts: float) -> NoReturn:
+    """Say which budget this tolerance needs, and which tolerance the budget allows."""
+    needed = candidate.core.nbytes
+    raise TooLarge(parts * budget, rtol, parts * needed, _allowed(problem, candidate, rtol, budget))
+
+
+def _allowed(problem: Problem, candidate: Candidate, rtol: float, budget: float) -> float:
+    """A tolerance within the budget: guessed from as many numbers as fit, then raised until it holds."""
+    core, found, kind = candidate.core, candidate.found, candidate.fit.kind
+    count = int(budget * candidate.fit.coefficients.core.nnz / core.nbytes)
+    fitted = fit.measure(problem, kind, found.above(Magnitudes.of(found.core.data).at_most(count)))
+    inverse = inverse_bound(problem, fitted)
+    allowed = max(inverse * fitted.norm.upper / DROPPING, 1.1 * rtol)
+    while allowed < 1.0:
+        goal = allowed / inverse
+        fitted = fit.fit(problem, kind, found, DROPPING * goal, fitted.coefficients.dropped)
+        core = cores.best(problem.device, fitted.coefficients.core, ROUNDING * goal, budget)
+        if core.nbytes <= _SPARE * budget:
+            break
+        allowed *= 1.2
+    return allowed
+
+
+def _up(error: float) -> str:
+    """Two digits, rounded up.
+
+    >>> _up(0.0421)
+    '0.043'
+    """
+    unit = 10.0 ** (math.floor(math.log10(error)) - 1)
+    return f"{math.ceil(error / unit) * unit:.2g}"
+
+
+def _seconds(fitted: Fit, core: Core) -> float | None:
+    """Of a product in a solve, which runs on the core alone where both bases are one."""
+    R = fitted.operator(core.operator)
+    return core.seconds if core.seconds is None or R.two_sided else cores.seconds(R)
+
+
+def _timed(candidate: Candidate) -> Core:
+    core = candidate.core
+    return Core(
+        core.operator,
+        core.format,
+        core.width,
+        core.precision,
+        core.nbytes,
+        core.quantisation,
+        candidate.seconds,
+    )

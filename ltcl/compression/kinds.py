@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Between which bases R is written, by name: pixels, their order, wavelets for rows or for both sides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ltcl.device import Device
+from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import Basis, Chained, Ordered, Wavelet, basis, relatives
+from ltcl.operators.wavelets import filters
+
+PIXELS, HILBERT, ROWS = "pixels", "hilbert", " rows"
+KINDS = ("db2", "haar", "db4", "db2 rows", "haar rows", PIXELS, HILBERT)  # in the order they are tried
+
+
+@dataclass(frozen=True)
+class Kind:
+    """R = out^T C into; None is pixels."""
+
+    name: str
+    out: Basis | None
+    into: Basis | None
+
+    @property
+    def transforms(self) -> tuple[Callable | None, Callable | None]:
+        """Both as functions of (N, k) arrays on the host."""
+        return _function(self.out), _function(self.into)
+
+
+def check(name: str) -> str:
+    """Return `name` if it is that of a kind; refuse others."""
+    if not isinstance(name, str):
+        raise InputTypeError(f"basis is {name!r}; it must be a name, such as {', '.join(KINDS)}")
+    if name not in (PIXELS, HILBERT):
+        try:
+            filters(name.removesuffix(ROWS))
+        except InputError as error:
+            raise InputError(
+                f"basis is {name!r}; it must be pixels, hilbert, or an orthonormal wavelet such as haar, db2 "
+                "or db4, with ' rows' behind it for rows alone"
+            ) from error
+    return name
+
+
+def kind(device: Device, grid: tuple[int, int], name: str) -> Kind:
+    """The bases of a kind on a grid.
+
+    >>> import ltcl
+    >>> kind(ltcl.open_device(), (4, 6), "db2 rows").into.shape
+    (24, 24)
+    """
+    W = basis(device, grid, check(name).removesuffix(ROWS))
+    if isinstance(W, Wavelet):  # large coefficients then lie side by side, in fewer tiles
+        W = Chained(Ordered(device, grid, relatives(grid, W.levels), "relatives"), W)
+    return Kind(name, None if name.endswith(ROWS) else W, W)
+
+
+def _function(W: Basis | None) -> Callable[[np.ndarray], np.ndarray] | None:
+    return None if W is None else lambda x: W.apply(W.device.upload(x)).get()

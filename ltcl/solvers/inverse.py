@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""S^-1 = I - A, kept: a solution is one product, x = b - A b, and its error was bounded when A was made.
+
+A is one physical bounce of the scene (eq. 4 and 6), sparser than R = A + A^2 + ... that T tells. Found once,
+by `ltcl.invert`, it takes the place of a solve for every further frame.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ltcl import channels, checks, first_bounces, layout
+from ltcl.device import Device, open_device
+from ltcl.errors import InputError
+from ltcl.operators import IdentityPlus, Operator, stored
+from ltcl.operators.interreflection import nbytes
+from ltcl.solvers import units
+from ltcl.solvers.result import Solution, Status
+
+
+class Inverse:
+    """S^-1 = I - A of every channel of a transport, on the device; `ltcl.invert` makes it.
+
+    Parameters
+    ----------
+    bounces : sequence of 1 or 3 Operator, (N, N)
+        A of each channel.
+    errors : sequence of float
+        Bound on ``||x~ - x|| / ||x||`` of every solution in each channel.
+    grid : (h, w)
+    first_bounce : (N,) or (channels, N)
+        F of T; 0 at masked pixels.
+    mixing : (3, 3), optional
+        Of the projector's colours, as in `ltcl.Transport`.
+    confidence : float
+        Of each of these bounds, over the random starts of `theory.two_norm`.
+
+    Attributes
+    ----------
+    A : Operator or tuple of 3
+        One physical bounce: ``inv.A @ picture`` is the light of the picture after one more bounce.
+    error : float
+        The largest of `errors`.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> scene = ltcl.scenes.dihedral(4, albedo=0.5)
+    >>> T = scene.transport(first_bounce=scene.first_bounce)
+    >>> inv = ltcl.invert(T, rtol=1e-3)
+    >>> direct = numpy.zeros(T.grid)
+    >>> direct[:, :4] = 0.5  # the left wall is lit
+    >>> once = (inv.A @ direct.ravel()).reshape(T.grid)  # one bounce later the right one is
+    >>> bool(once[:, :4].max() < 1e-3 < once[:, 4:].min())
+    True
+    """
+
+    def __init__(
+        self,
+        bounces: Sequence[Operator],
+        errors: Sequence[float],
+        grid: tuple[int, int],
+        first_bounce: np.ndarray,
+        mixing: np.ndarray | None = None,
+        confidence: float = 1.0,
+    ) -> None:
+        if len(bounces) not in (1, 3) or len(errors) != len(bounces):
+            raise InputError(f"an inverse has {len(bounces)} A and {len(errors)} errors; both must be 1 or 3")
+        self.systems = tuple(IdentityPlus(A, sign=-1) for A in bounces)
+        n = bounces[0].shape[0]
+        self.grid = checks.grid("grid", grid, n)
+        self.errors = tuple(checks.number("error", error, least=0.0) for error in errors)
+        F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce)).astype(np.float64)
+        self._F = checks.shape("first_bounce", np.atleast_2d(F), (len(bounces), n))
+        self.mixing = None if mixing is None else channels.mixing(mixing, len(bounces), None)
+        self.confidence = checks.number("confidence", confidence, above=0.0, most=1.0)
+
+    def __repr__(self) -> str:
+        (h, w), kind = self.grid, {1: "grey", 3: "colour"}[self.channels]
+        return (
+            f"<ltcl Inverse {h * w} x {h * w}, {kind}, grid {h} x {w}, {checks.size(self.nbytes)} "
+            f"with an error of {self.error:.2g}>"
+        )
+
+    @property
+    def channels(self) -> int:
+        """1 for grey, 3 for colour."""
+        return len(self.systems)
+
+    @property
+    def device(self) -> Device:
+        """Where A lies."""
+        return self.systems[0].device
+
+    @property
+    def A(self) -> Operator | tuple[Operator, ...]:
+        """One bounce: the operator itself, or three of them in colour."""
+        found = tuple(X.R for X in self.systems)
+        return found[0] if self.channels == 1 else found
+
+    @property
+    def error(self) -> float:
+        """What a solution may be off by, relative to itself, in the worst channel."""
+        return max(self.errors)
+
+    @property
+    def first_bounce(self) -> np.ndarray:
+        """Diagonal of F: (N,) float64, or (3, N) in colour; 0 at masked pixels."""
+        return self._F[0] if self.channels == 1 else self._F
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device; what channels share counts once."""
+        return nbytes(self.systems)
+
+    def solve(self, b: Any, channel: int = 0, *, rtol: float | None = None) -> Solution:
+        """x = b - A b, by one product; no residual is computed.
+
+        Parameters
+        ----------
+        b : (N,) or (N, k)
+        channel : int
+            0, or 0 to 2 in colour.
+        rtol : float, optional
+            Relative error of x that is allowed; that of the inverse when not given.
+
+        Returns
+        -------
+        Solution
+            Its status is PRECOMPUTED, `error` the bound, and there are no residuals.
+
+        Raises
+        ------
+        InputError
+            Shapes that do not fit, NaN, or an `rtol` below the error of the inverse.
+        """
+        start = time.perf_counter()
+        self.refuse_beyond(rtol)
+        if checks.count("channel", channel, least=0) >= self.channels:
+            raise InputError(f"channel is {channel}; it must be below {self.channels}")
+        X = self.systems[channel]
+        b = checks.finite("b", checks.real("b", b))
+        if b.ndim not in (1, 2) or b.shape[0] != X.shape[0] or b.size == 0:
+            raise InputError(f"b has shape {b.shape}; it must be ({X.shape[0]},) or ({X.shape[0]}, k)")
+        unit = units.of(b)
+        x = units.restored(X.apply(X.device.upload(b / unit)).get(), unit)
+        seconds = time.perf_counter() - start
+        return Solution(
+            x, Status.PRECOMPUTED, 1, 1, (math.nan,), seconds, "precomputed", error=self.errors[channel]
+        )
+
+    def pattern(
+        self,
+        desired: Any,
+        *,
+        bounds: tuple[float, float] = (0.0, 1.0),
+        background: float = 0.0,
+        gain: float = 1.0,
+    ) -> np.ndarray:
+        """The projector pattern for a picture or frames of a video, by one product a channel.
+
+        l_in = F^-1 (b - A b) of b = gain * desired - background, clamped to the bounds.
+
+        Parameters
+        ----------
+        desired : (h, w), (h, w, 3), or frames of these
+        bounds, background, gain
+            As in `ltcl.compensate`; the background is one number.
+
+        Returns
+        -------
+        array like `desired`, float32
+
+        Notes
+        -----
+        What clamping takes from one pixel is not made up for by others, as `ltcl.compensate` does within the
+        bounds, and nothing tells how far the scene will be off: for single pictures use that, with
+        ``inverse=`` and perhaps ``clamp=True``.
+
+        Examples
+        --------
+        >>> import ltcl, numpy
+        >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
+        >>> ltcl.invert(T).pattern(numpy.array([[0.3, 0.3]])).round(2).tolist()
+        [[0.5, 0.5]]
+        """
+        low, high = _bounds(bounds)
+        gain, dark = checks.number("gain", gain, above=0.0), checks.number("background", background)
+        columns, shape = layout.unpack("desired", desired, self.grid, self.channels)
+        solved = [self.solve(gain * b - dark, channel).x for channel, b in enumerate(columns)]
+        light = first_bounces.undone(solved, self._F, self.mixing)
+        limited = [
+            np.where(f[:, None] > 0.0, np.clip(p, low, high), 0.0)
+            for p, f in zip(light, self._F, strict=True)
+        ]
+        return shape.pack(limited, self.grid).astype(np.float32)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Plain arrays by name, as files hold them; `from_arrays` makes the same of them, to the bit."""
+        mixed = {} if self.mixing is None else {"mixing": self.mixing}
+        return {
+            "grid": np.array(self.grid),
+            "first_bounce": self._F,
+            "errors": np.array(self.errors),
+            "confidence": np.array(self.confidence),
+            **mixed,
+            **stored.to_arrays(self.systems),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray], device: Device | str | None = None) -> Inverse:
+        """Of what `to_arrays` gave, on a device that is opened at once.
+
+        Raises
+        ------
+        InputError
+            Arrays that are missing, or do not fit each other.
+        """
+        for name in ("grid", "first_bounce", "errors", "confidence"):
+            if name not in arrays:
+                raise InputError(f"an inverse has the array {name!r}, which is missing")
+        systems = stored.from_arrays(open_device(device), arrays)
+        if any(X.sign != -1.0 for X in systems):
+            raise InputError("the operators are I + R; those of an inverse are I - A")
+        errors = np.ravel(arrays["errors"]).tolist()
+        confidence = float(checks.shape("confidence", arrays["confidence"], ()))
+        grid, F = checks.shape("grid", arrays["grid"], (2,)), arrays["first_bounce"]
+        return cls([X.R for X in systems], errors, grid.tolist(), F, arrays.get("mixing"), confidence)
+
+    def refuse_beyond(self, rtol: float | None) -> None:
+        """Refuse a tolerance that is below the error."""
+        if rtol is None:
+            return
+        rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
+        if rtol < self.error:
+            raise InputError(
+                f"rtol is {rtol:g}, but what this inverse gives may be off by {checks.upwards(self.error)}; "
+                "ask for no less, or make a better one with ltcl.invert(T, rtol=...)"
+            )
+
+
+def _bounds(value: Any) -> tuple[float, float]:
+    try:
+        low, high = value
+    except (TypeError, ValueError):
+        raise InputError(f"bounds is {value!r}; it must be (low, high)") from None
+    low = checks.number("bounds[0]", low)
+    return low, checks.number("bounds[1]", high, above=low)

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Precomputed inverses on disk, as .npz: the layout of compressed transports under a name of its own."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from ltcl.errors import FileError, InputTypeError
+from ltcl.files import as_path, input_file, replace_file
+from ltcl.solvers import Inverse
+from ltcl.store import compressed, formats
+from ltcl.store.archive import Archive
+
+_EXTENSION = ".npz"
+
+
+def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
+    """Save what `ltcl.invert` made; an earlier file at `path` is replaced whole or not at all.
+
+    Parameters
+    ----------
+    path
+        .npz
+    inverse : Inverse
+
+    Raises
+    ------
+    FileError
+        Another extension, or the file cannot be written.
+
+    Examples
+    --------
+    >>> import ltcl, pathlib, tempfile
+    >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "inverse.npz"
+    >>> ltcl.save_inverse(path, ltcl.invert(T, rtol=1e-3))
+    >>> ltcl.load_inverse(path).error <= 1e-3
+    True
+    """
+    if not isinstance(inverse, Inverse):
+        raise InputTypeError(f"inverse is a {type(inverse).__name__}; it must be what ltcl.invert(T) gives")
+    path = check_name(path)
+    with formats.about(path), replace_file(path) as temporary:
+        compressed.write(temporary, compressed.Parts(inverse.to_arrays()), compressed.INVERSE)
+
+
+def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse:
+    """Load an inverse onto a device, with the same bits as it was saved.
+
+    Parameters
+    ----------
+    path
+        A .npz file of `save_inverse`.
+    device : Device or str, optional
+        As `open_device` takes it.
+
+    Raises
+    ------
+    FileError
+        The file is missing, damaged, truncated, lies about a size, or holds something else.
+    MemoryLimitError
+        It does not fit the memory of the host or of the device.
+    """
+    path = check_name(path)
+    input_file(path)
+    with formats.about(path):
+        with Archive(path) as archive:
+            if not compressed.is_layout(archive, compressed.INVERSE):
+                raise FileError(
+                    f"is no inverse, whose format is {compressed.INVERSE}; 'ltcl invert' makes one"
+                )
+            parts = compressed.read(archive)
+        return Inverse.from_arrays(parts.arrays, device)
+
+
+def check_name(path: str | os.PathLike[str]) -> Path:
+    """`path`, if its extension is that of an inverse."""
+    path = as_path(path)
+    if path.suffix.lower() != _EXTENSION:
+        raise FileError(f"{path}: the extension is {path.suffix!r}; inverses are {_EXTENSION}")
+    return path
