@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse
@@ -111,15 +112,29 @@ def coefficients(
         last = _Columns(_first_pass(R, into, first, memory, lambda share: done(share / 2)), out)
     if threshold is None:
         threshold = last.sample().threshold_for(drop, math.inf if most is None else most)
-    pieces, squares = [], []
-    for start, stop in cut(last.count, at_once(last.height, memory)):
-        kept, lost = _chosen(last.block(np.arange(start, stop)), threshold)
+    pieces, squares, busy = [], [], last.busy
+    for start, stop in cut(len(busy), at_once(last.height, memory)):
+        kept, lost = _chosen(last.block(busy[start:stop]), threshold)
         pieces.append(kept)
         squares += lost
-        done(stop / last.count if out is None else 0.5 + 0.5 * stop / last.count)
-    core = scipy.sparse.hstack(pieces, format="csc")
+        done(stop / len(busy) if out is None else 0.5 + 0.5 * stop / len(busy))
+    done(1.0)
+    core = _spread(pieces, busy, (last.height, last.count))
     core = scipy.sparse.csr_array(core if out is not None else core.T)
     return Coefficients(core, last.dropped, math.sqrt(math.fsum(squares)), threshold)
+
+
+def _spread(
+    pieces: list[scipy.sparse.csc_array], busy: np.ndarray, shape: tuple[int, int]
+) -> scipy.sparse.csc_array:
+    """Columns `busy` of a matrix, the others of which are empty."""
+    if not pieces:
+        return scipy.sparse.csc_array(shape, dtype=np.float32)
+    found = scipy.sparse.csc_array(scipy.sparse.hstack(pieces, format="csc"))
+    lengths = np.zeros(shape[1], np.int64)
+    lengths[busy] = np.diff(found.indptr)
+    ends = np.concatenate([[0], np.cumsum(lengths)])
+    return scipy.sparse.csc_array((found.data, found.indices, ends), (found.shape[0], shape[1]))
 
 
 @dataclass(frozen=True)
@@ -149,6 +164,10 @@ class _Rows:
         return self.R.shape[0]
 
     @property
+    def busy(self) -> np.ndarray:
+        return np.arange(self.count)
+
+    @property
     def height(self) -> int:
         return self.R.shape[1]
 
@@ -176,6 +195,14 @@ class _Columns:
     def count(self) -> int:
         return self.between.columns
 
+    @cached_property
+    def busy(self) -> np.ndarray:
+        """Columns with anything in them: of smooth light few are left by then."""
+        between = self.between.matrix
+        if isinstance(between, np.ndarray):
+            return np.arange(self.count)
+        return np.flatnonzero(np.diff(between.indptr))
+
     @property
     def height(self) -> int:
         return self.between.rows
@@ -190,14 +217,17 @@ class _Columns:
 
     def sample(self) -> _Sample:
         # Single columns: those of large numbers lie side by side, and blocks would hit or miss them all.
-        chosen = np.random.default_rng(0).permutation(self.count)[: max(-(-self.count // _SHARE), _LEAST)]
+        chosen = np.random.default_rng(0).permutation(self.busy)
+        chosen = chosen[: max(-(-len(chosen) // _SHARE), _LEAST)]
         return _sampled(self, [chosen[start:stop] for start, stop in cut(len(chosen), 4 * COLUMNS)])
 
 
 def _sampled(last: _Rows | _Columns, blocks: list[np.ndarray]) -> _Sample:
     found = [Magnitudes.of(last.block(which)) for which in blocks]
+    if not found:
+        return _Sample(Magnitudes.of(np.zeros(0, np.float32)), 1.0)
     counts, squares = sum(m.counts for m in found), sum(m.squares for m in found)
-    share = sum(map(len, blocks)) / last.count
+    share = sum(map(len, blocks)) / len(last.busy)
     return _Sample(Magnitudes(np.asarray(counts), np.asarray(squares)), share)
 
 

@@ -81,7 +81,8 @@ class Solution:
         Of "monte_carlo": of the noise, without the bias of a polynomial. 0 only where there is none for
         certain; NaN where it is unknown, since no walk has found light, or all scored alike. It is itself an
         estimate, good from some 30 samples on: x is within 1.96 of it 95 times in 100 then, of 8 samples
-        about 91 times, of 2 about 70.
+        about 91 times, of 2 about 70. It tells of the light that walks have met: where a few pixels are
+        hundreds of times as bright as the rest and hardly any walk has found them, it is far too small.
     error : float, optional
         Bound on the relative error of x, where one is known: of a precomputed inverse.
     """

@@ -75,6 +75,29 @@ def test_blocks_of_any_size_give_the_same_bits(kind, blocks, threshold):
     assert whole.second == parts.second
 
 
+@pytest.mark.parametrize("first", [1e-3, 0.05, 10.0])
+def test_columns_that_the_first_pass_leaves_empty_are_skipped(first):
+    """10.0 leaves none."""
+    R, asked = smooth(GRID), []
+    out, into = transforms("two-sided")
+    assert out is not None
+    assert into is not None
+
+    def counted(x):
+        asked.append(np.count_nonzero(x.any(axis=0)))
+        return out(x)
+
+    found = coefficients(source("R", R), counted, into, 1e-3, first=first)
+    between = into(R.T.astype(np.float32)).T
+    between = np.where(np.abs(between) >= first, between, 0)
+    wanted = out(np.ascontiguousarray(between))
+    wanted = np.where(np.abs(wanted) >= 1e-3, wanted, 0)
+    np.testing.assert_allclose(found.core.toarray(), wanted, atol=1e-6)
+    assert found.core.shape == R.shape
+    assert sum(asked) == np.count_nonzero(between.any(axis=0))
+    assert coefficients(source("R", R), out, into, drop=0.1, first=first).core.shape == R.shape
+
+
 def test_rows_are_asked_for_in_blocks_that_fit():
     R, asked = smooth(GRID), []
 
