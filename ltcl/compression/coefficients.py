@@ -131,10 +131,11 @@ def _spread(
     if not pieces:
         return scipy.sparse.csc_array(shape, dtype=np.float32)
     found = scipy.sparse.csc_array(scipy.sparse.hstack(pieces, format="csc"))
+    rows, _ = found.shape or shape
     lengths = np.zeros(shape[1], np.int64)
     lengths[busy] = np.diff(found.indptr)
     ends = np.concatenate([[0], np.cumsum(lengths)])
-    return scipy.sparse.csc_array((found.data, found.indices, ends), (found.shape[0], shape[1]))
+    return scipy.sparse.csc_array((found.data, found.indices, ends), (rows, shape[1]))
 
 
 @dataclass(frozen=True)
