@@ -30,9 +30,6 @@ _Out = Annotated[
     Path,
     typer.Option("--out", "-o", metavar="FILE", help="The compressed transport: .npz.", show_default=False),
 ]
-_Rtol = Annotated[
-    float, typer.Option(metavar="FRACTION", help="Relative error that a solution may have for it.")
-]
 _Budget = Annotated[
     int | None,
     typer.Option(
@@ -53,7 +50,7 @@ _Basis = Annotated[
 def run(
     file: options.Matrix,
     out: _Out,
-    rtol: _Rtol = 1e-2,
+    rtol: options.SolutionRtol = 1e-2,
     budget: _Budget = None,
     basis: _Basis = None,
     grid: options.Grid = None,

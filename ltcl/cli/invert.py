@@ -15,9 +15,6 @@ _Out = Annotated[
     Path,
     typer.Option("--out", "-o", metavar="FILE", help="The inverse: .npz.", show_default=False),
 ]
-_Rtol = Annotated[
-    float, typer.Option(metavar="FRACTION", help="Relative error that a solution may have for it.")
-]
 _Basis = Annotated[
     list[str] | None,
     typer.Option(
@@ -32,7 +29,7 @@ _Basis = Annotated[
 def run(
     file: options.Matrix,
     out: _Out,
-    rtol: _Rtol = 1e-2,
+    rtol: options.SolutionRtol = 1e-2,
     basis: _Basis = None,
     grid: options.Grid = None,
     first_bounce: options.FirstBounce = None,

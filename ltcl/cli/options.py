@@ -97,6 +97,9 @@ Device = Annotated[
     ),
 ]
 Method = Annotated[str, typer.Option(callback=_method, metavar="NAME", help=f"One of {', '.join(METHODS)}.")]
+SolutionRtol = Annotated[
+    float, typer.Option(metavar="FRACTION", help="Relative error that a solution may have for it.")
+]
 Rtol = Annotated[float, typer.Option(metavar="FRACTION", help="Relative residual at which a solve is done.")]
 Inverse = Annotated[
     Path | None,
