@@ -9,13 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
-from ltcl.transport import Transport, require
-
-_SAME = 1e-6  # relative difference of first bounces, which float32 hardly tells from none
+from ltcl.transport import Transport, refuse_other, require
 
 
 def beside(T: Transport, exact: Any) -> tuple[Transport, tuple[IdentityPlus | None, ...]]:
@@ -36,14 +31,5 @@ def beside(T: Transport, exact: Any) -> tuple[Transport, tuple[IdentityPlus | No
         return T, (None,) * T.channels
     require(T)
     require(exact, name="exact")
-    for name in ("grid", "channels"):
-        if getattr(exact, name) != getattr(T, name):
-            raise InputError(
-                f"exact has {name} {getattr(exact, name)}; it must be that of T, {getattr(T, name)}"
-            )
-    if not np.allclose(exact.first_bounce, T.first_bounce, rtol=_SAME, atol=0.0):
-        raise InputError("exact has another first bounce; it must be that of T, or T made from exact")
-    own, others = (np.eye(3) if M is None else M for M in (T.mixing, exact.mixing))
-    if not np.array_equal(own, others):
-        raise InputError("exact mixes colours in another way; it must mix them as T does")
+    refuse_other("exact", exact, T, "it must be that of T, or T made from exact")
     return exact, exact.systems

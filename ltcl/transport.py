@@ -20,6 +20,7 @@ from ltcl.operators import Coupled, IdentityPlus, Operator, ScaledColumns, as_op
 from ltcl.operators.interreflection import device_of, made_with, maskable, nbytes
 
 logger = logging.getLogger(__name__)
+_SAME = 1e-6  # relative difference of first bounces, which float32 hardly tells from none
 
 
 class Transport:
@@ -275,6 +276,20 @@ def require(T: Any, *, square: bool = True, name: str = "T") -> Transport:
     if square:
         T._require_first_bounce()
     return T
+
+
+def refuse_other(name: str, other: Any, T: Transport, advice: str) -> None:
+    """Refuse what was made of a transport with other pixels, colours or first bounce than T."""
+    for what in ("grid", "channels"):
+        if getattr(other, what) != getattr(T, what):
+            raise InputError(
+                f"{name} has {what} {getattr(other, what)}; it must be that of T, {getattr(T, what)}"
+            )
+    if not np.allclose(other.first_bounce, T.first_bounce, rtol=_SAME, atol=0.0):
+        raise InputError(f"{name} has another first bounce than T; {advice}")
+    own, others = (np.eye(3) if M is None else M for M in (T.mixing, other.mixing))
+    if not np.array_equal(own, others):
+        raise InputError(f"{name} mixes colours in another way than T; {advice}")
 
 
 def _product(T: Operator, x: np.ndarray) -> np.ndarray:

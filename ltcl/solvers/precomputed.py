@@ -11,9 +11,8 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError
 from ltcl.solvers.inverse import Inverse
-from ltcl.transport import Transport, require
+from ltcl.transport import Transport, refuse_other, require
 
-_SAME = 1e-6  # relative difference of first bounces, which float32 hardly tells from none
 _ROUNDING = 1e-5  # of float32, in the light that tells whether an inverse is that of a transport
 _FITS: weakref.WeakKeyDictionary[Inverse, weakref.ref[Transport]] = weakref.WeakKeyDictionary()
 
@@ -42,16 +41,7 @@ def require_inverse(T: Transport, inverse: Any, rtol: float | None, **others: An
 
 def _refuse_other(T: Transport, inverse: Inverse) -> None:
     """Refuse a transport that this is not the inverse of: told by one random light."""
-    for name in ("grid", "channels"):
-        if getattr(T, name) != getattr(inverse, name):
-            raise InputError(
-                f"inverse has {name} {getattr(inverse, name)}; it must be that of T, {getattr(T, name)}"
-            )
-    if not np.allclose(inverse.first_bounce, T.first_bounce, rtol=_SAME, atol=0.0):
-        raise InputError("inverse has another first bounce than T; make it with ltcl.invert(T)")
-    own, others = (np.eye(3) if M is None else M for M in (inverse.mixing, T.mixing))
-    if not np.array_equal(own, others):
-        raise InputError("inverse mixes colours in another way than T; make it with ltcl.invert(T)")
+    refuse_other("inverse", inverse, T, "make it with ltcl.invert(T)")
     missed, allowed = _miss(T, inverse)
     if not missed <= allowed:
         raise InputError(
