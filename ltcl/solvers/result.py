@@ -29,7 +29,7 @@ class Status(enum.Enum):
         "the method has no next step here, not even started anew; "
         "try method='gmres', 'cg' with normal=True, or 'direct'"
     )
-    SAMPLED = "the samples are spent, what is left is noise; .reason tells what to try next"
+    SAMPLED = "the samples are spent; .reason tells what to try next"
     PRECOMPUTED = "one product with an inverse whose error is bounded; no residual was computed"
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
