@@ -368,7 +368,7 @@ def test_where_samples_are_too_few_for_shared_columns_channels_draw_their_own(de
 
 def test_what_no_channel_can_do_alone_is_refused(device):
     S = tuple(IdentityPlus(Dense(device, lambertian(30, rho).R)) for rho in (0.5, 1.2, 0.5))
-    with pytest.raises(InputError, match="^in channel 1: walks over R have no finite variance"):
+    with pytest.raises(InputError, match=r"^in channel 1: walks over R have no finite variance"):
         ltcl.solve(S, np.ones((3, 30)), "monte_carlo")
     with pytest.raises(InputError, match=r"^in channel 1: the spectral radius of R is 1\.2"):
         ltcl.solve(S, np.ones((3, 30)), "hybrid")
