@@ -113,11 +113,8 @@ def rules(T: Transport, method: str, rtol: Any, options: dict[str, Any]) -> dict
     if T.is_square:
         kind = {**ITERATIVE, **SAMPLED, Direct.name: Direct}.get(method)
         known += ["x0", *(field.name for field in (dataclasses.fields(kind) if kind else ()))]
+    sampled.check_method(method, options, SAMPLED)
     for name in options:
-        if name not in known and name in ("samples", "seed"):
-            raise InputTypeError(
-                f"unknown option {name!r}: method {method!r} does not sample; {' and '.join(SAMPLED)} do"
-            )
         if name not in known:
             raise InputTypeError(f"unknown option {name!r}; compensate has {', '.join([*_OWN, *known])}")
     rtol = checks.number("rtol", rtol, least=0.0, below=1.0)

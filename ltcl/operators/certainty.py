@@ -10,14 +10,17 @@ from __future__ import annotations
 import numpy as np
 
 from ltcl.operators.alias import Tables
-from ltcl.operators.base import Operator
+from ltcl.operators.csr import CSR
+from ltcl.operators.dense import Dense
+from ltcl.operators.entrywise import mapped
+from ltcl.operators.links import Links
 from ltcl.operators.walks import Lengths
 
 _FARTHEST = 256  # steps; what is farther apart counts as within reach
 
 
 def without_noise(
-    R: Operator, made: Tables, lengths: Lengths, b: np.ndarray, only_dark: bool = False
+    R: CSR | Dense, made: Tables, lengths: Lengths, b: np.ndarray, only_dark: bool = False
 ) -> np.ndarray:
     """Pixels whose samples are all alike for certain, bool like `b`, (N,) or (N, k).
 
@@ -37,12 +40,22 @@ def without_noise(
     lit = reached(R, b.reshape(len(b), -1) != 0.0, steps)
     if only_dark:
         return ~lit.reshape(b.shape)
-    several = (made.counts() > 1)[:, None]
+    several = (_drawn(R, made) > 1)[:, None]
     choice = lit & several if lengths.are_one else lit  # to go on is one, where light may still come
     return ~(lit & (several | reached(R, choice, steps))).reshape(b.shape)
 
 
-def reached(R: Operator, goal: np.ndarray, steps: int) -> np.ndarray:
+def _drawn(R: CSR | Dense, made: Tables) -> np.ndarray:
+    """Entries of each row that a walk may draw; of a row of zeros, that ends it, 0 or more."""
+    if isinstance(made, Links):
+        return made.drawn()
+    if made.sampler == "uniform":
+        return made.counts()
+    nonzero = mapped(R, lambda entries: (entries != 0.0).astype(np.float32))
+    return nonzero.apply(R.device.upload(np.ones(R.shape[1]))).get()
+
+
+def reached(R: CSR | Dense, goal: np.ndarray, steps: int) -> np.ndarray:
     """Pixels from which 1 .. `steps` steps along entries of R lead to `goal`, (N, k) bool.
 
     Products of R with random numbers in place of ones tell it without another matrix: they cancel by chance

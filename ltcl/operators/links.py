@@ -78,6 +78,13 @@ class Links(Tables):
             Q, columns = np.minimum(Q, _LARGEST), made[:, 0].astype(np.int32)
             yield CSR(self.device, scipy.sparse.csr_array((Q, columns, self._indptr), shape=self.shape))
 
+    def drawn(self) -> np.ndarray:
+        """Entries of each row that a walk may draw, (rows,)."""
+        if self.sampler == "uniform":
+            return self.counts()
+        rows = _per_entry(self._indptr, np.arange(self.shape[0]))
+        return np.bincount(rows, self._P > 0.0, self.shape[0])
+
     def _inverse_chances(self) -> np.ndarray:
         """1 / p(j | i) of each entry, float64; 0 where it is never drawn."""
         if self.sampler == "uniform":

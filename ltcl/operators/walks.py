@@ -46,13 +46,16 @@ class Lengths:
 
     def steps(self, estimator: str) -> np.ndarray:
         """The steps of `kernels/walk.cl`, (L, 2) uint32: c_k by the chance to be scored, chance to go on."""
+        _, worth = self.scores(estimator)
+        return np.stack([worth.astype(np.float32).view(np.uint32), self.chances], axis=1)
+
+    def scores(self, estimator: str) -> tuple[np.ndarray, np.ndarray]:
+        """Of each step the chance to be scored, and c_k by it, 0 where that is never; (L,) float64."""
         going = self.chances / _CERTAIN
         scored = np.concatenate([[1.0], np.cumprod(going[:-1])])
         if estimator == "endpoint":
             scored = scored * (1.0 - going)
-        # Of a step that is never scored nothing is read.
-        worth = np.divide(self.coefficients, scored, out=np.zeros_like(scored), where=scored > 0.0)
-        return np.stack([worth.astype(np.float32).view(np.uint32), self.chances], axis=1)
+        return scored, np.divide(self.coefficients, scored, out=np.zeros_like(scored), where=scored > 0.0)
 
     @property
     def are_one(self) -> bool:

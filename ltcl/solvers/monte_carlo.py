@@ -197,15 +197,16 @@ class MonteCarlo:
                 "method='chebyshev'"
             )
         reason = f"Chebyshev series of degree {degree}, which leaves {bias_in_words(degree, bounds)}"
-        noisy = f"and noise of about {noise:.2g} times b with {most} samples"
-        return float(c[0]), whole(c[1:]), f"{reason}, {noisy}"
+        if self.error is None:  # else nobody knows how many samples there will be
+            reason += f", and noise of about {noise:.2g} times b with {most} samples"
+        return float(c[0]), whole(c[1:]), reason
 
     def _walk(self, channels: Sequence[Channel], made: Tables, lengths: Lengths) -> Staged:
         """Estimates of the terms k >= 1 of channels side by side, and their standard errors."""
         pixels, light = self._which(channels[0]), [one.r.get() for one in channels]
         estimator = "endpoint" if self.adjoint else self.estimator or "collision"
         lit = [(rows_of_R(c.system.S, self.name)[0], r) for c, r in zip(channels, light, strict=True)]
-        measured = Noise(lit, made, lengths, only_dark=estimator == "endpoint").errors
+        measured = Noise(lit, made, lengths, estimator, self.adjoint).errors
         walker = Walker(made, lengths, estimator, self.seed, watch=sampled.watch(channels))
         host = sampled.side_by_side(light)
         if self.adjoint:
@@ -213,7 +214,9 @@ class MonteCarlo:
         r = made.device.upload(host)
         if self.error is not None:
             unit = np.stack([one.unit for one in channels], axis=-1).ravel()
-            return sample_to(walker, r, pixels, self.error / unit, self.samples or MOST, measured)
+            with np.errstate(over="ignore"):
+                wanted = np.minimum(self.error / unit, np.finfo(np.float64).max)
+            return sample_to(walker, r, pixels, wanted, self.samples or MOST, measured)
         sums = walker.rows(r, pixels, 0, self.samples or self.usual)
         return Staged.fixed(sums, measured(sums, pixels))
 

@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Standard errors of sampled pixels: 0 where that is certain, NaN where samples do not tell."""
+"""Standard errors of sampled pixels: of the light that samples have met, and of that which they have not.
+
+Samples tell nothing of a light that none of them has met, however bright it is. But then its chance is at
+most about 3 / n of n samples, and so its share of the variance of a mean at most
+
+    3 (W_i max |b|)^2 / n^2,    W_i the root mean square of what a score is worth by its light
+
+(`ltcl.theory.walks.largest_square`). That is added to s^2 / n, the estimate by the samples' own spread s, but
+where there is no noise for certain. Of pictures with ordinary contrast it is a few hundredths of it; where
+few samples have met the light, or none, it is most of it.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +24,7 @@ from ltcl.operators.certainty import reached, without_noise
 from ltcl.operators.entrywise import squares
 from ltcl.operators.walks import Lengths, Sums
 from ltcl.solvers.sampled import side_by_side
+from ltcl.theory.walks import growth_of_weights, largest_square
 
 
 class Noise:
@@ -26,8 +37,11 @@ class Noise:
     Parameters
     ----------
     channels : R and light, (N,) or (N, k), of each
-    made, lengths, only_dark
+    made, lengths
         As of `without_noise`.
+    estimator : str
+    adjoint : bool
+        Walks from light.
     """
 
     def __init__(
@@ -35,22 +49,49 @@ class Noise:
         channels: Sequence[tuple[CSR | Dense, np.ndarray]],
         made: Tables,
         lengths: Lengths,
-        only_dark: bool,
+        estimator: str,
+        adjoint: bool = False,
     ) -> None:
-        self._channels, self._walks = channels, (made, lengths, only_dark)
+        self._channels, self._made, self._lengths = channels, made, lengths
+        self._estimator, self._adjoint = estimator, adjoint
 
     def errors(self, sums: Sums, pixels: np.ndarray) -> np.ndarray:
-        """Of the means of `pixels`, (P, columns): those of the channels side by side."""
-        found, alike = sums.standard_error, sums.alike
-        if not alike.any():
-            return found
-        return np.where(self._certain[pixels], 0.0, np.where(alike, np.nan, found))
+        """Of the means of `pixels`, (P, columns): those of the channels side by side.
+
+        NaN of a single sample.
+        """
+        alike = sums.alike
+        if sums.samples < 2:
+            found = np.where(alike, np.nan, sums.standard_error)
+        else:
+            found = np.hypot(sums.standard_error, self._unmet(sums.samples)[pixels] / sums.samples)
+        return np.where(self._certain[pixels], 0.0, found) if alike.any() else found
+
+    def _unmet(self, samples: int) -> np.ndarray:
+        """Root of the squares that light may add which no sample has met, (N, columns)."""
+        scores = self._lengths.scores(self._estimator)
+        growth = growth_of_weights(self._channels[0][0], self._made, self._adjoint)
+        found = []
+        for moments, (_, light) in zip(growth, self._channels, strict=True):
+            root, bright = np.sqrt(largest_square(moments, *scores, samples)), np.abs(light)
+            found.append(
+                _from(bright, root) if self._adjoint else np.multiply.outer(root, bright.max(axis=0))
+            )
+        return side_by_side(found)
 
     @functools.cached_property
     def _certain(self) -> np.ndarray:
-        made, lengths, only_dark = self._walks
-        found = [without_noise(R, made, lengths, light, only_dark) for R, light in self._channels]
+        only_dark = self._estimator == "endpoint"
+        found = [without_noise(R, self._made, self._lengths, light, only_dark) for R, light in self._channels]
         return side_by_side(found)
+
+
+def _from(bright: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Of walks that begin in proportion to the light, (N,) or (N, k), each with the weight of all of it."""
+    whole = bright.sum(axis=0, dtype=np.float64)
+    chosen = bright / np.where(whole > 0.0, whole, 1.0)
+    with np.errstate(invalid="ignore"):
+        return np.broadcast_to(whole * np.sqrt(root**2 @ chosen), bright.shape)
 
 
 def gathered(R: CSR | Dense, error: np.ndarray) -> np.ndarray:

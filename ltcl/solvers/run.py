@@ -89,14 +89,18 @@ def run(method: Any, given: Problem) -> Solution:
 def sample(method: MonteCarlo | Hybrid, channels: Sequence[Problem]) -> list[Solution]:
     """A method that samples, on colour channels of one size at once; one solution a channel.
 
-    The numbers that the callback hears ascend through all of them.
+    The callback hears of one beginning, of every step, and of one end: the largest residual.
     """
     told = sampled.numbered(channels[0].rule.callback)
     begun = [_begin(given, told) for given in channels]
-    return [
+    solved = [
         sampled.solution(method, one, found, functools.partial(units.restored, unit=one.unit))
         for one, found in zip(begun, method.estimate(begun), strict=True)
     ]
+    largest = float(np.max([one.residuals[-1] for one in solved]))
+    if told is not None and not np.isnan(largest):  # of some pixels alone there is none
+        told(1, largest)
+    return solved
 
 
 def _begin(given: Problem, callback: Callable[[int, float], object] | None) -> Channel:

@@ -10,20 +10,22 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, vectors
-from ltcl.errors import InputError, InputTypeError, LtclError
+from ltcl.errors import InputError, InputTypeError, LtclError, MemoryLimitError
 from ltcl.operators.alias import Tables, tables
 from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.links import links
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.stopping import Rule, System
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,6 @@ def solution(
     relative, met = np.nan, False
     if found.whole:
         relative, met = _residual(system, gathered(system, found.x, add=False), rule)
-    if rule.callback is not None and found.whole:
-        rule.callback(found.iterations, relative)
     error, converged = found.standard_error, met and found.met
     advice = found.advice if found.met and not converged else ""
     return Solution(
@@ -95,9 +95,22 @@ def tables_of(channels: Sequence[Channel], method: Any) -> tuple[Tables, float]:
 
 def each_alone(method: Any, channels: Sequence[Channel], why: str) -> list[Estimate]:
     """Estimates by walks of each channel's own, where they cannot share them."""
-    found = [method.estimate([one])[0] for one in channels]
+    found = [of_channel(c, method.estimate, [one])[0] for c, one in enumerate(channels)]
     why = f"channels share no walks: {why}"
     return [dataclasses.replace(one, reason="; ".join(filter(None, (one.reason, why)))) for one in found]
+
+
+def of_channel(channel: int, f: Callable[..., Result], *given: Any, **named: Any) -> Result:
+    """f(...) of one channel of several; its refusals say of which.
+
+    >>> of_channel(2, checks.count, "samples", 0)
+    Traceback (most recent call last):
+    ltcl.errors.InputError: in channel 2: samples is 0; it must be a whole number of at least 1
+    """
+    try:
+        return f(*given, **named)
+    except (InputError, MemoryLimitError) as error:
+        raise type(error)(f"in channel {channel}: {error}") from None
 
 
 def cause(error: LtclError) -> str:
@@ -128,18 +141,25 @@ def each(found: np.ndarray, channels: Sequence[Channel]) -> list[np.ndarray]:
 
 
 def numbered(callback: Callable[[int, float], object] | None) -> Callable[[int, float], object] | None:
-    """A callback that is told of its calls in order, 0, 1, ...: of steps, and of what they made."""
-    calls = itertools.count()
-    return None if callback is None else lambda _, residual: callback(next(calls), residual)
+    """A callback that is told of its calls in order, 0, 1, ...; of several beginnings the first alone."""
+    if callback is None:
+        return None
+    heard: list[float] = []
+
+    def told(step: int, residual: float) -> None:
+        if step or not heard:
+            heard.append(residual)
+            callback(len(heard) - 1, residual)
+
+    return told
 
 
 def watch(channels: Sequence[Channel]) -> Callable[[], object]:
-    """Tell the callback that sampling begins, once a channel; what comes back tells of each step, as NaN."""
+    """Tell the callback that sampling begins; what comes back tells of each step, as NaN."""
     callback, steps = channels[0].rule.callback, itertools.count(1)
     if callback is None:
         return lambda: None
-    for _ in channels:
-        callback(0, 1.0)
+    callback(0, 1.0)
     return lambda: callback(next(steps), np.nan)
 
 
@@ -167,6 +187,15 @@ def check_whole(options: dict[str, Any]) -> None:
     """Refuse, where a task needs whole pictures, to estimate some pixels only."""
     if "pixels" in options:
         raise InputTypeError("pixels= gives some pixels alone; a picture needs all: leave it out")
+
+
+def check_method(method: str, options: Iterable[str], those: Collection[str]) -> None:
+    """Refuse options of `those` methods that sample, for one that does not."""
+    for name in options:
+        if name in ("samples", "seed") and method not in those:
+            raise InputTypeError(
+                f"unknown option {name!r}: method {method!r} does not sample; {' and '.join(those)} do"
+            )
 
 
 def check_seed(seed: Any) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
-from ltcl.solvers import refinement
+from ltcl.solvers import refinement, sampled
 from ltcl.solvers.bicgstab import BiCGStab
 from ltcl.solvers.block_gauss_seidel import BlockGaussSeidel
 from ltcl.solvers.cg import CG
@@ -161,6 +161,7 @@ def solve(
     checks.one_of("method", method, METHODS)
     settings = {"rtol": rtol, "atol": atol, "maxiter": maxiter, "x0": x0, "callback": callback}
     settings["exact"] = exact
+    _refuse_matrices(S)
     if _is_several(S):
         return joined(_in_colour(S, b, method, **settings, **options))
     chosen, given = _checked(S, b, method, **settings, **options)
@@ -203,9 +204,10 @@ def _in_colour(
         raise InputError(f"S is operators of shapes {shapes}; all must be the same")
     parts = _channels("b", b, shapes[0][0])
     guesses = [None] * n if x0 is None else _channels("x0", x0, shapes[0][0])
+    _checked(systems[0], np.zeros(shapes[0][:1]), method, **settings)  # what all channels share
     checked = [
-        _checked(S, part, method, x0=guess, **settings)
-        for S, part, guess in zip(systems, parts, guesses, strict=True)
+        sampled.of_channel(c, _checked, *one, method, x0=guess, **settings)
+        for c, (*one, guess) in enumerate(zip(systems, parts, guesses, strict=True))
     ]
     found = sample(checked[0][0], [given for _, given in checked])
     seconds = time.perf_counter() - start
@@ -256,6 +258,15 @@ def _is_several(S: Any) -> bool:
     return isinstance(S, (tuple, list)) and any(isinstance(part, Operator) for part in S)
 
 
+def _refuse_matrices(S: Any) -> None:
+    several = isinstance(S, (tuple, list)) and S and not _is_several(S)
+    if several and all(len(getattr(part, "shape", ())) == 2 for part in S):
+        raise InputTypeError(
+            f"S is {len(S)} matrices; of three colour channels it must be three Operators, such as "
+            "T.interreflection"
+        )
+
+
 def _shape(S: Any) -> tuple[int, ...]:
     """The shape of whatever was given for S, before it becomes an operator on a device."""
     if hasattr(S, "interreflection"):
@@ -293,6 +304,7 @@ def _guess(x0: Any, b: np.ndarray) -> np.ndarray | None:
 
 def _method(name: str, options: dict[str, Any]) -> Any:
     """The method with its options, None of "auto"; an unknown option is named, with those there are."""
+    sampled.check_method(name, options, SAMPLED)
     if name == "auto":
         if options:
             raise InputTypeError(f"unknown option {next(iter(options))!r}; name a method to give it options")

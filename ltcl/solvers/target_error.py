@@ -5,8 +5,9 @@ Each stage draws fresh samples, as many as the stage before it says are needed, 
 the last stage of a pixel counts. Samples chosen by their own spread would be biased: where few of them have
 met light, those that met none seem best.
 
-A spread is worth nothing where few samples carry its squares (`Sums.doubt`): then the next stage has four
-times the samples, whatever the spread says.
+A spread is worth nothing where few samples carry its squares (`Sums.doubt`), and the light that they have
+not met (`ltcl.solvers.noise`) is not as much again: then the next stage has four times the samples, whatever
+the spread says.
 """
 
 from __future__ import annotations
@@ -99,11 +100,19 @@ def sample_to(
 
 
 def _judged(sums: Sums, standard: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Samples that the next stage of each pixel needs, and whether this one met the error."""
-    certain, believed = standard == 0.0, (sums.doubt <= _DOUBT) & ~np.isnan(standard)
-    with np.errstate(over="ignore", invalid="ignore"):
-        needed = sums.samples * (standard / error) ** 2 * (1.0 + 2.0 * np.minimum(sums.doubt, 1.0))
-    more = np.where(believed, needed, np.fmax(needed, _GROWTH * sums.samples))
+    """Samples that the next stage of each pixel needs, and whether this one met the error.
+
+    The spread falls with the root of the samples, what they have not met as fast as they grow in number.
+    """
+    n, certain = sums.samples, standard == 0.0
+    spread = np.where(np.isfinite(standard), np.minimum(sums.standard_error, standard), standard)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        share = np.nan_to_num((spread / standard) ** 2)  # of the variance, and so of what there is to doubt
+        doubt = np.where(share > 0.0, np.minimum(sums.doubt, 1.0) * share, 0.0)
+        met, unmet = n * (standard / error) ** 2 * np.stack([share, (1.0 - share) * n])
+        needed = 0.5 * (met + np.sqrt(met**2 + 4.0 * unmet)) * (1.0 + 2.0 * doubt)
+    believed = (doubt <= _DOUBT) & ~np.isnan(standard)
+    more = np.where(believed, needed, np.fmax(needed, _GROWTH * n))
     more = np.where(certain, 0.0, more)
     return more.reshape(len(more), -1).max(axis=1), _all(certain | (believed & (standard <= error)))
 

@@ -66,6 +66,20 @@ def least_samples(R: Operator, Q: Operator) -> float:
     return math.floor(spare) + 1.0 if math.isfinite(spare) else math.inf
 
 
+def noise_of_iteration(Q: Operator, least: float, radius: float) -> float:
+    """About the noise that an iteration with the `least` samples ends with, in units of the light.
+
+    One product makes of light p = 1 variances of about rho(Q) / s, and the iteration multiplies them by
+    1 / (1 - rho(H) / s); `radius` is rho(Q). Of rho(H) only the margin is known that `least` leaves.
+
+    >>> from ltcl.operators import as_operator
+    >>> round(noise_of_iteration(as_operator([[0.0, 0.25], [0.25, 0.0]]), 1.0, 0.25), 2)
+    0.7
+    """
+    share = (least - 0.5) / (least * _MARGIN[Q.shape[0] <= _EXACT])
+    return math.sqrt(radius / least / (1.0 - share))
+
+
 def _variances(R: Operator, d: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """W d, of variances d >= 0; infinite where the powers of R do not fall."""
     n = len(d)

@@ -28,7 +28,9 @@ from ltcl.operators.links import Links
 from ltcl.theory.spectrum import spectral_radius
 
 _LONGEST = 0.9999  # chance to go on; beyond, walks of many thousand steps would carry nothing
+_SETTLED = 8  # steps, after which second moments of weights grow alike at all pixels
 _SHORTEST = 1 / 16  # below, terms that matter little are seen so rarely that nobody can tell their error
+_UNMET = 3.0  # rule of three
 
 
 class SecondMoments(Operator):
@@ -75,6 +77,70 @@ def second_moment_radius(R: CSR | Dense, made: Tables, columns: bool = False) ->
 def second_moments(R: CSR | Dense, made: Tables, columns: bool = False) -> Iterable[Operator]:
     """q Q, of `Links` that of each channel, for which R is not looked at. See `SecondMoments`."""
     return made.second_moments() if isinstance(made, Links) else [SecondMoments(R, made, columns)]
+
+
+def growth_of_weights(R: CSR | Dense, made: Tables, columns: bool = False) -> np.ndarray:
+    """(q Q)^k 1, k = 1 .. 8, of each channel, (channels, 8, N) float64; kept with the tables.
+
+    The mean square of the weight that walks have after k steps, without what their lengths divide it by.
+
+    >>> import ltcl
+    >>> from ltcl.operators.alias import tables
+    >>> R = Dense(ltcl.open_device(), [[0.0, 0.5], [-0.5, 0.0]])
+    >>> growth_of_weights(R, tables(R))[0, :3, 0].tolist()
+    [0.25, 0.0625, 0.015625]
+    """
+    if made.growth is None:
+        made.growth = np.stack([_powers(Q) for Q in second_moments(R, made, columns)])
+    return made.growth
+
+
+def _powers(Q: Operator) -> np.ndarray:
+    found, unit = np.ones((_SETTLED + 1, Q.shape[0])), 1.0
+    for k in range(_SETTLED):  # float32 holds what is near 1
+        found[k + 1] = Q.apply(Q.device.upload(found[k] / unit)).get() * unit
+        unit = float(found[k + 1].max()) or 1.0
+        if not math.isfinite(unit):
+            found[k + 1 :] = math.inf
+            break
+    return found[1:]
+
+
+def largest_square(growth: np.ndarray, scored: np.ndarray, worth: np.ndarray, samples: int) -> np.ndarray:
+    """Of what `samples` walks have not met: the most that it may add to the sum of squares, by |light|^2.
+
+    An event that n samples have not met has a chance of 3 / n at most, with 95 % confidence (the rule of
+    three: Hanley and Lippman-Hand, 1983), and not more than that to be scored at the step in question. Its
+    score is light times the worth of the step times the weight of the walk; of that the mean square is known:
+
+        n E[score^2] / |light|^2 <= max over steps k of min(3, n p_k) worth_k^2 ((q Q)^k 1)_i
+
+    Parameters
+    ----------
+    growth : (8, N)
+        From `growth_of_weights`; of later steps all pixels grow alike, as they did at last.
+    scored, worth : (L,)
+        p_k and worth_k, of `Lengths.scores`.
+    samples : int
+
+    Returns
+    -------
+    (N,) float64
+
+    Examples
+    --------
+    >>> largest_square(np.full((8, 1), 0.25), np.array([1.0, 0.5]), np.array([1.0, 2.0]), 100).tolist()
+    [3.0]
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        times = np.minimum(_UNMET, samples * scored) * worth**2
+        early, late = times[:_SETTLED, None], times[_SETTLED:]
+        found = np.max(early * growth[: len(early)], axis=0)
+        if late.size:
+            later = np.arange(1, late.size + 1)
+            ratio = float(growth[-1].max() / (growth[-2].max() or 1.0))
+            found = np.maximum(found, growth[-1] * np.fmax.reduce(late * ratio**later, initial=0.0))
+    return found
 
 
 def chance_to_go_on(radius: float, albedo: float | None) -> float:

@@ -135,3 +135,5 @@ def test_methods_that_do_not_sample_say_so(T, option):
     given: dict[str, Any] = {option: 3}
     with pytest.raises(InputTypeError, match=says):
         ltcl.compensate(T, np.full(T.grid, 0.2), method="jacobi", **given)
+    with pytest.raises(InputTypeError, match=says):
+        ltcl.separate(T, np.ones(T.grid), method="jacobi", **given)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,37 @@ def test_iterations_are_those_of_jacobi_and_never_above_maxiter(device):
     assert ltcl.solve(SCENE.S, b, "hybrid", iterations=5).iterations == 5
 
 
+def test_too_few_iterations_are_told_and_are_no_noise(device):
+    rho = 0.999
+    wanted = int(np.ceil(np.log(1e-2) / np.log(rho)))
+    S = np.eye(4) - rho * np.ones((4, 4)) / 4
+    for options, what in [({}, "maxiter"), ({"maxiter": 20}, "maxiter"), ({"iterations": 30}, "iterations")]:
+        found = ltcl.solve(S, np.ones(4), "hybrid", **options)
+        count = found.iterations
+        says = rf"stopped at {count} of the (\d+) iterations that rtol asks for: raise {what}=$"
+        told = re.search(says, str(found))
+        assert told is not None
+        assert int(told[1]) == pytest.approx(wanted, rel=1e-2)  # the spectral radius is that of float32
+        assert "noise" not in str(found)
+        assert "try more samples" not in str(found)
+    assert "stopped at" not in ltcl.solve(SCENE.S, np.ones(43), "hybrid", samples=2).reason
+
+
+def test_the_noise_that_the_least_samples_leave_is_told(device):
+    """Within a factor of three of what runs of many iterations end with."""
+    R = np.random.default_rng(0).standard_normal((43, 43))
+    R *= 0.75 / np.abs(np.linalg.eigvals(R)).max()
+    S, b = np.eye(43) + R, np.random.default_rng(1).random(43)
+    with pytest.raises(InputError, match="or use method='auto'") as caught:
+        ltcl.solve(S, b, "hybrid", samples=1)
+    told = re.search(r"must be (\d+) at least, which leave noise of about ([\d.]+) times", str(caught.value))
+    assert told is not None
+    exact, least = np.linalg.solve(S, b), int(told[1])
+    runs = [ltcl.solve(S, b, "hybrid", samples=least, iterations=300, seed=s).x for s in range(6)]
+    noise = np.sqrt(np.mean((np.stack(runs) - exact) ** 2) / np.mean(exact**2))
+    assert noise / 3 < float(told[2]) < 3 * noise
+
+
 def test_iterations_tell_the_callback(device):
     seen: list[tuple[int, float]] = []
     found = ltcl.solve(SCENE.S, np.ones(43), "hybrid", iterations=2, callback=lambda *step: seen.append(step))
@@ -105,6 +137,7 @@ def test_iterations_tell_the_callback(device):
         ({"seed": -1}, "seed is -1"),
         ({"seed": 1 << 64}, "it must be below 2"),
         ({"iterations": 0}, "iterations is 0"),
+        ({"iterations": 10**6}, "iterations is 1000000; it must be at most 10000"),
         ({"sampler": "none"}, "sampler is 'none'"),
         ({"gather": 1}, "gather is 1; it must be True or False"),
     ],
@@ -125,5 +158,5 @@ def test_rows_that_overflow_are_refused(device, value):
 
 def test_where_jacobi_diverges_it_is_refused(device):
     S = IdentityPlus(Dense(device, lambertian(30, 1.2).R))
-    with pytest.raises(InputError, match=r"spectral radius of R is 1.2; method='hybrid' .*chebyshev"):
+    with pytest.raises(InputError, match=r"spectral radius of R is 1.2; method='hybrid' .*use method='auto'"):
         ltcl.solve(S, np.ones(30), "hybrid")

@@ -57,14 +57,20 @@ def test_one_dark_pixel_alone_is_as_good_as_the_error_asks_for():
 
 
 @pytest.mark.parametrize("samples", [2, 64])
-def test_what_no_walk_has_met_is_unknown_and_not_certain(samples):
+def test_what_no_walk_has_met_is_part_of_the_error(samples):
     S, b, exact = corner(1)
-    error = error_of(ltcl.solve(S, b, "monte_carlo", samples=samples))
-    assert np.isnan(error).sum() > 20
-    assert not np.any(error == 0.0)
-    gathered = error_of(ltcl.solve(S, b, "monte_carlo", samples=samples, gather=True))
-    assert np.isnan(gathered).all()  # each pixel takes light from some that are unknown
+    tried: list[dict[str, Any]] = [{}, {"gather": True}]
+    for options in tried:
+        found = ltcl.solve(S, b, "monte_carlo", samples=samples, **options)
+        off = np.abs(found.x - exact)
+        assert off.max() > 10 * np.median(off)  # few have met it
+        assert np.mean(off <= 2 * error_of(found)) > 0.93
     assert np.abs(exact).min() > 0
+
+
+def test_a_single_sample_tells_nothing():
+    S, b, _ = corner(1)
+    assert not np.isfinite(error_of(ltcl.solve(S, b, "monte_carlo", samples=1))).any()
 
 
 def test_where_no_light_can_come_the_error_is_zero_and_nothing_is_spent():
@@ -86,10 +92,12 @@ def test_where_no_light_can_come_the_error_is_zero_and_nothing_is_spent():
 
 def test_a_choiceless_pixel_is_certain_and_a_lucky_one_is_not(device):
     R = CSR(device, scipy.sparse.csr_array([[0.0, 0.5, 0.0], [0.0, 0.0, 0.0], [1e-6, 0.5, 0.0]]))
-    found = ltcl.solve(IdentityPlus(R), np.array([1e3, 1.0, 1.0]), "monte_carlo", samples=64)
+    b = np.array([1e3, 1.0, 1.0])
+    exact = np.linalg.solve(np.eye(3) + R.to_dense(), b)
+    found = ltcl.solve(IdentityPlus(R), b, "monte_carlo", samples=64)
     np.testing.assert_allclose(found.x[:2], [999.5, 1.0])
     assert error_of(found)[:2].tolist() == [0.0, 0.0]
-    assert np.isnan(error_of(found)[2])
+    assert abs(found.x[2] - exact[2]) <= 2 * error_of(found)[2]
 
 
 def test_stopping_by_the_spread_leaves_no_bias(device):
@@ -99,7 +107,7 @@ def test_stopping_by_the_spread_leaves_no_bias(device):
     b[7] = 1.0
     R = Dense(device, scene.R)
     walker, light = Walker(tables(R), geometric(0.5, -1.0), "collision", 0), device.upload(b)
-    noise = Noise([(R, b)], tables(R), walker.lengths, only_dark=False)
+    noise = Noise([(R, b)], tables(R), walker.lengths, "collision")
     exact = (np.linalg.solve(scene.S, b) - b)[:, 0]
     z = []
     for seed in range(60):

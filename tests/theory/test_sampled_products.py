@@ -106,7 +106,9 @@ def test_hybrid_takes_the_least_samples_and_refuses_one_less(device, form):
     least = int(least_samples(A, SecondMoments(A, tables(A))))
     b = np.random.default_rng(0).standard_normal(31)
     assert least > 5
-    says = rf"samples is {least - 1}; .* samples= must be {least} at least, or use method='chebyshev'"
+    says = (
+        rf"samples is {least - 1}; .* must be {least} at least, which leave noise of .*, or use method='auto'"
+    )
     with pytest.raises(InputError, match=says):
         ltcl.solve(IdentityPlus(A), b, "hybrid", samples=least - 1)
     for samples in (1, least - 1):
