@@ -45,7 +45,7 @@ kernel void vector_scale_rows(int count, int k, global const real *d, global con
 
 // The sum of x y for each column. Group (g, c) sums the rows of column c that belong to slice g of
 // get_num_groups(0); a second launch with one slice, `rows` partial sums and ones == 1 (y is not read)
-// adds up the slices. Two launches of a fixed shape: the result is the same at every call.
+// adds up the slices, where there are several. Launches of a fixed shape: the result is the same at every call.
 kernel void vector_dot(
     int rows, int k, int ones, global const real *x, global const real *y, global real *out, int first,
     local real *scratch)

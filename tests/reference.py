@@ -649,8 +649,10 @@ def wavelet_join_all(x: np.ndarray, levels: int, taps: np.ndarray) -> np.ndarray
 def ordered_gather(
     order: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
 ) -> np.ndarray:
-    """out = scale * x[order] + add."""
-    out = scale * np.asarray(x, np.float64)[order]
+    """out = scale * x[order] + add, where a negative place of the order gives 0."""
+    picked = np.asarray(x, np.float64)[order]
+    picked[np.asarray(order) < 0] = 0.0
+    out = scale * picked
     return out if add is None else out + add
 
 

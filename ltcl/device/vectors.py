@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from ltcl.device.array import Array
 from ltcl.errors import InputError
 
+_AT_ONCE = 128  # values an item sums: up to so many, one group in one launch is faster than groups in two
 _SLICES = 64  # partial sums of a dot product: enough groups for a large GPU, few enough for one last group
 _COPIERS = {True: 1 << 12, False: 1 << 16}  # items of `keep` on a CPU or not: each has a rule to work out
 
@@ -95,8 +96,12 @@ def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
     kernel = device.kernel("vector", "vector_dot")
     group = 64 if device.is_cpu else 256
     group = min(group, kernel.largest_group())
-    slices = min(_SLICES, max(1, -(-rows // group)))
-    sums, scratch = device.empty((slices, k)), device.local(group)
+    scratch = device.local(group)
+    if rows <= _AT_ONCE * group:
+        kernel((group, k), (group, 1), rows, k, 0, x, y, out, slot * k, scratch)
+        return
+    slices = min(_SLICES, -(-rows // group))
+    sums = device.empty((slices, k))
     kernel((slices * group, k), (group, 1), rows, k, 0, x, y, sums, 0, scratch)
     kernel((group, k), (group, 1), slices, k, 1, sums, sums, out, slot * k, scratch)
 
