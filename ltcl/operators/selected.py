@@ -93,6 +93,14 @@ def chosen(W: Basis, places: np.ndarray) -> Basis:
     return Chained(Selected(W.device, (1, W.shape[0]), places), W)
 
 
+def on_active(core: Any, W: Basis) -> tuple[scipy.sparse.csr_array, Basis]:
+    """C and W with W^T C W as before, but of active coefficients alone where these are few."""
+    core, places = scipy.sparse.csr_array(core), active(core)
+    if places is None:
+        return core, W
+    return scipy.sparse.csr_array(core[places][:, places]), chosen(W, places)
+
+
 def _places(places: Any, pixels: int) -> np.ndarray:
     found = checks.real("places", places)
     if found.ndim != 1 or not len(found) or found.dtype.kind not in "iu":
