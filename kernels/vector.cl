@@ -51,9 +51,11 @@ kernel void vector_dot(
     local real *scratch)
 {
     const int column = get_group_id(1);
-    const int step = get_global_size(0);
+    const int slice = rows / (int)get_num_groups(0) + 1; // of rows side by side, which caches like
+    const int begin = get_group_id(0) * slice;
+    const int end = begin < rows - slice ? begin + slice : rows;
     real sum = 0;
-    for (int row = get_global_id(0); row < rows; row += step) {
+    for (int row = begin + get_local_id(0); row < end; row += get_local_size(0)) {
         const int i = row * k + column;
         sum += ones ? x[i] : x[i] * y[i];
     }

@@ -47,9 +47,10 @@ def axpby_columns(a: ArrayLike, x: Array, b: ArrayLike, y: Array, out: Array) ->
     _same_shape(x, y, out)
     k = out.columns
     with np.errstate(over="ignore"):  # a step beyond float32 becomes infinite, which the residual tells
-        ab = np.stack([np.broadcast_to(np.asarray(c).astype(np.float32), k) for c in (a, b)])
-    if k == 1 and ab.all():  # numbers travel with the launch, arrays before it
-        return axpby(ab[0, 0], x, ab[1, 0], y, out)
+        parts = [np.asarray(c).astype(np.float32) for c in (a, b)]
+    if k == 1 and all(parts):  # numbers travel with the launch, arrays before it
+        return axpby(parts[0].item(), x, parts[1].item(), y, out)
+    ab = np.stack([np.broadcast_to(part, k) for part in parts])
     _elementwise(out, "vector_axpby_columns", k, out.device.upload(ab), x, y, out)
     return out
 
