@@ -649,10 +649,17 @@ def wavelet_join_all(x: np.ndarray, levels: int, taps: np.ndarray) -> np.ndarray
 def ordered_gather(
     order: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
 ) -> np.ndarray:
-    """out = scale * x[order] + add, where a negative place of the order gives 0."""
-    picked = np.asarray(x, np.float64)[order]
-    picked[np.asarray(order) < 0] = 0.0
-    out = scale * picked
+    """out = scale * x[order] + add."""
+    out = scale * np.asarray(x, np.float64)[order]
+    return out if add is None else out + add
+
+
+def ordered_scatter(
+    order: np.ndarray, rows: int, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
+) -> np.ndarray:
+    """out[order] = scale * x, 0 in the other rows, + add."""
+    out = np.zeros((rows, *np.shape(x)[1:]))
+    out[order] = scale * np.asarray(x, np.float64)
     return out if add is None else out + add
 
 

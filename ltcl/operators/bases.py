@@ -98,7 +98,7 @@ class Ordered(Basis):
         return {**super().to_arrays(), "order": self.order}
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        gather(self._orders[transpose], x, out, scale, add)
+        move("ordered_gather", self._orders[transpose], x, out, scale, add)
 
 
 class Chained(Basis):
@@ -140,13 +140,13 @@ class Chained(Basis):
         second._product(between, out, scale, add, transpose)
 
 
-def gather(order: Array, x: Array, out: Array, scale: float, add: Array | None) -> None:
-    """out = scale * x[order] + add, where negative places of the order give 0; queued."""
-    rows, k = out.shape[0], x.columns
+def move(name: str, order: Array, x: Array, out: Array, scale: float, add: Array | None) -> None:
+    """out = scale * x[order] + add of "ordered_gather", out[order] = scale * x + add[order] of "_scatter"."""
+    rows, k = order.shape[0], x.columns
     if k == 0:
         return
     device, lanes = out.device, lanes_of(k)
-    kernel = device.kernel("ordered", "ordered_gather", K=lanes)
+    kernel = device.kernel("ordered", name, K=lanes)
     pieces = -(-k // lanes)
     across, group = (1, (1, 64)) if device.is_cpu else (pieces, group_of(pieces))
     adds, added = (0, out) if add is None else (1, add)

@@ -13,9 +13,9 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device import Array, Device
+from ltcl.device import Array, Device, vectors
 from ltcl.errors import InputError
-from ltcl.operators.bases import Basis, Chained, Ordered, gather
+from ltcl.operators.bases import Basis, Chained, Ordered, move
 
 _MOST = 0.5  # of the coefficients: where more are active, selecting them gains little
 
@@ -52,21 +52,26 @@ class Selected(Basis):
         self.places = _places(places, h * w)
         super().__init__(device, (h, w), "selected", len(self.places))
         self.orthonormal = self.shape[0] == self.shape[1]
-        back = np.full(self.shape[1], -1)
-        back[self.places] = np.arange(self.shape[0])
-        self._orders = [device.upload(order, np.int32) for order in (self.places, back)]
+        self._order = device.upload(self.places, np.int32)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the places, and of where each pixel went."""
-        return sum(order.nbytes for order in self._orders)
+        """Bytes of the places."""
+        return self._order.nbytes
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Name, grid and places."""
         return {**super().to_arrays(), "places": self.places}
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        gather(self._orders[transpose], x, out, scale, add)
+        if not transpose:
+            move("ordered_gather", self._order, x, out, scale, add)
+            return
+        if add is None:
+            vectors.fill(out, 0.0)
+        elif add is not out:
+            out.copy_from(add)
+        move("ordered_scatter", self._order, x, out, scale, add)
 
 
 def active(core: Any) -> np.ndarray | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 
-
 _FLOAT32 = np.finfo(np.float32)
 
 
