@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from ltcl.device.array import Array
 from ltcl.errors import InputError
 
-_AT_ONCE = 128  # values an item sums: up to so many, one group in one launch is faster than groups in two
+_AT_ONCE = {True: 128, False: 16}  # values an item of a CPU or not sums: up to so many, one launch will do
 _SLICES = 64  # partial sums of a dot product: enough groups for a large GPU, few enough for one last group
 _COPIERS = {True: 1 << 12, False: 1 << 16}  # items of `keep` on a CPU or not: each has a rule to work out
 
@@ -98,7 +98,7 @@ def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
     group = 64 if device.is_cpu else 256
     group = min(group, kernel.largest_group())
     scratch = device.local(group)
-    if rows <= _AT_ONCE * group:
+    if rows <= _AT_ONCE[device.is_cpu] * group:
         kernel((group, k), (group, 1), rows, k, 0, x, y, out, slot * k, scratch)
         return
     slices = min(_SLICES, -(-rows // group))
