@@ -24,7 +24,7 @@ from ltcl.compression.coefficients import coefficients
 from ltcl.compression.iteration import invert_coefficients
 from ltcl.compression.sources import source
 from ltcl.compression.thresholds import above
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Operator, Tiles, Wavelet
+from ltcl.operators import CSR, Basis, Compressed, Dense, IdentityPlus, Operator, Tiles, Wavelet, on_active
 from ltcl.scenes import CornerRows, landscape
 from ltcl.solvers import matrix_series
 from products import bisect
@@ -176,12 +176,13 @@ def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
     """The fewest numbers that will do, in 16 bits, and the iteration with these."""
     W = Wavelet(given.device, at.rows.grid, "db2")
 
-    def system(core: Operator) -> IdentityPlus:
-        return IdentityPlus(Compressed(core, W if both else None, W))
+    def system(core: Operator, V: Basis = W) -> IdentityPlus:
+        return IdentityPlus(Compressed(core, V if both else None, V))
 
     def error(threshold: float) -> float:
         return at.error(iterated(system(CSR(given.device, above(C, threshold)[0])), at, DROPPED / 10).x)
 
     threshold = bisect(error, DROPPED, float(np.abs(C.data).max()))
-    core, _ = above(C, threshold)
-    return by_steps(system(Tiles(given.device, core, 1, "float16")), at, core.nnz / len(at.l_out))
+    kept, _ = above(C, threshold)
+    core, V = on_active(kept, W) if both else (kept, W)
+    return by_steps(system(Tiles(given.device, core, 1, "float16"), V), at, core.nnz / len(at.l_out))

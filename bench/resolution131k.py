@@ -31,7 +31,7 @@ from _harness import Options, options, seconds
 from ltcl.compression.coefficients import Coefficients, coefficients
 from ltcl.compression.iteration import Iterated, invert_coefficients
 from ltcl.images import to_srgb
-from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Tiles, Wavelet
+from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Tiles, Wavelet, on_active
 from ltcl.scenes import CornerRows, dihedral, landscape
 from ltcl.scenes.viewer import draw as draw_view
 
@@ -117,7 +117,8 @@ def build(given: Options, corner: Corner) -> Built:
         with spent(f"R of albedo {albedo:g}"):
             C = (A.core * np.float32(albedo / REFERENCE)).astype(np.float32)
             found.append(invert_coefficients(C, -1, rtol=RTOL))
-        R = Compressed(Tiles(given.device, found[-1].D, 1, "float16"), W, W)
+        core, V = on_active(found[-1].D, W)
+        R = Compressed(Tiles(given.device, core, 8, "float16"), V, V)
         systems.append(IdentityPlus(R))
     F = np.repeat(np.array(ALBEDO)[:, None], corner.pixels, axis=1)
     T = ltcl.Transport(

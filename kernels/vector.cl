@@ -45,15 +45,17 @@ kernel void vector_scale_rows(int count, int k, global const real *d, global con
 
 // The sum of x y for each column. Group (g, c) sums the rows of column c that belong to slice g of
 // get_num_groups(0); a second launch with one slice, `rows` partial sums and ones == 1 (y is not read)
-// adds up the slices. Two launches of a fixed shape: the result is the same at every call.
+// adds up the slices, where there are several. Launches of a fixed shape: the result is the same at every call.
 kernel void vector_dot(
     int rows, int k, int ones, global const real *x, global const real *y, global real *out, int first,
     local real *scratch)
 {
     const int column = get_group_id(1);
-    const int step = get_global_size(0);
+    const int slice = rows / (int)get_num_groups(0) + 1; // of rows side by side, which caches like
+    const int begin = get_group_id(0) * slice;
+    const int end = begin < rows - slice ? begin + slice : rows;
     real sum = 0;
-    for (int row = get_global_id(0); row < rows; row += step) {
+    for (int row = begin + get_local_id(0); row < end; row += get_local_size(0)) {
         const int i = row * k + column;
         sum += ones ? x[i] : x[i] * y[i];
     }

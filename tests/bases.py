@@ -18,6 +18,7 @@ class Given(Basis):
         super().__init__(device, (1, matrix.shape[1]), "given", len(matrix))
         self.matrix = matrix.astype(np.float32).astype(np.float64)  # as it lies on the device
         self.orthonormal = bool(np.allclose(matrix.T @ matrix, np.eye(matrix.shape[1]), atol=1e-5))
+        self.isometric = bool(np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5))
         self._on_device = Dense(device, matrix)
 
     @property

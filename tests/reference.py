@@ -654,6 +654,15 @@ def ordered_gather(
     return out if add is None else out + add
 
 
+def ordered_scatter(
+    order: np.ndarray, rows: int, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
+) -> np.ndarray:
+    """out[order] = scale * x, 0 in the other rows, + add."""
+    out = np.zeros((rows, *np.shape(x)[1:]))
+    out[order] = scale * np.asarray(x, np.float64)
+    return out if add is None else out + add
+
+
 def pyramid_gather(x: np.ndarray) -> np.ndarray:
     """Sums of pictures (h, w, k) over the cells of all levels, (cells, k), each straight from its pixels."""
     x = np.asarray(x, np.float64)

@@ -58,7 +58,8 @@ class Confirmed:
             again: Operator = Tiles(core.device, core.packed)
         else:
             again = CSR(core.device, self.fit.coefficients.core)
-        return Compressed(again, kind.out, kind.into, error=self.norm.upper, diagonal=diagonal)
+        only = kind.only(self.fit.places)
+        return Compressed(again, only.out, only.into, error=self.norm.upper, diagonal=diagonal)
 
     def report(self, made: Choice) -> ChannelCompression:
         """What is told of this channel."""
@@ -118,10 +119,11 @@ def confirm(
     good: Confirmed | None = None
     reached = math.inf
     for _ in range(_TRIES):
-        core = cores.best(problem.device, fitted.coefficients.core, choice.ROUNDING * goal, budget)
+        active = fitted.active()
+        core = cores.best(problem.device, active.coefficients.core, choice.ROUNDING * goal, budget)
         if core.nbytes > budget:
             choice.refuse(problem, Candidate(fitted, core, None, found), rtol, budget, parts)
-        result = _measured(problem, fitted, core)
+        result = _measured(problem, active, core)
         reached = result.solution_error / rtol
         if reached <= 1.0 and (reached >= _LOOSE or not fitted.coefficients.core.nnz):
             return result

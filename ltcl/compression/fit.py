@@ -7,18 +7,20 @@ much less changes slowly with f, so that a few measured norms find the f that is
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
 
 from ltcl.compression.coefficients import Coefficients, coefficients
 from ltcl.compression.kinds import Kind
 from ltcl.compression.magnitudes import Magnitudes
 from ltcl.compression.sources import RowSource
 from ltcl.device import Device
-from ltcl.operators import CSR, Compressed, Operator
+from ltcl.operators import CSR, Compressed, Operator, active
 from ltcl.theory import TwoNorm, two_norm
 
 _STEPS = 6
@@ -57,6 +59,16 @@ class Fit:
     kind: Kind
     coefficients: Coefficients
     norm: TwoNorm
+    places: np.ndarray | None = None  # of the coefficients of the basis that are left, where not all
+
+    def active(self) -> Fit:
+        """The same R~ on the coefficients that its core acts on, where these are few and of both sides."""
+        kind, C = self.kind, self.coefficients.core
+        places = None if kind.into is None or kind.out is not kind.into else active(C)
+        if places is None:
+            return self
+        kept = dataclasses.replace(self.coefficients, core=scipy.sparse.csr_array(C[places][:, places]))
+        return Fit(kind.only(places), kept, self.norm, places)
 
     def operator(self, core: Operator) -> Compressed:
         """R~ with a core that stands for the coefficients."""

@@ -49,7 +49,9 @@ def inverse_norm(
     core = S.R.core if isinstance(S.R, Compressed) and S.R.two_sided else S.R
     found = two_norm(_Inverse(core, S.sign), confidence=confidence, factor=factor, seed=seed)
     widened = found.upper / (1.0 - _RTOL * math.sqrt(found.products))
-    return dataclasses.replace(found, upper=widened)
+    # Of some coefficients: S is the identity on the others.
+    least = 1.0 if core.shape[0] < S.shape[0] else 0.0
+    return dataclasses.replace(found, estimate=max(found.estimate, least), upper=max(widened, least))
 
 
 class _Inverse(Operator):

@@ -128,7 +128,7 @@ class _Coefficients:
 def _invert(S: IdentityPlus, rtol: float, method: str, own: Callable) -> tuple[Operator, float]:
     """A of one channel, and what solutions may be off by; `own` gives the basis of A for that of R."""
     R, off = _coefficients(S), S.solution_error
-    norm = _norm(R.matrix, 1.0, S.device)
+    norm = max(1.0, _norm(R.matrix, 1.0, S.device))  # beside active coefficients, S is the identity
     rounding = _UNIT * math.sqrt(S.shape[0]) * norm  # of x relative to x, for every unit of |b| + |A| |b|
     rest = (rtol - off - _BOUNCES * rounding) / (1.0 + off)
     if rest <= 0.0:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import Basis, Chained, Ordered, Wavelet, basis, relatives
+from ltcl.operators import Basis, Chained, Ordered, Wavelet, basis, chosen, relatives
 from ltcl.operators.wavelets import filters
 
 PIXELS, HILBERT, ROWS = "pixels", "hilbert", " rows"
@@ -29,6 +29,13 @@ class Kind:
     def transforms(self) -> tuple[Callable | None, Callable | None]:
         """Both as functions of (N, k) arrays on the host."""
         return _function(self.out), _function(self.into)
+
+    def only(self, places: np.ndarray | None) -> Kind:
+        """The same with these coefficients of the basis of both sides alone; None are all."""
+        if places is None or self.into is None or self.out is not self.into:
+            return self
+        V = chosen(self.into, places)
+        return Kind(self.name, V, V)
 
 
 def check(name: str) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -81,7 +82,7 @@ class Device:
         import pyopencl as cl
 
         shape = (shape,) if isinstance(shape, int) else tuple(shape)
-        nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        nbytes = math.prod(map(int, shape)) * np.dtype(dtype).itemsize
         if nbytes + SPARE_BYTES > self.max_allocation:
             raise MemoryLimitError(
                 f"a buffer of {checks.size(nbytes)} for an array {shape} is beyond the largest that "

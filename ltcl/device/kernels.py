@@ -34,6 +34,7 @@ class Kernel:
         self._kernel.set_scalar_arg_dtypes(list(types))
         # Arguments live in the cl_kernel until the launch: one thread at a time.
         self._lock = threading.Lock()
+        self._largest_group = 0
 
     def __call__(self, items: _Size, group: _Size | None, *arguments: Any) -> None:
         """Queue a launch over `items` rounded up to whole groups; returns at once."""
@@ -56,7 +57,11 @@ class Kernel:
         """The largest work-group this kernel can run with on its device."""
         import pyopencl as cl
 
-        return self._kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, self.device.handle)
+        if not self._largest_group:
+            self._largest_group = self._kernel.get_work_group_info(
+                cl.kernel_work_group_info.WORK_GROUP_SIZE, self.device.handle
+            )
+        return self._largest_group
 
 
 def build(device: Device, file: str, defines: dict[str, Any]) -> dict[str, Kernel]:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from ltcl.device.array import Array
 from ltcl.errors import InputError
 
+_AT_ONCE = {True: 128, False: 16}  # values an item of a CPU or not sums: up to so many, one launch will do
 _SLICES = 64  # partial sums of a dot product: enough groups for a large GPU, few enough for one last group
 _COPIERS = {True: 1 << 12, False: 1 << 16}  # items of `keep` on a CPU or not: each has a rule to work out
 
@@ -46,9 +47,10 @@ def axpby_columns(a: ArrayLike, x: Array, b: ArrayLike, y: Array, out: Array) ->
     _same_shape(x, y, out)
     k = out.columns
     with np.errstate(over="ignore"):  # a step beyond float32 becomes infinite, which the residual tells
-        ab = np.stack([np.broadcast_to(np.asarray(c).astype(np.float32), k) for c in (a, b)])
-    if k == 1 and ab.all():  # numbers travel with the launch, arrays before it
-        return axpby(ab[0, 0], x, ab[1, 0], y, out)
+        parts = [np.asarray(c).astype(np.float32) for c in (a, b)]
+    if k == 1 and all(parts):  # numbers travel with the launch, arrays before it
+        return axpby(parts[0].item(), x, parts[1].item(), y, out)
+    ab = np.stack([np.broadcast_to(part, k) for part in parts])
     _elementwise(out, "vector_axpby_columns", k, out.device.upload(ab), x, y, out)
     return out
 
@@ -95,8 +97,12 @@ def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
     kernel = device.kernel("vector", "vector_dot")
     group = 64 if device.is_cpu else 256
     group = min(group, kernel.largest_group())
-    slices = min(_SLICES, max(1, -(-rows // group)))
-    sums, scratch = device.empty((slices, k)), device.local(group)
+    scratch = device.local(group)
+    if rows <= _AT_ONCE[device.is_cpu] * group:
+        kernel((group, k), (group, 1), rows, k, 0, x, y, out, slot * k, scratch)
+        return
+    slices = min(_SLICES, -(-rows // group))
+    sums = device.empty((slices, k))
     kernel((slices * group, k), (group, 1), rows, k, 0, x, y, sums, 0, scratch)
     kernel((group, k), (group, 1), slices, k, 1, sums, sums, out, slot * k, scratch)
 

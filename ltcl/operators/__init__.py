@@ -20,6 +20,7 @@ from ltcl.operators.named_bases import basis, basis_of
 from ltcl.operators.orders import hilbert, relatives
 from ltcl.operators.packing import smallest, spread
 from ltcl.operators.pyramid import Pyramid
+from ltcl.operators.selected import Selected, active, chosen, on_active
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
 
@@ -38,16 +39,20 @@ __all__ = [
     "Pattern",
     "Pyramid",
     "ScaledColumns",
+    "Selected",
     "Shifted",
     "Sum",
     "Tiles",
     "Transposed",
     "Wavelet",
+    "active",
     "as_operator",
     "basis",
     "basis_of",
+    "chosen",
     "hilbert",
     "interreflections",
+    "on_active",
     "relatives",
     "smallest",
     "spread",

@@ -28,9 +28,12 @@ class Basis(Operator):
         As `ltcl.operators.basis` takes it, where it can.
     orthonormal : bool
         Whether W W^T = W^T W = I, so that synthesis undoes analysis and keeps norms.
+    isometric : bool
+        Whether W W^T = I at least, so that synthesis keeps norms: some coefficients of an orthonormal basis.
     """
 
     orthonormal = True
+    isometric = True
 
     def __init__(
         self, device: Device, grid: tuple[int, int], name: str, coefficients: int | None = None
@@ -95,15 +98,7 @@ class Ordered(Basis):
         return {**super().to_arrays(), "order": self.order}
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        rows, k = x.shape[0], x.columns
-        if k == 0:
-            return
-        lanes = lanes_of(k)
-        kernel = self.device.kernel("ordered", "ordered_gather", K=lanes)
-        pieces = -(-k // lanes)
-        across, group = (1, (1, 64)) if self.device.is_cpu else (pieces, group_of(pieces))
-        adds, added = (0, out) if add is None else (1, add)
-        kernel((across, min(rows, MOST)), group, rows, k, scale, adds, self._orders[transpose], x, added, out)
+        move("ordered_gather", self._orders[transpose], x, out, scale, add)
 
 
 class Chained(Basis):
@@ -126,6 +121,7 @@ class Chained(Basis):
         super().__init__(inner.device, inner.grid, f"{inner.name}, {outer.name}", outer.shape[0])
         self.outer, self.inner = outer, inner
         self.orthonormal = outer.orthonormal and inner.orthonormal
+        self.isometric = outer.isometric and inner.isometric
 
     @property
     def nbytes(self) -> int:
@@ -142,6 +138,19 @@ class Chained(Basis):
         between = self.device.empty((self.inner.shape[0], *x.shape[1:]))
         first._product(x, between, 1.0, None, transpose)
         second._product(between, out, scale, add, transpose)
+
+
+def move(name: str, order: Array, x: Array, out: Array, scale: float, add: Array | None) -> None:
+    """out = scale * x[order] + add of "ordered_gather", out[order] = scale * x + add[order] of "_scatter"."""
+    rows, k = order.shape[0], x.columns
+    if k == 0:
+        return
+    device, lanes = out.device, lanes_of(k)
+    kernel = device.kernel("ordered", name, K=lanes)
+    pieces = -(-k // lanes)
+    across, group = (1, (1, 64)) if device.is_cpu else (pieces, group_of(pieces))
+    adds, added = (0, out) if add is None else (1, add)
+    kernel((across, min(rows, MOST)), group, rows, k, scale, adds, order, x, added, out)
 
 
 def _permutation(order: Any, pixels: int) -> np.ndarray:

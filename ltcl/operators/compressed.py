@@ -3,8 +3,8 @@
 
 A picture is taken to coefficients by W_in, the core acts on these, and the transpose of W_out makes a picture
 of what it gives. Without a basis on a side, that side is of pixels: W on the right alone are the wavelet rows
-of the paper (section 6). Where both are one orthonormal basis, R has the norm, the spectrum and the solves of
-its core; see `ltcl.solvers.coefficients`.
+of the paper (section 6). Where both are one orthonormal basis, or some coefficients of one, R has the norm,
+the spectrum (and 0 beside it) and the solves of its core; see `ltcl.solvers.coefficients`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from ltcl.device import Array
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.bases import Basis, Ordered
+from ltcl.operators.selected import Selected
 
 _FEW = 4096  # pixels: the diagonal of no more is found by as many products
 
@@ -39,7 +40,7 @@ class Compressed(Operator):
     Attributes
     ----------
     two_sided : bool
-        Whether out and into are one orthonormal basis: then R is as good as its core.
+        Whether out and into are one isometric basis: then R is as good as its core.
     known_diagonal : (min(M, N),) float64 or None
         The diagonal as far as it was given or found.
 
@@ -74,7 +75,7 @@ class Compressed(Operator):
         super().__init__(core.device, (shape[0], shape[1]))
         self.core, self.out, self.into = core, out, into
         self.error = _error(core, out, into) if error is None else checks.number("error", error, least=0.0)
-        self.two_sided = out is into and out is not None and out.orthonormal
+        self.two_sided = out is into and out is not None and out.isometric
         self.known_diagonal = None if diagonal is None else _known(diagonal, min(self.shape))
         self._scratch: list[Array | None] = [None, None]
         self._lock = threading.Lock()  # a product must have the scratch to itself while it is queued
@@ -101,6 +102,10 @@ class Compressed(Operator):
             return self.core.diagonal()
         if self.out is self.into and isinstance(self.out, Ordered):
             return self.core.diagonal()[np.argsort(self.out.order)]
+        if self.out is self.into and isinstance(self.out, Selected):
+            diagonal = np.zeros(self.shape[0])
+            diagonal[self.out.places] = self.core.diagonal()
+            return diagonal
         n = min(self.shape)
         if n > _FEW:
             raise InputError(
@@ -182,10 +187,10 @@ def _refuse_misfit(name: str, basis: Basis | None, count: int, core: Operator) -
 
 
 def _error(core: Operator, *bases: Basis | None) -> float:
-    if core.error and not all(W is None or W.orthonormal for W in bases):
+    if core.error and not all(W is None or W.isometric for W in bases):
         raise InputError(
             f"error is None, and the core's, {core.error:.3g}, is not that of R in a basis that is not "
-            "orthonormal; it must be given"
+            "isometric; it must be given"
         )
     return core.error
 

@@ -12,6 +12,7 @@ from ltcl.device import Device
 from ltcl.errors import InputError
 from ltcl.operators.bases import Basis, Chained, Ordered
 from ltcl.operators.pyramid import Pyramid
+from ltcl.operators.selected import Selected
 from ltcl.operators.wavelets import Wavelet, families, is_known
 
 
@@ -67,6 +68,8 @@ def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:
     name, grid = str(arrays["name"]), tuple(np.ravel(arrays["grid"]).tolist())
     if "order" in arrays:
         return Ordered(device, grid, arrays["order"], name)
+    if "places" in arrays:
+        return Selected(device, grid, arrays["places"])
     if "levels" in arrays:
         return Wavelet(device, grid, name, np.asarray(arrays["levels"]).tolist())
     found = basis(device, grid, name)

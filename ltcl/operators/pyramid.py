@@ -48,6 +48,7 @@ class Pyramid(Basis):
     """
 
     orthonormal = False
+    isometric = False
 
     def __init__(self, device: Device, grid: tuple[int, int]) -> None:
         self.cells = _cells(checks.grid("grid", grid))

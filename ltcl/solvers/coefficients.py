@@ -5,6 +5,14 @@ Two transforms in all, where pixels take two for every product. Lengths stay wha
 them: residuals, tolerances and steps are those of pixels up to rounding, and so is the spectrum; the row sums
 that bound it stay those of S in pixels.
 
+Where W has but some coefficients of an orthonormal basis, those that C acts on (`ltcl.operators.Selected`),
+W W^T = I, but W^T W b is only a part of b. S is the identity on the rest, so that
+
+    (I + C) a = W b,    x = b + W^T (a - W b)
+
+is the solution, exactly. The residual of such an x is that of a, whatever it starts from; tolerances remain
+relative to the whole of b. Products then take as many numbers as C has rows that are not empty.
+
 Methods that read rows read those of I + C, where the core is CSR or dense: a sweep of Gauss-Seidel, SOR or
 Southwell is then over coefficients, from the first to the last, and Jacobi's splitting is the same in any
 basis. Their iterates are others than in pixels; where S is self-adjoint in the plain inner product so is
@@ -38,7 +46,8 @@ class OnCoefficients(IdentityPlus):
     """
 
     def __init__(self, S: IdentityPlus, core: Operator) -> None:
-        super().__init__(core, S.sign, S.weights)
+        super().__init__(core, S.sign)
+        self.weights = S.weights
         self._in_pixels = S
 
     def row_sums(self) -> np.ndarray:
@@ -57,9 +66,11 @@ class Space:
         """W x."""
         return x if self.W is None else self.W.apply(x)
 
-    def leave(self, a: Array) -> Array:
-        """W^T a."""
-        return a if self.W is None else self.W.apply_transpose(a)
+    def leave(self, a: Array, entered: Array, b: Array) -> Array:
+        """W^T a, and the part of b beside it that W, with W b = `entered`, has no coefficients of."""
+        if self.W is None or self.W.orthonormal:
+            return a if self.W is None else self.W.apply_transpose(a)
+        return self.W.apply_transpose(vectors.difference(a, entered, a.like()), add=b)
 
 
 def space(S: Operator, method: Any) -> Space:
@@ -74,12 +85,12 @@ def space(S: Operator, method: Any) -> Space:
 def iterate(method: Any, S: Operator, b: Array, guess: Array | None, rule: Rule) -> tuple[Array, Monitor]:
     """Run an iterative method on S x = b; the iterate to return, in pixels, and what watched it."""
     where = space(S, method)
-    system = System(where.S, where.enter(b))
+    system = System(where.S, where.enter(b), b)
     x, r = start(system, None if guess is None else where.enter(guess))
     monitor = Monitor(system, rule)
     method.iterate(system, x, r, monitor)
     best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
-    return where.leave(best), monitor
+    return where.leave(best, system.b, b), monitor
 
 
 def start(system: System, guess: Array | None) -> tuple[Array, Array]:

@@ -148,7 +148,7 @@ class Inverse:
         if b.ndim not in (1, 2) or b.shape[0] != X.shape[0] or b.size == 0:
             raise InputError(f"b has shape {b.shape}; it must be ({X.shape[0]},) or ({X.shape[0]}, k)")
         unit = units.of(b)
-        x = units.restored(X.apply(X.device.upload(b / unit)).get(), unit)
+        x = units.restored(X.apply(X.device.upload(units.scaled(b, unit))).get(), unit)
         seconds = time.perf_counter() - start
         return Solution(
             x, Status.PRECOMPUTED, 1, 1, (math.nan,), seconds, "precomputed", error=self.errors[channel]

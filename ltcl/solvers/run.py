@@ -57,6 +57,8 @@ def automatic(given: Problem) -> Solution:
 
 def wanted(b: np.ndarray, rule: Rule) -> float:
     """The relative residual that all columns have to reach; infinite where all are dark."""
+    if not np.any(rule.atol):
+        return rule.rtol if np.any(units.largest(b) > 0.0) else np.inf
     norms = np.linalg.norm(b.astype(np.float64), axis=0)
     least = np.maximum(rule.rtol, rule.atol / np.where(norms > 0.0, norms, 1.0))
     return float(np.min(np.where(norms > 0.0, least, np.inf)))
@@ -114,7 +116,7 @@ def _uploaded(given: Problem) -> tuple[Array, Array | None, Rule, np.ndarray]:
     unit, device = units.of(given.b), given.S.device
     guess = None if given.guess is None else device.upload(given.guess / unit)
     rule = dataclasses.replace(given.rule, atol=given.rule.atol / unit)
-    return device.upload(given.b / unit), guess, rule, unit
+    return device.upload(units.scaled(given.b, unit)), guess, rule, unit
 
 
 def _run_direct(method: Direct, S: Operator, b: np.ndarray, rule: Rule) -> Solution:

@@ -13,7 +13,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
-from ltcl.solvers import refinement, sampled
+from ltcl.solvers import refinement, sampled, units
 from ltcl.solvers.bicgstab import BiCGStab
 from ltcl.solvers.block_gauss_seidel import BlockGaussSeidel
 from ltcl.solvers.cg import CG
@@ -284,7 +284,7 @@ def _rule(
     rows = shape[0]
     if b.ndim not in (1, 2) or b.shape[0] != rows or b.size == 0:
         raise InputError(f"b has shape {b.shape}; it must be ({rows},) or ({rows}, k)")
-    largest = float(np.max(np.abs(b)))
+    largest = float(np.max(units.largest(b)))
     if largest > float(np.finfo(np.float32).max):
         raise InputError(f"b reaches {largest:.3g}; it must be within float32, at most 3.4e+38")
     rtol = checks.number("rtol", rtol, least=0.0, below=1.0)

@@ -29,11 +29,16 @@ _ROUNDING = 2.0**-23  # relative residual that is rounding alone, were it comput
 
 
 class System:
-    """S x = b on the device, counting products."""
+    """S x = b on the device, counting products.
 
-    def __init__(self, S: Operator, b: Array) -> None:
+    `whole` is what tolerances are relative to: b, or, where S and b are a part of a system whose other part
+    is solved already, the b of both.
+    """
+
+    def __init__(self, S: Operator, b: Array, whole: Array | None = None) -> None:
         self.S = S
         self.b = b
+        self.whole = b if whole is None else whole
         self.products = 0
 
     def apply(self, x: Array, out: Array, *, scale: float = 1.0, add: Array | None = None) -> Array:
@@ -86,7 +91,7 @@ class Monitor:
     factor: float = 1.0
 
     def __post_init__(self) -> None:
-        norms = vectors.norm(self.system.b)
+        norms = vectors.norm(self.system.whole)
         self._scale = np.where(norms > 0, norms, 1.0)
         self._history = History(self.system.b, self._scale)
         self._ahead: int | None = None  # steps from the last reading to the next, once foreseen

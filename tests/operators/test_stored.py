@@ -17,6 +17,7 @@ from ltcl.operators import (
     IdentityPlus,
     Ordered,
     Pyramid,
+    Selected,
     Shifted,
     Sum,
     Tiles,
@@ -50,6 +51,7 @@ def _systems(device, core: Any = "csr"):
     C = Chained(
         Ordered(device, (1, N), np.random.default_rng(0).permutation(N)), Wavelet(device, GRID, "haar", 1)
     )
+    V = Chained(Selected(device, GRID, np.random.default_rng(1).permutation(N)[:11]), W)
     P = Pyramid(device, GRID)
     M = P.shape[0]
     return {
@@ -57,6 +59,7 @@ def _systems(device, core: Any = "csr"):
         "rows": IdentityPlus(Compressed(_core(device, core), None, W), -1),
         "two-sided": IdentityPlus(Compressed(_core(device, core), W, W, 0.25), solution_error=0.5),
         "chained": IdentityPlus(Compressed(_core(device, core), C, C), weights=np.arange(1.0, N + 1)),
+        "selected": IdentityPlus(Compressed(_core(device, core, 11, 11), V, V, 0.1), solution_error=0.2),
         "pyramid": IdentityPlus(Compressed(_core(device, core, M, M), P, P, 0.1, diagonal=np.arange(N))),
         "two": IdentityPlus(Compressed(_core(device, core), W, C), solution_error=np.inf),
         "sum": IdentityPlus(Sum(_core(device, core), Compressed(_core(device, core, seed=1), W, W))),
@@ -76,7 +79,9 @@ def _same(a: IdentityPlus, b: IdentityPlus) -> None:
 
 
 @pytest.mark.parametrize("core", CORES, ids=str)
-@pytest.mark.parametrize("name", ["core", "rows", "two-sided", "chained", "pyramid", "two", "sum"])
+@pytest.mark.parametrize(
+    "name", ["core", "rows", "two-sided", "chained", "selected", "pyramid", "two", "sum"]
+)
 def test_the_same_bits_come_back(device, name, core):
     S = _systems(device, core)[name]
     arrays = stored.to_arrays([S])
