@@ -91,9 +91,9 @@ def compress(
 
     Notes
     -----
-    Bases are compared on the middle 64 x 64 pixels, and the best takes the whole. A sum takes the whole R into
-    host memory a few times, and is left out where there is no room. Norms are upper bounds but
-    for a probability of about two in a million over the random starts; see `ltcl.theory.two_norm`.
+    Bases are compared on the middle 64 x 64 pixels, and the best takes the whole. A sum needs host memory for
+    the whole R a few times, and is left out where there is none. Norms are upper bounds but for a probability
+    of about two in a million over the random starts; see `ltcl.theory.two_norm`.
 
     Examples
     --------
