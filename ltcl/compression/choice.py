@@ -165,9 +165,8 @@ def inverse_bound(problem: Problem, fitted: Fit) -> float:
     """Upper bound on ||S~^-1||, by the fit where it is good enough for that, else by R itself."""
     if fitted.norm.upper < 0.1:
         try:
-            return inverse_norm(
-                IdentityPlus(fit.exact(problem.device, fitted.kind, fitted.coefficients))
-            ).upper
+            R = fit.exact(problem.device, fitted.kind, fitted.coefficients)
+            return inverse_norm(IdentityPlus(R)).upper
         except ConvergenceError:
             pass
     return inverse_norm(IdentityPlus(problem.operator)).upper

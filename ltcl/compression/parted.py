@@ -111,7 +111,7 @@ def part(
     require_room(n)
     A = _all(R, memory)
     largest = float(np.abs(A).max(initial=0.0))
-    P, t, left = np.zeros_like(A), _START * largest, float(np.linalg.norm(A))
+    P, t, left = np.zeros_like(A), _START * largest, _norm(A)
     C, first = scipy.sparse.csr_array(A.shape, dtype=np.float32), left
     while left > drop and t > _LEAST * largest:
         C, left = _round(A, P, out, into, t)
