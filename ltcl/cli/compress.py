@@ -40,8 +40,8 @@ _Basis = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="pixels, hilbert, a wavelet (haar, db2, db4, ...) or its rows alone ('db2 rows'); may be given "
-        "more than once. Default: the best of these.",
+        help="pixels, hilbert, a wavelet (haar, db2, db4, ...), its rows alone ('db2 rows'), or a sum "
+        "('db2 + pixels'); may be given more than once. Default: the best of these.",
         show_default=False,
     ),
 ]

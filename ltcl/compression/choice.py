@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from ltcl import checks
-from ltcl.compression import cores, fit, kinds
+from ltcl.compression import cores, fit, kinds, parted
 from ltcl.compression.coefficients import Coefficients
 from ltcl.compression.cores import Core
 from ltcl.compression.fit import Fit, Problem
@@ -23,8 +23,8 @@ from ltcl.compression.inverse_norm import inverse_norm
 from ltcl.compression.kinds import Kind
 from ltcl.compression.magnitudes import Magnitudes
 from ltcl.compression.result import Trial
-from ltcl.errors import ConvergenceError, InputError
-from ltcl.operators import CSR, IdentityPlus
+from ltcl.errors import ConvergenceError, InputError, MemoryLimitError
+from ltcl.operators import Compressed, IdentityPlus, Sum
 
 DROPPING, ROUNDING = 0.9, 0.05  # of the goal, for what is dropped and for the rounding of the core
 GATHER = 0.7  # of the goal: Frobenius norm of what need not even be looked at
@@ -86,6 +86,8 @@ def choose(
     InputError
         None is within the budget; it says which tolerance and which budget would do.
     """
+    if all(name.endswith(kinds.SUM) for name in names):
+        parted.require_room(problem.whole or problem.pixels)
     find = find or (lambda name: kinds.kind(problem.device, problem.grid, name))
     for most in (_MOST * problem.pixels, None):
         survey = _Survey(problem, find, rtol, budget, most)
@@ -119,6 +121,12 @@ class _Survey:
 
     def add(self, name: str) -> None:
         kind, dropping = self.find(name), DROPPING * self.goal
+        if kind.sum:
+            try:
+                parted.require_room(self.problem.whole or self.problem.pixels)
+            except MemoryLimitError as error:
+                self._leave(name, 0, str(error))
+                return
         found = fit.gather(self.problem, kind, GATHER * dropping, self.most)
         alike = _kept(found, _ALIKE * self.goal)
         if alike > _WORSE * self._least:
@@ -137,8 +145,8 @@ class _Survey:
         if fitted.norm.upper > dropping:
             self._leave(name, found.core.nnz, "so many numbers are too few", fitted.norm.upper)
             return
-        core = cores.best(self.problem.device, fitted.coefficients.core, ROUNDING * self.goal, self.budget)
-        candidate = Candidate(fitted, core, _seconds(fitted, core), found)
+        core = fitted.best(self.problem.device, ROUNDING * self.goal, self.budget)
+        candidate = Candidate(fitted, core, seconds(fitted.operator(core.operator), core), found)
         self.candidates.append(candidate)
         self.trials.append(candidate.trial(self.problem.pixels))
 
@@ -157,8 +165,8 @@ def inverse_bound(problem: Problem, fitted: Fit) -> float:
     """Upper bound on ||S~^-1||, by the fit where it is good enough for that, else by R itself."""
     if fitted.norm.upper < 0.1:
         try:
-            core = CSR(problem.device, fitted.coefficients.core)
-            return inverse_norm(IdentityPlus(fitted.operator(core))).upper
+            R = fit.exact(problem.device, fitted.kind, fitted.coefficients)
+            return inverse_norm(IdentityPlus(R)).upper
         except ConvergenceError:
             pass
     return inverse_norm(IdentityPlus(problem.operator)).upper
@@ -200,7 +208,7 @@ def _allowed(problem: Problem, candidate: Candidate, rtol: float, budget: float)
     while allowed < 1.0:
         goal = allowed / inverse
         fitted = fit.fit(problem, kind, found, DROPPING * goal, fitted.coefficients.dropped)
-        core = cores.best(problem.device, fitted.coefficients.core, ROUNDING * goal, budget)
+        core = fitted.best(problem.device, ROUNDING * goal, budget)
         if core.nbytes <= _SPARE * budget:
             break
         allowed *= 1.2
@@ -217,10 +225,10 @@ def _up(error: float) -> str:
     return f"{math.ceil(error / unit) * unit:.2g}"
 
 
-def _seconds(fitted: Fit, core: Core) -> float | None:
+def seconds(R: Compressed | Sum, core: Core) -> float | None:
     """Of a product in a solve, which runs on the core alone where both bases are one."""
-    R = fitted.operator(core.operator)
-    return core.seconds if core.seconds is None or R.two_sided else cores.seconds(R)
+    alone = isinstance(R, Compressed) and R.two_sided
+    return core.seconds if core.seconds is None or alone else cores.seconds(R)
 
 
 def _timed(candidate: Candidate) -> Core:

@@ -9,6 +9,7 @@ the error is ||D_2||_F to rounding; otherwise at most the sum of both.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -59,7 +60,7 @@ class Coefficients:
         ends = np.concatenate([[0], np.cumsum(keep)])[self.core.indptr]
         core = scipy.sparse.csr_array((self.core.data[keep], self.core.indices[keep], ends), self.core.shape)
         second = math.sqrt(self.second**2 + float(gone @ gone))
-        return Coefficients(core, self.first, second, threshold)
+        return dataclasses.replace(self, core=core, second=second, threshold=threshold)
 
 
 def coefficients(

@@ -10,19 +10,21 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ltcl.compression import choice, cores, fit
+from ltcl.compression import choice, fit, sums
 from ltcl.compression.choice import Candidate, Choice
 from ltcl.compression.coefficients import Coefficients
 from ltcl.compression.cores import Core
 from ltcl.compression.fit import Fit, Problem
 from ltcl.compression.inverse_norm import inverse_norm
 from ltcl.compression.kinds import Kind
+from ltcl.compression.parted import Parted
 from ltcl.compression.result import ChannelCompression
 from ltcl.errors import InputError
-from ltcl.operators import CSR, Compressed, IdentityPlus, Operator, Tiles
+from ltcl.operators import CSR, Compressed, IdentityPlus, Operator, Sum, Tiles
 from ltcl.theory import TwoNorm, two_norm
 
 _TRIES = 6
@@ -37,7 +39,7 @@ _MORE = 4  # times the numbers kept on the window, which the whole may need
 class Confirmed:
     """R~ and what is known of it."""
 
-    operator: Compressed
+    operator: Compressed | Sum
     fit: Fit
     core: Core
     norm: TwoNorm
@@ -48,18 +50,17 @@ class Confirmed:
         """Bound on ||x~ - x|| / ||x||."""
         return self.norm.upper * self.inverse.upper
 
-    def fresh(self, kind: Kind, diagonal: np.ndarray | None) -> Compressed:
+    def fresh(self, kind: Kind, diagonal: np.ndarray | None) -> Compressed | Sum:
         """R~ again, of the same numbers but without what measuring it has left on the device.
 
         `kind` is fresh, too; `diagonal` is that of R.
         """
-        core = self.core.operator
-        if isinstance(core, Tiles):
-            again: Operator = Tiles(core.device, core.packed)
-        else:
-            again = CSR(core.device, self.fit.coefficients.core)
+        core, kept, error = self.core.operator, self.fit.coefficients, self.norm.upper
+        if isinstance(core, Sum) and isinstance(kept, Parted):
+            both = (_again(A, matrix) for A, matrix in zip(sums.parts(core), kept.parts, strict=True))
+            return sums.summed(kind, *both, error=error, diagonal=diagonal)
         only = kind.only(self.fit.places)
-        return Compressed(again, only.out, only.into, error=self.norm.upper, diagonal=diagonal)
+        return Compressed(_again(core, kept.core), only.out, only.into, error=error, diagonal=diagonal)
 
     def report(self, made: Choice) -> ChannelCompression:
         """What is told of this channel."""
@@ -120,7 +121,7 @@ def confirm(
     reached = math.inf
     for _ in range(_TRIES):
         active = fitted.active()
-        core = cores.best(problem.device, active.coefficients.core, choice.ROUNDING * goal, budget)
+        core = active.best(problem.device, choice.ROUNDING * goal, budget)
         if core.nbytes > budget:
             choice.refuse(problem, Candidate(fitted, core, None, found), rtol, budget, parts)
         result = _measured(problem, active, core)
@@ -141,6 +142,11 @@ def confirm(
         f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by {reached * rtol:.2g}; "
         "it must be larger"
     )
+
+
+def _again(core: Operator, matrix: Any) -> Operator:
+    """A core of the same numbers, `matrix` where nothing was rounded."""
+    return Tiles(core.device, core.packed) if isinstance(core, Tiles) else CSR(core.device, matrix)
 
 
 def _whole(
@@ -165,6 +171,5 @@ def _measured(problem: Problem, fitted: Fit, core: Core) -> Confirmed:
     norm = two_norm(problem.operator, R, factor=1.05, frobenius=total, seed=_FRESH)
     inverse = inverse_norm(IdentityPlus(R), factor=1.05, seed=_FRESH + 1)
     R.error = norm.upper
-    timed = core if core.seconds is None or R.two_sided else cores.seconds(R)
-    core = timed if isinstance(timed, Core) else dataclasses.replace(core, seconds=timed)
+    core = dataclasses.replace(core, seconds=choice.seconds(R, core))
     return Confirmed(R, fitted, core, norm, inverse)

@@ -15,12 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
+from ltcl.compression import cores, sums
 from ltcl.compression.coefficients import Coefficients, coefficients
+from ltcl.compression.cores import Core
 from ltcl.compression.kinds import Kind
 from ltcl.compression.magnitudes import Magnitudes
+from ltcl.compression.parted import Parted, part
 from ltcl.compression.sources import RowSource
 from ltcl.device import Device
-from ltcl.operators import CSR, Compressed, Operator, active
+from ltcl.operators import CSR, Compressed, Operator, Sum, active
 from ltcl.theory import TwoNorm, two_norm
 
 _STEPS = 6
@@ -40,6 +43,7 @@ class Problem:
     operator: Operator
     grid: tuple[int, int]
     memory: int | None = None
+    whole: int | None = None  # pixels of that which this is a window of
 
     @property
     def device(self) -> Device:
@@ -64,15 +68,26 @@ class Fit:
     def active(self) -> Fit:
         """The same R~ on the coefficients that its core acts on, where these are few and of both sides."""
         kind, C = self.kind, self.coefficients.core
-        places = None if kind.into is None or kind.out is not kind.into else active(C)
+        if kind.sum or kind.into is None or kind.out is not kind.into:
+            return self
+        places = active(C)
         if places is None:
             return self
         kept = dataclasses.replace(self.coefficients, core=scipy.sparse.csr_array(C[places][:, places]))
         return Fit(kind.only(places), kept, self.norm, places)
 
-    def operator(self, core: Operator) -> Compressed:
-        """R~ with a core that stands for the coefficients."""
+    def operator(self, core: Operator) -> Compressed | Sum:
+        """R~ with a core that stands for the coefficients; or a sum that does, of which it has the cores."""
+        if isinstance(core, Sum):
+            return sums.summed(self.kind, *sums.parts(core), error=self.norm.upper)
         return Compressed(core, self.kind.out, self.kind.into, error=self.norm.upper)
+
+    def best(self, device: Device, allowance: float, budget: float) -> Core:
+        """As `cores.best`; of a kind that is a sum, as `sums.best`."""
+        kept = self.coefficients
+        if isinstance(kept, Parted):
+            return sums.best(device, self.kind, *kept.parts, allowance, budget)
+        return cores.best(device, kept.core, allowance, budget)
 
 
 def gather(
@@ -86,6 +101,9 @@ def gather(
 
     The threshold comes from a sample; where that has misled, all is read again.
     """
+    if kind.sum:
+        assert kind.out is not None and kind.into is not None  # noqa: S101, PT018 - they are wavelets
+        return part(problem.R, kind.out, kind.into, drop, problem.memory, progress)
     wanted = drop
     while True:
         found = coefficients(
@@ -142,8 +160,16 @@ def fit(problem: Problem, kind: Kind, found: Coefficients, goal: float, start: f
 
 def measure(problem: Problem, kind: Kind, kept: Coefficients) -> Fit:
     """The 2-norm of R~ - R with these coefficients."""
-    R = Compressed(CSR(problem.device, kept.core), kind.out, kind.into)
+    R = exact(problem.device, kind, kept)
     return Fit(kind, kept, two_norm(problem.operator, R, factor=_FACTOR, frobenius=certain(kept)))
+
+
+def exact(device: Device, kind: Kind, kept: Coefficients) -> Compressed | Sum:
+    """R~ of these coefficients as they are."""
+    if isinstance(kept, Parted):
+        P, C = kept.parts
+        return sums.summed(kind, CSR(device, P), CSR(device, C))
+    return Compressed(CSR(device, kept.core), kind.out, kind.into)
 
 
 def certain(kept: Coefficients) -> float:

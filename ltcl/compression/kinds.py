@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Between which bases R is written, by name: pixels, their order, wavelets for rows or for both sides."""
+"""How R is written, by name: pixels, their order, wavelets for rows or both sides, wavelets and pixels."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Basis, Chained, Ordered, Wavelet, basis, chosen, relatives
 from ltcl.operators.wavelets import filters
 
-PIXELS, HILBERT, ROWS = "pixels", "hilbert", " rows"
-KINDS = ("db2", "haar", "db4", "db2 rows", "haar rows", PIXELS, HILBERT)  # in the order they are tried
+PIXELS, HILBERT, ROWS, SUM = "pixels", "hilbert", " rows", " + pixels"
+# In the order they are tried.
+KINDS = ("db2", "haar", "db4", "db2 rows", "haar rows", PIXELS, HILBERT, f"db2{SUM}")
 
 
 @dataclass(frozen=True)
 class Kind:
-    """R = out^T C into; None is pixels."""
+    """R = out^T C into; None is pixels. Of a `sum`, R = P + out^T C into, P sparse."""
 
     name: str
     out: Basis | None
     into: Basis | None
+    sum: bool = False
 
     @property
     def transforms(self) -> tuple[Callable | None, Callable | None]:
@@ -44,11 +46,11 @@ def check(name: str) -> str:
         raise InputTypeError(f"basis is {name!r}; it must be a name, such as {', '.join(KINDS)}")
     if name not in (PIXELS, HILBERT):
         try:
-            filters(name.removesuffix(ROWS))
+            filters(_wavelet(name))
         except InputError as error:
             raise InputError(
                 f"basis is {name!r}; it must be pixels, hilbert, or an orthonormal wavelet such as haar, db2 "
-                "or db4, with ' rows' behind it for rows alone"
+                "or db4, with ' rows' behind it for rows alone, or ' + pixels' for a sum of both"
             ) from error
     return name
 
@@ -60,10 +62,14 @@ def kind(device: Device, grid: tuple[int, int], name: str) -> Kind:
     >>> kind(ltcl.open_device(), (4, 6), "db2 rows").into.shape
     (24, 24)
     """
-    W = basis(device, grid, check(name).removesuffix(ROWS))
+    W = basis(device, grid, _wavelet(check(name)))
     if isinstance(W, Wavelet):  # large coefficients then lie side by side, in fewer tiles
         W = Chained(Ordered(device, grid, relatives(grid, W.levels), "relatives"), W)
-    return Kind(name, None if name.endswith(ROWS) else W, W)
+    return Kind(name, None if name.endswith(ROWS) else W, W, name.endswith(SUM))
+
+
+def _wavelet(name: str) -> str:
+    return name.removesuffix(ROWS) if name.endswith(ROWS) else name.removesuffix(SUM)
 
 
 def _function(W: Basis | None) -> Callable[[np.ndarray], np.ndarray] | None:

@@ -15,9 +15,10 @@ class Trial:
     Attributes
     ----------
     basis : str
-        "pixels", "hilbert", a wavelet for both sides, or one followed by " rows".
+        "pixels", "hilbert", a wavelet for both sides, or one with " rows" or " + pixels" behind it.
     format, width, precision : str, int, str
-        Of the core: "csr" or "tiles"; neighbouring columns of a tile; of its numbers.
+        Of the core: "csr" or "tiles"; neighbouring columns of a tile; of its numbers. Of a sum, where they
+        differ, that of the coefficients and that of pixels, "tiles + csr"; the width is of the coefficients.
     kept : float
         Numbers in a row.
     nbytes : int
@@ -52,11 +53,11 @@ class ChannelCompression:
     threshold : float
         Numbers below it were dropped.
     dropped : float
-        Frobenius norm of all that was dropped; where `dropped_between` is above 0, a bound on it.
+        Frobenius norm of all that was dropped; where `dropped_between` is above 0 or R is a sum, a bound.
     dropped_between : float
         The part of it that was dropped between the passes over rows and columns.
     quantisation : float
-        Frobenius norm of what rounding of the core changed.
+        Frobenius norm of what rounding of the core changed; of a sum, a bound on it.
     error, error_estimate : float
         Upper bound on the 2-norm of R~ - R, rounding included, and an estimate of it from below.
     inverse_norm : float

@@ -60,8 +60,9 @@ def compress(
     budget : int, optional
         Bytes that the cores of all channels may take on the device.
     basis : str or sequence of str, optional
-        "pixels", "hilbert" (pixels in that order), a wavelet ("haar", "db2", "db4", ... on both sides), or
-        one for rows alone ("db2 rows", the paper's). When not given, all of these are tried.
+        "pixels", "hilbert" (pixels in that order), a wavelet ("haar", "db2", "db4", ... on both sides), one
+        for rows alone ("db2 rows", the paper's), or a sum of sharp parts in pixels and the smooth rest in
+        wavelets ("db2 + pixels"). When not given, all of these are tried.
     grid : (h, w)
         Of rows. A Transport has its own, and its first bounce.
     first_bounce : (N,) or (3, N), optional
@@ -90,8 +91,9 @@ def compress(
 
     Notes
     -----
-    Bases are compared on the middle 64 x 64 pixels, and the best takes the whole. Norms are upper bounds but
-    for a probability of about two in a million over the random starts; see `ltcl.theory.two_norm`.
+    Bases are compared on the middle 64 x 64 pixels, and the best takes the whole. A sum needs host memory for
+    the whole R a few times, and is left out where there is none. Norms are upper bounds but for a probability
+    of about two in a million over the random starts; see `ltcl.theory.two_norm`.
 
     Examples
     --------

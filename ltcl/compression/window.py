@@ -34,4 +34,4 @@ def window(problem: Problem, side: int | None = None) -> Problem:
         for start, stop in cut(grid[1], at_once(problem.pixels, problem.memory)):
             place, first = row * grid[1], int(chosen[row * grid[1]])
             R[place + start : place + stop] = problem.R.rows(first + start, first + stop)[:, chosen]
-    return Problem(source("R", R), Dense(problem.device, R), grid, problem.memory)
+    return Problem(source("R", R), Dense(problem.device, R), grid, problem.memory, problem.pixels)

@@ -78,7 +78,7 @@ def test_solutions_are_within_the_bound_and_the_bound_within_the_tolerance(scene
 
 @settings(max_examples=12, deadline=None)
 @given(
-    basis=st.sampled_from(["db2", "haar", "db4 rows", "pixels", "sym4"]),
+    basis=st.sampled_from(["db2", "haar", "db4 rows", "pixels", "sym4", "haar + pixels"]),
     h=st.integers(1, 12),
     w=st.integers(1, 12),
     rtol=st.sampled_from([0.3, 0.05, 3e-3]),
