@@ -28,6 +28,8 @@ from ltcl.solvers.columns import ratio
 from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import Monitor, System
 
+_ORTHOGONAL = 2.0**-20  # ||S^T r|| / (||S|| ||r||), below which float32 makes the rest of S^T r
+
 
 @dataclass(frozen=True)
 class CG:
@@ -116,12 +118,14 @@ def _conjugate_gradients(system: System, x: Array, r: Array, monitor: Monitor, i
 def _normal_equations(system: System, x: Array, r: Array, monitor: Monitor) -> None:
     z, p, w = r.like(), r.like(), r.like()
     broken = np.zeros(r.columns, bool)
-    square = None
+    square, largest = None, np.zeros(r.columns)
     while not monitor.done(x, r, replace=True):
         step = monitor.unsolved & ~broken
         system.apply_transpose(r, z)  # 1. and 6.
         previous, square = square, vectors.dot(z, z)
-        broken |= step & (square <= 0.0)  # r is orthogonal to all that S can make
+        largest = np.maximum(largest, ratio(square, monitor.norms**2, step))  # of ||S||^2, from below
+        # Least squares: r is orthogonal to all that S can make. More steps are rounding, and make x grow.
+        broken |= step & (square <= largest * (_ORTHOGONAL * monitor.norms) ** 2)
         step &= ~broken
         if not step.any() and broken.any():
             return monitor.give_up(Status.BREAKDOWN)

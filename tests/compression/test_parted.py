@@ -60,7 +60,7 @@ def test_both_parts_leave_what_they_say(device, grid, drop):
         P, C = these.parts
         return float(np.linalg.norm(A - P.toarray() - W.T @ C.toarray() @ W))
 
-    assert error(found) == pytest.approx(found.residual, rel=1e-3, abs=1e-6 * np.linalg.norm(A))
+    assert error(found) == pytest.approx(found.residual, rel=1e-3, abs=1e-6 * float(np.linalg.norm(A)))
     assert found.residual == found.dropped <= drop
     assert np.abs(found.core.data).min(initial=np.inf) >= found.threshold
     fewer = found.above(3 * found.threshold)

@@ -195,7 +195,5 @@ def test_where_nothing_converges_it_raises_with_the_best_iterate(device, monkeyp
     assert not s.converged
     assert "gmres ended" in s.reason
     assert "cg ended" in s.reason
-    # On the normal equations of a singular S iterates may grow until rounding them is what a residual tells.
-    rounding = 2.0**-24 * np.sqrt(N) * np.linalg.norm(S, 2) * np.linalg.norm(s.x) / np.linalg.norm(b)
-    assert residual(S, s.x, b) == pytest.approx(s.residual, rel=1e-2, abs=rounding)
+    assert residual(S, s.x, b) == pytest.approx(s.residual, rel=1e-2)
     assert s.residual < 0.6  # 1/3 of the light is out of reach

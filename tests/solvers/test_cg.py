@@ -128,6 +128,19 @@ def test_normal_equations_of_a_singular_system_break_down(device):
     assert caught.value.solution.status is Status.BREAKDOWN
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_normal_equations_of_a_singular_system_end_at_its_least_squares(device, seed):
+    """Beyond them all steps are rounding, and x would grow without end."""
+    values = np.linspace(-1.0, 3.0, 9)[np.arange(60) % 9] * (np.arange(60) % 9 != 4)
+    Q = np.linalg.qr(np.random.default_rng(seed).standard_normal((60, 60)))[0]
+    S, b = (Q * values) @ Q.T, np.random.default_rng(seed).random(60)
+    s = ltcl.solve(as_operator(S, device), b, "cg", normal=True, throw=False)
+    least = np.linalg.lstsq(S, b, rcond=1e-6)[0]
+    assert s.status is Status.BREAKDOWN
+    np.testing.assert_allclose(s.x, least, atol=1e-3 * np.abs(least).max())
+    assert residual(S, s.x, b) == pytest.approx(s.residual, rel=1e-4)
+
+
 @pytest.mark.parametrize(
     ("options", "error", "says"),
     [
