@@ -25,7 +25,7 @@ import scipy.sparse.linalg
 
 ALL, QUICK = 1 << 22, 1 << 18  # entries to compare at most, in `analyze` and in passing
 _DEARER = 16  # times an entry that is found by products
-_STEPS, _RTOL = 200, 1e-6  # of conjugate gradients
+_STEPS, _RTOL = 200, 1e-10  # of conjugate gradients
 _LARGEST = 60.0  # of |log d|: beyond, there is nothing but noise to fit
 
 
