@@ -26,6 +26,7 @@ Transform = Callable[[np.ndarray], np.ndarray]  # (N, k) float32 -> (M, k) float
 _FEW = 16  # blocks tell what may be dropped between the passes
 _SHARE = 8  # one of so many rows or columns is looked at for a threshold
 _LEAST = 512  # but so many at least, or all
+_CACHED = 512  # rows of a block that are looked at together, several times
 
 
 @dataclass(frozen=True)
@@ -295,12 +296,20 @@ def _transformed(transform: Transform | None, block: np.ndarray) -> np.ndarray:
 
 def _chosen(block: np.ndarray, threshold: float) -> tuple[scipy.sparse.csc_array, list[float]]:
     """What is at least `threshold` as sparse columns, and the sum of squares of the rest in each column."""
-    keep = np.abs(block) >= threshold
-    keep &= block != 0.0
-    turned = np.ascontiguousarray(keep.T)
-    rows = np.nonzero(turned)[1]
-    ends = np.concatenate([[0], np.cumsum(np.count_nonzero(turned, axis=1))])
-    kept = scipy.sparse.csc_array((block.T[turned], rows.astype(np.int32), ends), block.shape)
+    found = [_piece(block, start, stop, threshold) for start, stop in cut(len(block), _CACHED)]
+    places, values, squares = zip(*found, strict=True)
+    rows, columns = np.divmod(np.concatenate(places), block.shape[1])
+    kept = scipy.sparse.coo_array((np.concatenate(values), (rows.astype(np.int32), columns)), block.shape)
+    return scipy.sparse.csc_array(kept), np.sum(squares, axis=0).tolist()
+
+
+def _piece(block: np.ndarray, start: int, stop: int, threshold: float) -> tuple[np.ndarray, ...]:
+    """Of some rows: places in the block and values of what is kept, and sums of squares of the rest."""
+    part = np.ascontiguousarray(block[start:stop])
+    keep = np.abs(part) >= threshold
+    keep &= part != 0.0
+    places = np.flatnonzero(keep)
+    rest = part.astype(np.float64)
+    rest.flat[places] = 0.0
     # Summed row by row: a column has the same sum in any block.
-    rest = np.where(keep, np.float32(0.0), block).astype(np.float64)
-    return kept, np.sum(np.square(rest, out=rest), axis=0).tolist()
+    return start * part.shape[1] + places, part.flat[places], np.sum(np.square(rest, out=rest), axis=0)
