@@ -20,13 +20,13 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.compression.magnitudes import Magnitudes
+from ltcl.compression.sieve import sieve
 from ltcl.compression.sources import COLUMNS, RowSource, at_once, cut
 
 Transform = Callable[[np.ndarray], np.ndarray]  # (N, k) float32 -> (M, k) float32, k a multiple of COLUMNS
 _FEW = 16  # blocks tell what may be dropped between the passes
 _SHARE = 8  # one of so many rows or columns is looked at for a threshold
 _LEAST = 512  # but so many at least, or all
-_CACHED = 512  # rows of a block that are looked at together, several times
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def coefficients(
         threshold = last.sample().threshold_for(drop, math.inf if most is None else most)
     pieces, squares, busy = [], [], last.busy
     for start, stop in cut(len(busy), at_once(last.height, memory)):
-        kept, lost = _chosen(last.block(busy[start:stop]), threshold)
+        kept, lost = sieve(last.block(busy[start:stop]), threshold)
         pieces.append(kept)
         squares += lost
         done(stop / len(busy) if out is None else 0.5 + 0.5 * stop / len(busy))
@@ -259,7 +259,7 @@ def _first_pass(
     dense: np.ndarray | None = None
     for stop, block in _blocks(R, into, memory):
         if first > 0.0:
-            kept, lost = _chosen(block, first)
+            kept, lost = sieve(block, first)
             pieces.append(kept)
             squares += lost
         else:
@@ -292,24 +292,3 @@ def _transformed(transform: Transform | None, block: np.ndarray) -> np.ndarray:
     padded = np.zeros((len(block), -(-count // COLUMNS) * COLUMNS), np.float32)
     padded[:, :count] = block
     return transform(padded)[:, :count]
-
-
-def _chosen(block: np.ndarray, threshold: float) -> tuple[scipy.sparse.csc_array, list[float]]:
-    """What is at least `threshold` as sparse columns, and the sum of squares of the rest in each column."""
-    found = [_piece(block, start, stop, threshold) for start, stop in cut(len(block), _CACHED)]
-    places, values, squares = zip(*found, strict=True)
-    rows, columns = np.divmod(np.concatenate(places), block.shape[1])
-    kept = scipy.sparse.coo_array((np.concatenate(values), (rows.astype(np.int32), columns)), block.shape)
-    return scipy.sparse.csc_array(kept), np.sum(squares, axis=0).tolist()
-
-
-def _piece(block: np.ndarray, start: int, stop: int, threshold: float) -> tuple[np.ndarray, ...]:
-    """Of some rows: places in the block and values of what is kept, and sums of squares of the rest."""
-    part = np.ascontiguousarray(block[start:stop])
-    keep = np.abs(part) >= threshold
-    keep &= part != 0.0
-    places = np.flatnonzero(keep)
-    rest = part.astype(np.float64)
-    rest.flat[places] = 0.0
-    # Summed row by row: a column has the same sum in any block.
-    return start * part.shape[1] + places, part.flat[places], np.sum(np.square(rest, out=rest), axis=0)
