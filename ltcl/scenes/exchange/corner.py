@@ -7,6 +7,7 @@ the N^2 = 4 n^4 entries of A. So A of 131072 pixels, 69 GB, comes from two table
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,31 @@ class CornerRows:
         found = np.concatenate(parts)
         found *= self.first_bounce[start:stop, None].astype(np.float32)
         return found
+
+    def matmat(self, x: np.ndarray) -> np.ndarray:
+        """A x, (N, k) float64, of the same float32 form factors as the rows.
+
+        They depend on how far apart two pixels are along the seam, so that this is a convolution there and a
+        matrix in the other direction: O(n^3) for each column, by a Fourier transform in float64.
+        """
+        n = self.n
+        x = checks.shape("x", np.asarray(x, np.float64), (self.shape[0], *np.shape(x)[1:2]))
+        waves = np.fft.rfft(x.reshape(n, 2 * n, -1), 2 * n, axis=0)
+        of_left, of_right = self._spectra
+        parts = waves.view(np.float64)  # real and imaginary side by side: the spectra are real
+        seen = np.concatenate([of_left @ parts[:, n:], of_right @ parts[:, :n]], axis=1)
+        found = np.fft.irfft(seen.view(np.complex128), 2 * n, axis=0)[:n].reshape(x.shape)
+        return found * self.first_bounce.reshape(-1, *[1] * (x.ndim - 1))
+
+    @cached_property
+    def _spectra(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cosine transforms of both tables over the distance, (n + 1, n, n): they are even in it."""
+        around = np.abs(np.arange(2 * self.n) - self.n)  # n, n - 1, ..., 0, ..., n - 1, of which n is none
+        found = []
+        for table in (self._of_left, self._of_right):
+            even = np.concatenate([table, np.zeros_like(table[:1])])[np.roll(around, self.n)]
+            found.append(np.ascontiguousarray(np.fft.rfft(even.astype(np.float64), axis=0).real))
+        return found[0], found[1]
 
     def _of_picture_row(self, r: int, first: int, last: int) -> np.ndarray:
         """Form factors of pixels first .. last - 1 of row r of the picture, (last - first, N)."""

@@ -22,6 +22,20 @@ def test_any_rows_are_those_of_the_dihedral(n, data):
     np.testing.assert_allclose(rows.rows(start, stop), A[start:stop], rtol=1e-6, atol=1e-9)
 
 
+@given(st.integers(1, 6), st.integers(0, 3))
+def test_a_product_is_that_of_the_rows(n, columns):
+    rows = CornerRows(n, albedo=(0.5, 0.25))
+    shape = (2 * n * n, columns) if columns else (2 * n * n,)
+    x = np.random.default_rng(n).standard_normal(shape)
+    exact = rows.rows(0, 2 * n * n).astype(np.float64) @ x
+    np.testing.assert_allclose(rows.matmat(x), exact, rtol=1e-6, atol=1e-6)
+
+
+def test_a_product_takes_pictures_of_its_size_alone():
+    with pytest.raises(InputError, match=r"x has shape \(3, 2\); it must be \(8, 2\)"):
+        CornerRows(2).matmat(np.ones((3, 2)))
+
+
 def test_grid_and_first_bounce_are_those_of_the_dihedral():
     rows, scene = CornerRows(3, albedo=(0.5, 0.25)), dihedral(3, albedo=(0.5, 0.25))
     assert rows.grid == scene.grid
