@@ -130,7 +130,7 @@ def relative(found: np.ndarray, exact: np.ndarray) -> float:
 
 
 def rows_at_random(given: Options, corner: Corner, built: Built, light: np.ndarray) -> tuple[float, float]:
-    """Relative errors against rows of A drawn at random: of these as they are kept, and of the exact product."""
+    """Relative errors against rows of A drawn at random: of these as kept, and of the exact product."""
     W = Wavelet(given.device, corner.rows.grid, "db2")
     A = Compressed(CSR(given.device, built.A.core), W, W)
     which = np.sort(np.random.default_rng(7).choice(corner.pixels, min(PROBES, corner.pixels), replace=False))
