@@ -20,12 +20,7 @@ SHIFT, LOWEST, BINS = 16, 95 << 7, 4096  # 128 bins an octave of float32, by its
 
 
 def errors(matrix: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Relative error of matrix @ x, which should be y, by numbers of each bin and beyond alone, (BINS,).
-
-    >>> found = errors(np.array([[0.5, 0.25]], np.float32), np.ones(2), np.array([0.75]))
-    >>> found[0].item(), kept(np.array([[0.5, 0.25]], np.float32), found, 0.4).toarray().tolist()
-    (0.0, [[0.5, 0.0]])
-    """
+    """Relative error of matrix @ x, which should be y, by numbers of each bin and beyond alone, (BINS,)."""
     squares = np.zeros(BINS)
     for number, rows in enumerate(_blocks(matrix, 0.0)):
         count = rows.shape[0]

@@ -39,7 +39,7 @@ ALBEDO, ERROR = 0.8, 0.01
 ERRORS = (0.1, 0.03, ERROR, 0.003)
 AIM = 0.99  # of an error, for what is left out; the rest is for rounding to 16 bits
 DROP = 1e-3  # of R in the Frobenius norm: coefficients that no error here needs
-FORMATS = {"pixels": "sparse rows of R", "rows": "its rows in db2", "both": "db2 on both sides"}
+FORMATS = {"pixels": "sparse rows of R", "rows": "its rows in db2", "both": "both sides in db2"}
 COLOURS = {"pixels": "#ffb347", "rows": "#7fd77f", "both": "#5cc8ff"}
 OTHERS = "#ff7f9f"
 OURS_TARGET, SCIPY_TARGET = 15.0, 30.0
@@ -202,51 +202,60 @@ def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
         470,
         "What a product with a smooth R takes",
         "Thresholding drops the far field, which is weak at every place and strong together; wavelets on",
-        "both sides keep it in a few numbers. Strong lines: 16 bits; pale: 32. Dashed: with a transform at",
-        "each end; a solve does without.",
+        "both sides keep it in a few numbers. Bold: 16 bits, or as others have it; fine: 32 bits.",
+        "Dashed: with a transform at each end, which solves do without.",
     )
     lefts, width = figures.columns(2, gap=50)
     boxes = [(left + 50, 168, width - 50, 210) for left in lefts]
     memory = figures.graph(figure, boxes[0], "Memory", "megabytes", "relative error of R l")
     time = figures.graph(figure, boxes[1], "Time", "milliseconds", "")
-    for point in points:
-        mine = [other for other in points if other.name == point.name]
-        if point is mine[0]:
-            curve(memory, mine, [other.nbytes / 1e6 for other in mine])
-            curve(time, mine, [other.pixels for other in mine], "--" if point.form == "both" else "-")
-        if point is mine[0] and point.form == "both":
-            curve(time, mine, [other.core for other in mine])
+    for name in dict.fromkeys(point.name for point in points):
+        mine = [point for point in points if point.name == name]
+        curve(memory, mine, [point.nbytes / 1e6 for point in mine])
+        if mine[0].form == "both":
+            curve(time, mine, [point.core for point in mine])
+        curve(time, mine, [point.pixels for point in mine], "--" if mine[0].form == "both" else "-")
+        if mine[0].narrow or mine[0].form == "pixels":
+            entitle(memory, mine[0])
     peers = [(name, spent) for name, spent in ms.items() if name != "dense numpy"]
     for (name, spent), marker in zip(peers, "v^<>", strict=False):
         time.plot(spent, ERROR, marker, color=OTHERS, label=name, ms=7, zorder=4, ls="none")
+    time.plot([], [], ":", color=OTHERS, lw=1, label="NumPy, dense: no error")
     sparse, best = at_one_percent(points)
-    times = f"{sparse.pixels / best.core:.0f} times less,\n{sparse.pixels / best.pixels:.0f} with transforms"
-    fewer = f"{sparse.nbytes / best.nbytes:.0f} times less"
-    across(memory, at.R.nbytes / 1e6, sparse.nbytes / 1e6, best.nbytes / 1e6, fewer)
-    across(time, ms["dense numpy"], sparse.pixels, best.core, times)
+    fewer, faster = f"{sparse.nbytes / best.nbytes:.0f}", f"{sparse.pixels / best.core:.0f}"
+    across(memory, at.R.nbytes / 1e6, (sparse.nbytes / 1e6, best.nbytes / 1e6), f"{fewer} times less")
+    text = f"{faster} times less,\n{sparse.pixels / best.pixels:.0f} with transforms"
+    across(time, ms["dense numpy"], (sparse.pixels, best.core), text)
     figure.legend(loc="lower center", ncols=6, frameon=False, labelcolor="linecolor", fontsize=9.5)
     return figure
 
 
 def curve(axes: Axes, points: list[Point], x: list[float], ls: str = "-") -> None:
-    """One format at every error; its name stands above it."""
-    one = points[0]
-    thin = one.form != "pixels" and not one.narrow
-    style: dict[str, Any] = {"alpha": 0.5, "lw": 1} if thin else {"marker": "o", "ms": 4, "lw": 2}
-    axes.loglog(x, [point.error for point in points], ls=ls, color=COLOURS[one.form], **style)
-    if not thin and ls == "-":
-        label: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 9}
-        axes.annotate(FORMATS[one.form], (x[0], one.error), (0, 8), color=COLOURS[one.form], **label)
+    """One format at every error."""
+    bold = points[0].narrow or points[0].form == "pixels"
+    style: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 2} if bold else {"alpha": 0.5, "lw": 1}
+    axes.loglog(x, [point.error for point in points], ls=ls, color=COLOURS[points[0].form], **style)
 
 
-def across(axes: Axes, dense: float, theirs: float, ours: float, text: str) -> None:
-    """How much less ours takes at 1 %, and where the dense product stands; errors as percentages."""
-    axes.axvline(dense, color=OTHERS, lw=1, ls=":", label="NumPy, dense: no error")
+def entitle(axes: Axes, first: Point) -> None:
+    """The name of a format above its largest error."""
+    style: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 9}
+    colour, words = COLOURS[first.form], FORMATS[first.form].rsplit(" ", 2)
+    name = f"{words[0]}\n{' '.join(words[1:])}"
+    axes.annotate(name, (first.nbytes / 1e6, first.error), (0, 7), color=colour, **style)
+
+
+def across(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> None:
+    """How much less ours takes at 1 % than others, and where the dense product stands."""
+    theirs, ours = pair
+    axes.vlines(dense, min(ERRORS) / 1.3, max(ERRORS), color=OTHERS, lw=1, ls=":")
     arrow = {"arrowstyle": "->", "color": INK, "shrinkA": 4, "shrinkB": 4}
     axes.annotate("", (ours, ERROR), (theirs, ERROR), arrowprops=arrow)
-    axes.text((ours * theirs**3) ** 0.25, ERROR * 1.1, text, color=INK, fontsize=9, ha="center", va="bottom")
-    axes.set_ylim(min(ERRORS) / 1.3, max(ERRORS) * 2)
-    axes.set_yticks(ERRORS, [f"{error:.2g} %" for error in 100 * np.array(ERRORS)])
+    axes.text(
+        (ours * theirs**2) ** (1 / 3), ERROR * 1.1, text, color=INK, fontsize=9, ha="center", va="bottom"
+    )
+    axes.set_ylim(min(ERRORS) / 1.3, max(ERRORS) * 3)
+    axes.set_yticks(ERRORS, [f"{100 * error:.2g} %" for error in ERRORS])
     axes.minorticks_off()
 
 
