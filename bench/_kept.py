@@ -2,7 +2,7 @@
 """Which numbers of a matrix to keep, the largest ones, so that its product with one vector has some error.
 
 One pass over the matrix tells it for every threshold: numbers are sorted into bins by size, and what each bin
-adds to each row of the product is summed. A matrix is dense or sparse; 512 rows are handled at once.
+adds to each row of the product is summed. A matrix is dense or sparse; 64 rows are handled at once.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import scipy.sparse
 
 from ltcl.compression.thresholds import above
 
-ROWS = 512
+ROWS = 64  # more, and the system hands out and takes back memory at every step
 SHIFT, LOWEST, BINS = 16, 95 << 7, 4096  # 128 bins an octave of float32, by its bits, from 2^-32 up to 1
 
 
