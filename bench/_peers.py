@@ -52,7 +52,9 @@ def _mkl(A: Any, x: np.ndarray) -> Product:
 def _torch(A: Any, x: np.ndarray) -> Product:
     torch: Any = importlib.import_module("torch")  # in no extra: it brings gigabytes
 
-    pointers, columns = (torch.from_numpy(part.astype(np.int32)) for part in (A.indptr, A.indices))
+    pointers, columns = (
+        torch.from_numpy(part.astype(np.int32, copy=False)) for part in (A.indptr, A.indices)
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that its sparse rows are in beta state
         matrix = torch.sparse_csr_tensor(pointers, columns, torch.from_numpy(A.data), size=A.shape)
