@@ -2,12 +2,13 @@
 """Which numbers of a matrix to keep, the largest ones, so that its product with one vector has some error.
 
 One pass over the matrix tells it for every threshold: numbers are sorted into bins by size, and what each bin
-adds to each row of the product is summed. A matrix is dense or sparse; 64 rows are handled at once.
+adds to each row of the product is summed. A matrix is dense or sparse; 64 rows are handled at once. The error
+of a solve is asked for at one threshold after the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,15 @@ def kept(matrix: Any, found: np.ndarray, wanted: float) -> scipy.sparse.csr_arra
     first = np.flatnonzero(found <= wanted)[-1]
     threshold = float(np.int32((LOWEST + first) << SHIFT).view(np.float32)) if first else 0.0
     return scipy.sparse.csr_array(scipy.sparse.vstack(list(_blocks(matrix, threshold)), format="csr"))
+
+
+def bisect(error: Callable[[float], float], wanted: float, high: float) -> float:
+    """About the largest threshold whose error is at most `wanted`; `high` drops everything."""
+    low = high * 2.0**-40
+    for _ in range(18):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if error(middle) <= wanted else (low, middle)
+    return low
 
 
 def _blocks(matrix: Any, threshold: float) -> Iterator[Any]:

@@ -20,6 +20,7 @@ from rich.console import Console
 
 import ltcl
 from _harness import Options
+from _kept import bisect
 from ltcl.compression.coefficients import coefficients
 from ltcl.compression.iteration import invert_coefficients
 from ltcl.compression.sources import source
@@ -27,7 +28,6 @@ from ltcl.compression.thresholds import above
 from ltcl.operators import CSR, Basis, Compressed, Dense, IdentityPlus, Operator, Tiles, Wavelet, on_active
 from ltcl.scenes import CornerRows, landscape
 from ltcl.solvers import matrix_series
-from products import bisect
 
 ALBEDO, ERROR = 0.8, 1e-2
 DROPPED = 0.7e-2  # of the error, what compression may take; the iteration has the rest

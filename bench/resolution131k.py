@@ -8,120 +8,36 @@ neighbours, 69 GB a colour, and is never formed:
     R     (I - A)^-1 - I by Chebyshev's form of eq. 21, on coefficients
     T     (I + R) F, solved on coefficients
 
-A picture in colour is compensated and its bounces are separated to 1 %. The truth needs no inverse: of a
-picture l the direct light is l - A l, and bounce k + 1 is A times bounce k. These products take all numbers
-of A, by a Fourier transform along the seam, and agree with rows drawn at random to rounding.
+A picture in colour is compensated and its bounces are separated to 1 %, the former with fewer numbers of R
+(`_built.py`). The truth needs no inverse: of a picture l the direct light is l - A l, and bounce k + 1 is A
+times bounce k. These products take all numbers of A, by a Fourier transform along the seam, and agree with
+rows drawn at random to rounding.
 """
 
 from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 
 import _figures as figures
 import ltcl
+from _built import ALBEDO, ERROR, REFERENCE, SEPARATION, Built, Corner, build, wanted_picture
 from _figures import Claim
 from _harness import Options, options, seconds
-from ltcl.compression.coefficients import Coefficients, coefficients
-from ltcl.compression.iteration import Iterated, invert_coefficients
 from ltcl.images import to_srgb
-from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Tiles, Wavelet, on_active
-from ltcl.scenes import CornerRows, dihedral, landscape
+from ltcl.operators import CSR, Compressed, Wavelet
+from ltcl.scenes import CornerRows, dihedral
 from ltcl.scenes.viewer import draw as draw_view
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ALBEDO, REFERENCE = (0.8, 0.65, 0.5), 0.5
-THRESHOLD, RTOL = 1e-4, 5e-4  # of numbers of A; of solutions with R
-ERROR, SEPARATION = 1e-2, 2e-4  # wanted; of the solves from which bounces come, which are small beside them
 BOUNCES, PROBES = 2, 64
 PAPER_PRODUCT, PAPER_PICTURE, TARGET = 33.0, 3000.0, 17.0  # ms; the paper's of one colour channel
-MEMORY = 1 << 28  # bytes of a block of rows
-note = Console(stderr=True).print
-
-
-@dataclass(frozen=True)
-class Corner:
-    """Rows of A of a reference albedo; A of a channel is a multiple of it."""
-
-    rows: CornerRows
-
-    @property
-    def pixels(self) -> int:
-        """N."""
-        return self.rows.shape[0]
-
-    def bounce(self, light: np.ndarray) -> np.ndarray:
-        """A_c l_c of every channel, (N, 3) float64, with every number of A."""
-        return self.rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
-
-
-@dataclass(frozen=True)
-class Built:
-    """What was made on the way to T."""
-
-    A: Coefficients
-    R: list[Iterated]
-    T: ltcl.Transport
-    spent: dict[str, float]
-
-
-class Stopwatch(dict[str, float]):
-    """Seconds by what they were spent on."""
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Time a block and say so."""
-        start = time.perf_counter()
-        yield
-        self[name] = time.perf_counter() - start
-        note(f"{name}: {self[name]:.3g} s")
-
-
-def build(given: Options, corner: Corner) -> Built:
-    """The transport, from rows of A alone."""
-    W, spent = Wavelet(given.device, corner.rows.grid, "db2"), Stopwatch()
-
-    def transform(x: np.ndarray) -> np.ndarray:
-        return W.apply(given.device.upload(x)).get()
-
-    def progress(share: float, last: list[float] = [0.0]) -> None:  # noqa: B006 - kept between calls
-        if share >= last[0] + 0.05:
-            last[0] = share
-            note(f"  compressing, {share:.0%}")
-
-    with spent("compressing A"):
-        A = coefficients(
-            corner.rows,
-            transform,
-            transform,
-            THRESHOLD,
-            first=THRESHOLD / 4,
-            memory=MEMORY,
-            progress=progress,
-        )
-    found, systems = [], []
-    W = Wavelet(given.device, corner.rows.grid, "db2")  # its scratch is for pictures
-    for albedo in ALBEDO:
-        with spent(f"R of albedo {albedo:g}"):
-            C = (A.core * np.float32(albedo / REFERENCE)).astype(np.float32)
-            found.append(invert_coefficients(C, -1, rtol=RTOL))
-        core, V = on_active(found[-1].D, W)
-        R = Compressed(Tiles(given.device, core, 8, "float16"), V, V)
-        systems.append(IdentityPlus(R))
-    F = np.repeat(np.array(ALBEDO)[:, None], corner.pixels, axis=1)
-    T = ltcl.Transport(
-        [ScaledColumns(S, f) for S, f in zip(systems, F, strict=True)], corner.rows.grid, first_bounce=F
-    )
-    return Built(A, found, T, spent)
 
 
 def relative(found: np.ndarray, exact: np.ndarray) -> float:
@@ -161,20 +77,20 @@ class Pictures:
 
 def pictures(corner: Corner, built: Built, spent: dict[str, float]) -> Pictures:
     """Compensate and separate a landscape, and compare with the truth."""
-    wanted = 0.05 + 0.4 * landscape(*corner.rows.grid).astype(np.float64)
+    wanted = wanted_picture(corner)
     flat = wanted.reshape(-1, 3)
     start = time.perf_counter()
-    compensation = ltcl.compensate(built.T, wanted, bounds=(-10.0, 10.0), rtol=ERROR)
+    compensation = ltcl.compensate(built.lighter, wanted, bounds=(-10.0, 10.0), rtol=ERROR)
     spent["compensate, first call"] = time.perf_counter() - start
     start = time.perf_counter()
     separation = ltcl.separate(built.T, wanted, BOUNCES, rtol=SEPARATION)
     spent["separate, first call"] = time.perf_counter() - start
-    exact = [flat - corner.bounce(flat)]
+    exact = [corner.direct(flat)]
     for _ in range(BOUNCES):
         exact.append(corner.bounce(exact[-1]))
     found = [separation.direct, *separation.bounces]
-    direct = compensation.pattern.reshape(-1, 3) * np.array(ALBEDO)
-    errors = [relative(direct, exact[0])]
+    of_pattern = compensation.pattern.reshape(-1, 3) * np.array(ALBEDO)
+    errors = [relative(of_pattern, exact[0])]
     errors += [relative(part.reshape(-1, 3), truth) for part, truth in zip(found, exact, strict=True)]
     return Pictures(wanted, compensation.pattern, found, errors)
 
@@ -184,7 +100,7 @@ def times(given: Options, built: Built, wanted: np.ndarray) -> dict[str, float]:
     pixels = wanted.reshape(-1, 3).astype(np.float32)
     x = given.device.upload(pixels[:, 0])
     out = x.like()
-    R: Any = built.T.systems[0].R
+    R: Any = built.lighter.systems[0].R
     a = given.device.upload(np.zeros(R.core.shape[1], np.float32))
     product_out = a.like()
 
@@ -197,14 +113,16 @@ def times(given: Options, built: Built, wanted: np.ndarray) -> dict[str, float]:
         given.device.finish()
 
     def solve() -> None:
-        for c, S in enumerate(built.T.systems):
+        for c, S in enumerate(built.lighter.systems):
             ltcl.solve(S, pixels[:, c], "chebyshev", rtol=ERROR)
 
     actions: dict[str, Any] = {
         "product, on coefficients": on_coefficients,
         "product, in pixels": in_pixels,
         "solve in colour": solve,
-        "compensate in colour": lambda: ltcl.compensate(built.T, wanted, bounds=(-10.0, 10.0), rtol=ERROR),
+        "compensate in colour": lambda: ltcl.compensate(
+            built.lighter, wanted, bounds=(-10.0, 10.0), rtol=ERROR
+        ),
     }
     return {name: 1e3 * spent for name, spent in seconds(actions).items()}
 
@@ -260,7 +178,8 @@ def main() -> None:
         "R, products of eq. 21": ", ".join(str(one.products) for one in built.R),
         "R, error of (I + R)(I - A~), bound": max(one.error for one in built.R),
         "R, error of (I + R)(I - A), probed": residual_at_random(given, corner, built),
-        "bytes of T": built.T.nbytes,
+        "R for patterns, numbers a row": ", ".join(f"{one.nnz / n:.3g}" for one in built.fewer),
+        "bytes of T, for bounces and for patterns": f"{built.T.nbytes}, {built.lighter.nbytes}",
         "bytes of R, were it dense": 3 * 4 * n * n,
         **{f"{name}, s": spent for name, spent in built.spent.items()},
         **{f"{name}, ms": spent for name, spent in ms.items()},
