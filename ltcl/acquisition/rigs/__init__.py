@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Set-ups of a projector and a camera, each an `ltcl.acquisition.Rig`.
+
+virtual     VirtualRig: photographs of a known T, made by sensor (noise, saturation, levels) and curves
+folder      FolderRig: patterns and a shooting list out, photographs in; shooting_list keeps the numbers,
+            photographs and exif read what a person's camera wrote
+"""
+
+from __future__ import annotations
+
+from ltcl.acquisition.rigs.virtual import VirtualRig
+
+__all__ = ["VirtualRig"]
