@@ -10,6 +10,6 @@ Codes in [0, 1] are what a projector is fed and what a camera gives; they are no
 from __future__ import annotations
 
 from ltcl.acquisition.rig import Rig, Shots
-from ltcl.acquisition.rigs import VirtualRig
+from ltcl.acquisition.rigs import FolderRig, VirtualRig
 
-__all__ = ["Rig", "Shots", "VirtualRig"]
+__all__ = ["FolderRig", "Rig", "Shots", "VirtualRig"]

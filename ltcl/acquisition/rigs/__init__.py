@@ -3,11 +3,12 @@
 
 virtual     VirtualRig: photographs of a known T, made by sensor (noise, saturation, levels) and curves
 folder      FolderRig: patterns and a shooting list out, photographs in; shooting_list keeps the numbers,
-            photographs and exif read what a person's camera wrote
+            arrivals finds the files, photographs and exif read them, sequence checks that they fit
 """
 
 from __future__ import annotations
 
+from ltcl.acquisition.rigs.folder import FolderRig
 from ltcl.acquisition.rigs.virtual import VirtualRig
 
-__all__ = ["VirtualRig"]
+__all__ = ["FolderRig", "VirtualRig"]
