@@ -33,6 +33,8 @@ class Sequence:
     def check(self, name: str, number: int, seconds: float, photograph: Photograph) -> None:
         """Refuse a photograph of another size or kind, another exposure than `seconds`, or out of order.
 
+        A number that passed is not checked again.
+
         Raises
         ------
         AcquisitionError
@@ -56,13 +58,11 @@ class Sequence:
         if time is None or not self._in_order:
             return
         place = bisect_left(self._numbers, number)
-        known = number in self._times
-        for other in [*self._numbers[:place][-1:], *self._numbers[place + known : place + known + 1]]:
+        for other in [*self._numbers[:place][-1:], *self._numbers[place : place + 1]]:
             if (time < self._times[other]) if other < number else (time > self._times[other]):
                 raise AcquisitionError(
                     f"{name} was taken at {time}, photograph {other} at {self._times[other]}, against the "
                     "order of the list; put them right (in_order=False allows one that was taken again)"
                 )
-        if not known:
-            self._numbers.insert(place, number)
+        self._numbers.insert(place, number)
         self._times[number] = time
