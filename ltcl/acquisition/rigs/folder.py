@@ -176,7 +176,7 @@ class FolderRig:
         InputError
             There are more or fewer of them than photographs are missing. Nothing is copied then.
         FileError
-            One of them is no file or of an unknown kind; or a copy cannot be written, and those before it stay.
+            One of them is no file or of an unknown kind; or a copy cannot be written, and earlier ones stay.
         """
         self._arrivals.take(files, self.missing())
 
