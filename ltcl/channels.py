@@ -15,22 +15,22 @@ from ltcl.errors import InputError
 _WORST = 1e6  # condition number of a mixing, at which float32 has hardly a digit left
 
 
-def own(matrix: Any) -> tuple[Any, ...]:
-    """The checked matrices of 1 or 3 channels; one of a sequence is grey."""
+def own(matrix: Any, name: str = "matrix") -> tuple[Any, ...]:
+    """The checked matrices of 1 or 3 channels; one of a sequence is grey. `name` is for refusals."""
     if _is_matrix(matrix):
         parts = [matrix]
     elif isinstance(matrix, (list, tuple)) and any(_is_matrix(part) for part in matrix):
         parts = list(matrix)
     else:
-        array = checks.real("matrix", matrix)
+        array = checks.real(name, matrix)
         parts = list(array) if array.ndim == 3 else [array]
     if len(parts) not in (1, 3):
-        raise InputError(f"matrix has {len(parts)} channels; it must be one matrix, or three for RGB")
-    names = ["matrix"] if len(parts) == 1 else [f"matrix[{channel}]" for channel in range(3)]
-    checked = tuple(_checked(name, part) for name, part in zip(names, parts, strict=True))
+        raise InputError(f"{name} has {len(parts)} channels; it must be one matrix, or three for RGB")
+    names = [name] if len(parts) == 1 else [f"{name}[{channel}]" for channel in range(3)]
+    checked = tuple(_checked(each, part) for each, part in zip(names, parts, strict=True))
     shapes = [part.shape for part in checked]
     if len(set(shapes)) > 1:
-        raise InputError(f"matrix has channels of shapes {shapes}; all must be the same")
+        raise InputError(f"{name} has channels of shapes {shapes}; all must be the same")
     return checked
 
 

@@ -34,6 +34,18 @@ class DeviceError(LtclError, RuntimeError):
     """An OpenCL device is missing, or failed; the message says what to do."""
 
 
+class AcquisitionError(LtclError, RuntimeError):
+    """A photograph is missing, stale or unusable, or the rig failed; the message says which and why."""
+
+
+class PhotographMissing(AcquisitionError):
+    """A photograph has yet to be taken by a person; `number` is its place in the shooting list."""
+
+    def __init__(self, message: str, number: int) -> None:
+        super().__init__(message)
+        self.number = number
+
+
 class ConvergenceError(LtclError, ArithmeticError):
     """A solve did not reach its tolerance. `solution` holds the best iterate and the history.
 

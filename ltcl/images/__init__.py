@@ -8,7 +8,9 @@ ignored), and values are clipped to [0, 1] only where an integer format can hold
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ from ltcl.images.pictures import as_picture
 from ltcl.images.scaling import resize
 from ltcl.images.srgb import from_srgb, to_srgb
 
-__all__ = ["BITS", "from_srgb", "read", "resize", "to_srgb", "write"]
+__all__ = ["BITS", "from_srgb", "read", "read_codes", "resize", "to_srgb", "write"]
 
 BITS: dict[str, tuple[int, ...]] = {**raster.BITS, ".exr": (32, 16)}
 """Known extensions and the bits per channel that each can be written with, the default first."""
@@ -65,11 +67,50 @@ def read(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> np.nda
     """
     checks.one_of("encoding", encoding, codes.ENCODINGS)
     path = as_path(path)
+    stored = read_codes(path)
+    with _naming(path):
+        return codes.to_linear(stored, encoding)
+
+
+def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read what a picture file holds, as it stands: no transfer curve, no scale, no rotation.
+
+    Parameters
+    ----------
+    path
+        As in `read`.
+
+    Returns
+    -------
+    np.ndarray
+        (h, w) or (h, w, 3) RGB; uint8, uint16, float16, float32 or float64, as the file holds it. Floats may
+        be NaN.
+
+    Raises
+    ------
+    FileError, MemoryLimitError
+        As in `read`.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> path = Path(tempfile.mkdtemp()) / "grey.png"
+    >>> write(path, np.full((1, 2), 0.5), encoding="linear")
+    >>> read_codes(path)
+    array([[128, 128]], dtype=uint8)
+    """
+    path = as_path(path)
     _bits(path)
     input_file(path)
+    with _naming(path):
+        return exr.read(path) if path.suffix.lower() == ".exr" else raster.read(path)
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Put the name of the file in front of what its reading refuses."""
     try:
-        stored = exr.read(path) if path.suffix.lower() == ".exr" else raster.read(path)
-        return codes.to_linear(stored, encoding)
+        yield
     except MemoryLimitError as error:
         raise MemoryLimitError(f"{path}: {error}") from None
     except InputError as error:

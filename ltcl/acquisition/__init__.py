@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""From photographs to a transport: what drives projectors and cameras, and what their pictures say.
+
+    rig         Rig, what a set-up of projector and camera must offer; Shots, which checks and counts
+    rigs/       set-ups: virtual (over a known T), folder (photographs taken by a person)
+
+Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
+"""
+
+from __future__ import annotations
+
+from ltcl.acquisition.rig import Rig, Shots
+from ltcl.acquisition.rigs import FolderRig, VirtualRig
+
+__all__ = ["FolderRig", "Rig", "Shots", "VirtualRig"]
