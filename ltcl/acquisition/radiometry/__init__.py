@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Light from the codes of a camera, and codes for the light of a projector.
+
+    stack           photographs of one scene at several exposures, checked
+    response        Response: from codes to linear light
+    curve           monotone splines, and least squares over them
+    calibration     calibrate: the response from photographs alone; consistency
+    noise           NoiseModel; estimate: from repeated photographs
+    merge           merge: photographs to Radiance, with its variance and what of it is valid
+
+A linear value is light on the sensor, 1 at the largest code; radiance is linear value per second.
+"""
+
+from __future__ import annotations
+
+from ltcl.acquisition.radiometry.calibration import calibrate, consistency
+from ltcl.acquisition.radiometry.merge import Radiance, merge
+from ltcl.acquisition.radiometry.noise import NoiseModel, estimate
+from ltcl.acquisition.radiometry.response import Response
+
+__all__ = ["NoiseModel", "Radiance", "Response", "calibrate", "consistency", "estimate", "merge"]
