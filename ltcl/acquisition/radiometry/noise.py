@@ -19,7 +19,7 @@ import scipy.optimize
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.response import Response
-from ltcl.acquisition.radiometry.stack import normalised, photographs
+from ltcl.acquisition.radiometry.stack import levels_of, normalised, photographs
 from ltcl.errors import InputError
 
 _BINS, _ROUNDS = 64, 10
@@ -116,8 +116,7 @@ def estimate(
         shots = photographs(f"bursts[{number}]", burst)
         if len(shots) < 2:
             raise InputError(f"bursts[{number}] holds one photograph; noise needs two at least")
-        if levels is None:
-            levels = 0 if shots[0].dtype.kind == "f" else np.iinfo(shots[0].dtype).max + 1
+        levels = levels_of(shots, levels)
         rows.append(_moments(shots, response, levels, saturation))
     model = NoiseModel(1.0, 0.0, black, saturation, levels or 0)
     return _line(np.concatenate(rows, axis=1), model)

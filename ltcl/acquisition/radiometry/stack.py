@@ -110,14 +110,15 @@ def stack(images: Sequence[Any], seconds: Any, levels: int | None = None) -> Sta
         raise InputError(
             f"seconds is {seconds!r}; it must be {len(found)} positive number(s), one for each photograph"
         )
-    levels = _levels(found, levels)
+    levels = levels_of(found, levels)
     order = np.argsort(times, kind="stable")
     made = Stack(tuple(found[k] for k in order), times[order], levels)
     _check_order(made, order)
     return made
 
 
-def _levels(images: tuple[np.ndarray, ...], levels: int | None) -> int:
+def levels_of(images: tuple[np.ndarray, ...], levels: int | None) -> int:
+    """Codes of the camera: as given, where photographs allow it, or by their type; 0 of floats."""
     dtype = images[0].dtype
     natural = 0 if dtype.kind == "f" else np.iinfo(dtype).max + 1
     if levels is None:
