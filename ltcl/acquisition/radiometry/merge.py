@@ -36,7 +36,7 @@ from ltcl.acquisition.radiometry.stack import Stack, stack
 from ltcl.errors import InputError
 
 _MARGIN = 2.0  # standard deviations: clipping there moves a mean by less than a hundredth of one
-_BLOCK = 1 << 14  # pixels at once: all of an exposure's arrays stay in the cache
+_BLOCK = 1 << 15  # pixels at once: enough to hide the calls, few enough for the cache
 _VALUES = 4096  # linear values that weights are tabulated at
 _TINY = np.float32(1e-30)
 
