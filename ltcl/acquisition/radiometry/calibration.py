@@ -62,7 +62,8 @@ def calibrate(
     Parameters
     ----------
     images : sequence of (H, W) or (H, W, 3)
-        uint8, uint16, or floats in [0, 1]; nothing may move between them.
+        uint8, uint16, or floats in [0, 1]; nothing may move between them. Pixels from black to white tell
+        most: photographs under a black projector may be put beside those under a white one.
     seconds : (K,)
         Of each photograph, in any order.
     levels : int, optional

@@ -39,7 +39,7 @@ def choose(
     response: Response | None = None,
     noise: NoiseModel | None = None,
     *,
-    snr: float = 100.0,
+    snr: float = 50.0,
     most: int = MOST,
     exposures: Sequence[float] | None = None,
     levels: int | None = None,
@@ -55,7 +55,8 @@ def choose(
     response, noise, levels
         As in `merge`.
     snr : float
-        Signal over noise to reach in a merged pixel, from the darkest 2 % of the lit pixels on.
+        Signal over noise to reach in a merged pixel, from the darkest 2 % of the lit pixels on. One exposure
+        has at most the root of the camera's electrons, at its brightest.
     most : int
         Exposures at most, up to 8.
     exposures : sequence of float, optional
