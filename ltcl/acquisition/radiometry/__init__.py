@@ -4,7 +4,8 @@
     stack           photographs of one scene at several exposures, checked
     response        Response: from codes to linear light
     curve           monotone splines, and least squares over them
-    calibration     calibrate: the response from photographs alone; consistency
+    calibration     calibrate: the response from photographs alone
+    consistency     how far photographs, seconds and response agree
     noise           NoiseModel; estimate: from repeated photographs
     merge           merge: photographs to Radiance, with its variance and what of it is valid
     exposures       choose: which ones to take; bracket: which ones to calibrate from
@@ -19,8 +20,9 @@ from __future__ import annotations
 
 from ltcl.acquisition.radiometry import black, colour, projector
 from ltcl.acquisition.radiometry.black import Black
-from ltcl.acquisition.radiometry.calibration import calibrate, consistency
+from ltcl.acquisition.radiometry.calibration import calibrate
 from ltcl.acquisition.radiometry.colour import mixing, unmix
+from ltcl.acquisition.radiometry.consistency import consistency
 from ltcl.acquisition.radiometry.exposures import bracket, choose
 from ltcl.acquisition.radiometry.merge import Radiance, merge
 from ltcl.acquisition.radiometry.noise import NoiseModel, estimate

@@ -128,7 +128,7 @@ def measure(
 
 
 def _offset(light: np.ndarray, bracket: Stack, noise: NoiseModel) -> tuple[float, float]:
-    """B and its standard error, of light (K, P)."""
+    """Offset of light (K, P), and its standard error."""
     y = light[:, light.max(axis=0) <= noise.saturation].astype(np.float64)
     if y.shape[1] == 0:
         raise InputError("images are saturated at every pixel; take shorter ones, or less ambient light")

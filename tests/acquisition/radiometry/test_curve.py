@@ -10,7 +10,7 @@ CODES = np.linspace(0, 1, 801)
 
 
 def fitted(values: np.ndarray, anchor: float = 0.7) -> np.ndarray:
-    """The curve of least squares through values at CODES, of a fixed height at the anchor, scaled to end at 1."""
+    """Least squares through values at CODES, of a given height at the anchor; scaled to end at 1."""
     B = curve.design(CODES)
     at = np.array([anchor])
     theta = curve.fit(B.T @ B, -B.T @ values, at, float(np.interp(anchor, CODES, values)))
