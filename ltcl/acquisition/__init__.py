@@ -3,6 +3,7 @@
 
     rig         Rig, what a set-up of projector and camera must offer; Shots, which checks and counts
     rigs/       set-ups: virtual (over a known T), folder (photographs taken by a person)
+    radiometry/ light from codes: response, noise, exposures, black, merging, colours
 
 Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
 """
