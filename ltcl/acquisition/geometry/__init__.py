@@ -6,7 +6,7 @@ classification         direct and indirect light; which bits are certain
 consistency, subpixel  neighbours that do not fit; fractions of a pixel from the edges of stripes
 correspondence         the map; `decode` makes it from photographs at hand
 measure                drives a projector and a camera through the patterns
-resample               photographs on the projector's grid, by area
+footprints, resample   what a camera pixel covers; photographs on the projector's grid, by area
 """
 
 from __future__ import annotations
@@ -15,5 +15,6 @@ from ltcl.acquisition.geometry.correspondence import Correspondence, decode
 from ltcl.acquisition.geometry.gray import GrayCode
 from ltcl.acquisition.geometry.measure import measure
 from ltcl.acquisition.geometry.phase import PhaseShift
+from ltcl.acquisition.geometry.resample import Resampling
 
-__all__ = ["Correspondence", "GrayCode", "PhaseShift", "decode", "measure"]
+__all__ = ["Correspondence", "GrayCode", "PhaseShift", "Resampling", "decode", "measure"]
