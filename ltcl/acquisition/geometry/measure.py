@@ -17,6 +17,7 @@ from ltcl.errors import InputError
 
 SMALL = 128  # sides up to here take narrow stripes in every pattern: the wide ones would be whole walls
 PROBES = 8
+STEPS = 1.5  # of the camera's codes: the least difference that counts
 BRIGHT, DIM = 0.95, 0.3  # of full scale, at the brightest pixels
 
 
@@ -45,6 +46,8 @@ def measure(
     Parameters
     ----------
     shots : object with ``photograph(codes, seconds)``
+        Used where it has them: `exposures`, the seconds to choose from; `levels`, the largest code of an integer
+        camera; `prepare`, told of all (codes, seconds) that come next.
     grid : (h, w)
         Of the projector; a side of 1 takes no patterns.
     phase : bool
@@ -88,9 +91,13 @@ def measure(
     if seconds is None:
         seconds = _exposure(shots, grid)
     checks.number("seconds", seconds, above=0.0)
-    known = code.decode(_take(shots, code, seconds), sigmas=sigmas, dark=dark, edges=True)
+    patterns = [*code.patterns(), *(shift.patterns() if shift else [])]
+    images = _take(shots, patterns, seconds)
+    # A difference of one step of the camera tells nothing.
+    dark = max(dark, STEPS / (getattr(shots, "levels", None) or np.inf))
+    known = code.decode(images[: code.count], sigmas=sigmas, dark=dark, edges=True)
     if shift is not None:
-        known = shift.decode(_take(shots, shift, seconds), known, sigmas=sigmas, dark=dark)
+        known = shift.decode(images[code.count :], known, sigmas=sigmas, dark=dark)
     found = Correspondence.of(*known, grid)
     if not found.valid.any():
         raise InputError(
@@ -99,8 +106,11 @@ def measure(
     return found
 
 
-def _take(shots: Shots, code: GrayCode | PhaseShift, seconds: float) -> list[np.ndarray]:
-    return [np.asarray(shots.photograph(pattern, seconds)) for pattern in code.patterns()]
+def _take(shots: Shots, patterns: list[np.ndarray], seconds: float) -> list[np.ndarray]:
+    tell = getattr(shots, "prepare", None)
+    if tell is not None:
+        tell((pattern, seconds) for pattern in patterns)
+    return [np.asarray(shots.photograph(pattern, seconds)) for pattern in patterns]
 
 
 def _exposure(shots: Shots, grid: tuple[int, int], seconds: float = 1 / 60) -> float:
