@@ -18,6 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+ENOUGH = 6  # pairs that tell a variance
+
 
 @dataclass(frozen=True)
 class Bits:
@@ -44,12 +46,22 @@ def direct_global(lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def noise(pattern: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Variance of one photograph, from B pairs (B, ...): a pattern and its inverse always sum to white.
 
-    What that sum varies by is noise of two photographs; drift and flicker count, too. With one pair there
-    is nothing to compare, and the answer is 0.
+    What that sum varies by is noise of two photographs; drift and flicker count, too. Raw pictures keep that
+    sum only where both are the lightest and the darkest they get, and so only those pairs count where there
+    are enough of them. With one pair there is nothing to compare, and the answer is 0.
     """
     if len(pattern) < 2:
         return np.zeros(pattern.shape[1:], np.float32)
-    return (pattern + inverse).var(axis=0, ddof=1) / 2.0
+    total, difference = pattern + inverse, np.abs(pattern - inverse)
+    plain = total.var(axis=0, ddof=1)
+    far = difference > 0.7 * difference.max(axis=0)
+    count = np.count_nonzero(far, axis=0)
+    total -= total.mean(axis=0)  # small numbers, for the squares
+    total *= far
+    mean = total.sum(axis=0) / np.maximum(count, 1)
+    square = np.einsum("b...,b...->...", total, total)
+    chosen = np.maximum(square - count * mean**2, 0.0) / np.maximum(count - 1, 1)
+    return np.where(count >= ENOUGH, np.minimum(chosen, plain), plain) / 2.0
 
 
 def classify(

@@ -46,8 +46,8 @@ def measure(
     Parameters
     ----------
     shots : object with ``photograph(codes, seconds)``
-        Used where it has them: `exposures`, the seconds to choose from; `levels`, the largest code of an integer
-        camera; `prepare`, told of all (codes, seconds) that come next.
+        Used where it has them: `exposures`, the seconds to choose from; `levels`, the largest code of an
+        integer camera; `prepare`, told of all (codes, seconds) that come next.
     grid : (h, w)
         Of the projector; a side of 1 takes no patterns.
     phase : bool
