@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ltcl.acquisition.geometry import Correspondence, GrayCode, decode
+from ltcl.acquisition.geometry import Correspondence, GrayCode, classification, decode
 from ltcl.errors import InputError
 from tests.acquisition.geometry.scenes import Rig, homography
 
@@ -163,3 +163,18 @@ def test_a_correspondence_refuses_what_does_not_fit():
     assert np.isnan(Correspondence(one * np.nan, one, one, one < 0, (3, 4)).x).all()
     with pytest.raises(InputError, match="tell no homography"):
         Correspondence(one, one, one, one > 0, (3, 4)).homography()
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_noise_is_known_without_more_photographs(gamma):
+    """Also from raw pictures, where a half-lit pair sums to something else."""
+    rng, sigma = np.random.default_rng(6), 0.01
+    lit = rng.choice([0.0, 0.02, 0.98, 1.0], (20, 5000))
+    lit[:2] = 0.5
+    pairs = [share ** (1 / gamma) + sigma * rng.standard_normal(lit.shape) for share in (lit, 1 - lit)]
+    if gamma == 1.0:
+        assert np.mean(classification.noise(*pairs)) == pytest.approx(sigma**2, rel=0.05)
+    ends = [(share > 0.5) + sigma * rng.standard_normal(lit.shape) for share in (lit, 1 - lit)]
+    for pair, full in zip(pairs, ends, strict=True):
+        pair[2:] = full[2:]
+    assert np.mean(classification.noise(*pairs)) == pytest.approx(sigma**2, rel=0.1)

@@ -132,3 +132,22 @@ def test_a_period_shorter_than_the_grid_needs_gray_code():
     shift = PhaseShift((8, 32))
     with pytest.raises(InputError, match="span the 32 pixels"):
         shift.decode(shift.patterns())
+
+
+def test_a_rig_hears_what_comes_next_and_its_steps_count():
+    x, y = homography((40, 50), (16, 16))
+
+    class Camera(Rig):
+        levels, exposures, told = 255, (1 / 500, 1 / 60, 1 / 4), 0
+
+        def prepare(self, shots):
+            self.told += len(list(shots))
+
+        def photograph(self, codes, seconds):
+            assert seconds in self.exposures
+            return super().photograph(codes, seconds)
+
+    rig = Camera(x, y, (16, 16), bits=8, noise=0.002)
+    assert measure(rig, (16, 16)).decoded > 0.9
+    assert rig.told == 2 * 8 + 2 + 2 * 6
+    assert rig.taken == rig.told + 1  # white, to find the exposure
