@@ -4,13 +4,15 @@
     rig         Rig, what a set-up of projector and camera must offer; Shots, which checks and counts
     rigs/       set-ups: virtual (over a known T), folder (photographs taken by a person)
     radiometry/ light from codes: response, noise, exposures, black, merging, colours
+    geometry/   which projector pixel a camera pixel sees: Gray code, phase shift, resampling
 
 Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
 """
 
 from __future__ import annotations
 
+from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.rigs import FolderRig, VirtualRig
 
-__all__ = ["FolderRig", "Rig", "Shots", "VirtualRig"]
+__all__ = ["Correspondence", "FolderRig", "Rig", "Shots", "VirtualRig"]

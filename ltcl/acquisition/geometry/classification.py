@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Is a camera pixel lit by a stripe, or only by light from elsewhere: bits with a confidence.
+
+Fine stripes light half of everything evenly, so that a pixel shows `l_d + l_g / 2` when its own stripe is on
+and `l_g / 2` when it is off (Nayar et al. 2006). With the direct light l_d and the indirect l_g known, a bit
+is certain (Xu and Aliaga 2007) where
+
+- direct light outweighs indirect light: then the brighter of pattern and inverse tells;
+- or one of the two shows more than l_g, so that it must be lit, and the other less than l_d, so that it
+  cannot be.
+
+Everything else is undecided, and so is what does not stand out of the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+ENOUGH = 6  # pairs that tell a variance
+
+
+@dataclass(frozen=True)
+class Bits:
+    """Decisions on B bits, (B, ...) each: `on`, `certain`, and by how much of l_d the two pictures differ."""
+
+    on: np.ndarray
+    certain: np.ndarray
+    confidence: np.ndarray
+
+
+def direct_global(lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Direct and indirect light of pictures (B, ...) under fine stripes, less what the black projector gives.
+
+    `l_d = max - min`, `l_g = 2 min` (Nayar et al. 2006, with half of the projector's pixels lit).
+
+    >>> l_d, l_g = direct_global(np.array([[1.0, 3.0], [2.0, 3.0]]))
+    >>> l_d.tolist(), l_g.tolist()
+    ([1.0, 0.0], [2.0, 6.0])
+    """
+    least = np.maximum(lit.min(axis=0), 0.0)
+    return lit.max(axis=0) - least, 2.0 * least
+
+
+def noise(pattern: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Variance of one photograph, from B pairs (B, ...): a pattern and its inverse always sum to white.
+
+    What that sum varies by is noise of two photographs; drift and flicker count, too. Raw pictures keep that
+    sum only where both are the lightest and the darkest they get, and so only those pairs count where there
+    are enough of them. With one pair there is nothing to compare, and the answer is 0.
+    """
+    if len(pattern) < 2:
+        return np.zeros(pattern.shape[1:], np.float32)
+    total, difference = pattern + inverse, np.abs(pattern - inverse)
+    plain = total.var(axis=0, ddof=1)
+    far = difference > 0.7 * difference.max(axis=0)
+    count = np.count_nonzero(far, axis=0)
+    total -= total.mean(axis=0)  # small numbers, for the squares
+    total *= far
+    mean = total.sum(axis=0) / np.maximum(count, 1)
+    square = np.einsum("b...,b...->...", total, total)
+    chosen = np.maximum(square - count * mean**2, 0.0) / np.maximum(count - 1, 1)
+    return np.where(count >= ENOUGH, np.minimum(chosen, plain), plain) / 2.0
+
+
+def classify(
+    pattern: np.ndarray,
+    inverse: np.ndarray,
+    direct: np.ndarray,
+    indirect: np.ndarray,
+    least: np.ndarray,
+    wide: np.ndarray,
+    uneven: np.ndarray,
+) -> Bits:
+    """Decide B bits of every pixel.
+
+    Parameters
+    ----------
+    pattern, inverse : (B, ...)
+        Pictures under each pattern and its inverse, less what the black projector gives.
+    direct, indirect : (...)
+        Of the pixel, from `direct_global`.
+    least : (...)
+        The smallest difference that is no noise, and the smallest direct light that counts.
+    wide : (B,) bool
+        Bits of wide stripes. Under narrow ones light from elsewhere is the same in pattern and inverse, so
+        that the brighter of the two tells, however much of it there is.
+    uneven : (B,) float
+        By what part of all light a pattern of narrow stripes and its inverse differ.
+
+    Examples
+    --------
+    A pixel in much indirect light: it is lit in the first pattern; the second tells nothing.
+
+    >>> one, lit = np.ones(1), np.array([[5.0], [3.0]])
+    >>> bits = classify(lit, np.array([[1.0], [2.5]]), 2 * one, 4 * one, 0.1 * one, one > 0, 0 * one)
+    >>> bits.on[:, 0].tolist(), bits.certain[:, 0].tolist()
+    ([True, True], [True, False])
+    """
+    difference = pattern - inverse
+    on = difference > 0
+    np.abs(difference, out=difference)
+    certain = difference > least
+    for k in np.flatnonzero(uneven):
+        certain[k] &= difference[k] > least + uneven[k] * indirect
+    certain &= direct > least
+    dim = direct <= indirect
+    if wide.any() and dim.any():
+        told = (np.maximum(pattern, inverse) > indirect) & (np.minimum(pattern, inverse) < direct)
+        certain &= told | ~(dim & wide.reshape(-1, *[1] * dim.ndim))
+    difference *= np.where(direct > least, 1.0 / np.maximum(direct, least), 0.0)
+    return Bits(on, certain, np.minimum(difference, 1.0, out=difference))

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which projector coordinates each camera pixel sees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ltcl import checks
+from ltcl.acquisition.geometry.consistency import consistent
+from ltcl.acquisition.geometry.decoded import Axis
+from ltcl.acquisition.geometry.gray import GrayCode
+from ltcl.acquisition.geometry.subpixel import refine
+from ltcl.errors import InputError
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """A map from camera pixels to projector coordinates.
+
+    Attributes
+    ----------
+    x, y : (H, W) float32
+        Column and row of the projector, in pixels, with pixel centres at integers; NaN where not valid.
+    confidence : (H, W) float32
+        In [0, 1]; 0 where not valid.
+    valid : (H, W) bool
+    grid : (h, w)
+        Of the projector.
+
+    Raises
+    ------
+    InputError
+        Sizes that differ, or a valid coordinate that is not finite.
+
+    Examples
+    --------
+    >>> Correspondence.aligned((2, 3)).x
+    array([[0., 1., 2.],
+           [0., 1., 2.]], dtype=float32)
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    confidence: np.ndarray
+    valid: np.ndarray
+    grid: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        checks.grid("grid", self.grid)
+        valid = np.asarray(self.valid, bool)
+        if valid.ndim != 2 or valid.size == 0:
+            raise InputError(f"valid has shape {valid.shape}; it must be (H, W)")
+        object.__setattr__(self, "valid", valid)
+        for name in ("x", "y", "confidence"):
+            array = checks.shape(name, checks.real(name, getattr(self, name)), valid.shape)
+            checks.finite(f"{name}[valid]", array[valid])
+            other = 0.0 if name == "confidence" else np.nan
+            object.__setattr__(self, name, np.where(valid, array, other).astype(np.float32))
+
+    @classmethod
+    def aligned(cls, grid: tuple[int, int]) -> Correspondence:
+        """The camera already on the projector's grid."""
+        h, w = checks.grid("grid", grid)
+        y, x = np.mgrid[:h, :w]
+        return cls(x, y, np.ones(grid), np.ones(grid, bool), (h, w))
+
+    @classmethod
+    def of(cls, x: Axis, y: Axis, grid: tuple[int, int]) -> Correspondence:
+        """Decoded coordinates, less those that are not fully known or do not fit their neighbours."""
+        valid = (x.width <= 2.0) & (y.width <= 2.0)
+        valid &= consistent(x.value, valid) & consistent(y.value, valid)
+        return cls(refine(x, valid), refine(y, valid), np.minimum(x.confidence, y.confidence), valid, grid)
+
+    @property
+    def camera_grid(self) -> tuple[int, int]:
+        """(H, W) of the camera."""
+        return self.valid.shape[0], self.valid.shape[1]
+
+    @property
+    def decoded(self) -> float:
+        """Part of the camera's pixels that are valid."""
+        return float(self.valid.mean())
+
+    def homography(self, where: Any = None, *, within: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """The homography that takes camera pixels (u, v, 1) to projector coordinates, robustly fitted.
+
+        Parameters
+        ----------
+        where : (H, W) bool, optional
+            The pixels to fit to; all valid ones when left out.
+        within : float
+            Projector pixels by which an inlier may be off.
+
+        Returns
+        -------
+        homography : (3, 3) float64
+        distance : (H, W) float32
+            How far each valid pixel is from it, in projector pixels; NaN elsewhere.
+
+        Raises
+        ------
+        InputError
+            Fewer than four pixels, or all on a line.
+
+        Examples
+        --------
+        >>> H, distance = Correspondence.aligned((4, 5)).homography()
+        >>> np.allclose(H, np.eye(3)), bool(distance.max() < 1e-4)
+        (True, True)
+        """
+        chosen = self.valid if where is None else self.valid & np.asarray(where, bool)
+        v, u = np.nonzero(chosen)
+        camera = np.stack([u, v], axis=1).astype(np.float64)
+        seen = np.stack([self.x[chosen], self.y[chosen]], axis=1).astype(np.float64)
+        found = None
+        if len(camera) >= 4 and all(np.linalg.matrix_rank(p - p.mean(axis=0)) == 2 for p in (camera, seen)):
+            found, _ = cv2.findHomography(camera, seen, cv2.RANSAC, within)
+        if found is None:
+            raise InputError(f"{len(camera)} pixel(s) tell no homography; there must be four, not on a line")
+        v, u = np.mgrid[: self.valid.shape[0], : self.valid.shape[1]]
+        p = np.einsum("ij,jhw->ihw", found, np.stack([u, v, np.ones_like(u)]).astype(np.float64))
+        distance = np.hypot(p[0] / p[2] - self.x, p[1] / p[2] - self.y)
+        return found, distance.astype(np.float32)
+
+
+def decode(
+    images: Sequence[Any],
+    grid: tuple[int, int],
+    *,
+    high_frequency: bool = False,
+    subpixel: bool = True,
+    sigmas: float = 3.0,
+    dark: float = 2e-3,
+) -> Correspondence:
+    """The map that photographs of Gray code tell, without a rig.
+
+    Parameters
+    ----------
+    images : sequence of (H, W) or (H, W, 3)
+        Of `GrayCode(grid, high_frequency).patterns()`, in that order.
+    grid : (h, w)
+        Of the projector.
+    high_frequency, sigmas, dark
+        As in `GrayCode` and its `decode`.
+    subpixel : bool
+        Fit planes through the edges of stripes; else coordinates are whole, or halves on edges.
+
+    Raises
+    ------
+    InputError
+        As `GrayCode.decode`.
+
+    Examples
+    --------
+    >>> decode(GrayCode((4, 6)).patterns(), (4, 6)).decoded
+    1.0
+    """
+    code = GrayCode(checks.grid("grid", grid), high_frequency)
+    x, y = code.decode(images, sigmas=sigmas, dark=dark, edges=checks.flag("subpixel", subpixel))
+    return Correspondence.of(x, y, code.grid)

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Drive a projector and a camera through the patterns that tell which pixel sees which."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.acquisition.geometry.correspondence import Correspondence
+from ltcl.acquisition.geometry.decoded import photographs
+from ltcl.acquisition.geometry.gray import GrayCode
+from ltcl.acquisition.geometry.phase import PhaseShift
+from ltcl.errors import InputError
+
+SMALL = 128  # sides up to here take narrow stripes in every pattern: the wide ones would be whole walls
+PROBES = 8
+STEPS = 1.5  # of the camera's codes: the least difference that counts
+BRIGHT, DIM = 0.95, 0.3  # of full scale, at the brightest pixels
+
+
+class Shots(Protocol):
+    """What takes the photographs; `photograph` gives float images in [0, 1] of full scale."""
+
+    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
+        """Photograph the scene under `codes` (h, w)."""
+        ...
+
+
+def measure(
+    shots: Shots,
+    grid: tuple[int, int],
+    *,
+    phase: bool = True,
+    seconds: float | None = None,
+    high_frequency: bool | None = None,
+    period: float | None = None,
+    steps: int = 6,
+    sigmas: float = 3.0,
+    dark: float = 2e-3,
+) -> Correspondence:
+    """Measure which projector coordinate each camera pixel sees.
+
+    Parameters
+    ----------
+    shots : object with ``photograph(codes, seconds)``
+        Used where it has them: `exposures`, the seconds to choose from; `levels`, the largest code of an
+        integer camera; `prepare`, told of all (codes, seconds) that come next.
+    grid : (h, w)
+        Of the projector; a side of 1 takes no patterns.
+    phase : bool
+        Add phase shift to Gray code. Planes through the edges of stripes give fractions of a pixel without
+        it.
+    seconds : float, optional
+        Exposure of every photograph; left out, a few photographs of white find one that is bright but not
+        saturated.
+    high_frequency : bool, optional
+        Narrow stripes in every pattern; left out, where both sides of the grid are 128 at most.
+    period, steps : float, int
+        Of the phase shift; the period is 16 projector pixels, 8 on small grids, when left out.
+    sigmas, dark : float
+        As in `GrayCode.decode`.
+
+    Returns
+    -------
+    Correspondence
+
+    Raises
+    ------
+    InputError
+        Bad arguments, photographs of mixed sizes, or no pixel that could be decoded.
+
+    Examples
+    --------
+    A camera that sees the projector's own pixels:
+
+    >>> class Mirror:
+    ...     def photograph(self, codes, seconds):
+    ...         return codes * min(seconds, 1.0)
+    >>> measure(Mirror(), (8, 12), seconds=0.5).decoded
+    1.0
+    """
+    grid = checks.grid("grid", grid)
+    small = max(grid) <= SMALL
+    narrow = small if high_frequency is None else checks.flag("high_frequency", high_frequency)
+    code = GrayCode(grid, narrow)
+    use_phase = checks.flag("phase", phase) and max(grid) > 1
+    shift = PhaseShift(grid, (period or (8.0 if small else 16.0),), steps) if use_phase else None
+    if seconds is None:
+        seconds = _exposure(shots, grid)
+    checks.number("seconds", seconds, above=0.0)
+    patterns = [*code.patterns(), *(shift.patterns() if shift else [])]
+    images = _take(shots, patterns, seconds)
+    # A difference of one step of the camera tells nothing.
+    dark = max(dark, STEPS / (getattr(shots, "levels", None) or np.inf))
+    known = code.decode(images[: code.count], sigmas=sigmas, dark=dark, edges=True)
+    if shift is not None:
+        known = shift.decode(images[code.count :], known, sigmas=sigmas, dark=dark)
+    found = Correspondence.of(*known, grid)
+    if not found.valid.any():
+        raise InputError(
+            "shots: no camera pixel could be decoded; the patterns must be in view, sharp and above the noise"
+        )
+    return found
+
+
+def _take(shots: Shots, patterns: list[np.ndarray], seconds: float) -> list[np.ndarray]:
+    tell = getattr(shots, "prepare", None)
+    if tell is not None:
+        tell((pattern, seconds) for pattern in patterns)
+    return [np.asarray(shots.photograph(pattern, seconds)) for pattern in patterns]
+
+
+def _exposure(shots: Shots, grid: tuple[int, int], seconds: float = 1 / 60) -> float:
+    """Seconds at which white is bright but not saturated, but for a thousandth of the pixels.
+
+    >>> class Lamp:
+    ...     def photograph(self, codes, seconds):
+    ...         return np.minimum(codes * 4.0 * seconds, 1.0)
+    >>> round(4 * _exposure(Lamp(), (4, 4)), 3)
+    0.7
+    """
+    white, allowed = np.ones(grid, np.float32), getattr(shots, "exposures", None)
+    for _ in range(PROBES):
+        seconds = _nearest(seconds, allowed)
+        (image,) = photographs("photographs", [shots.photograph(white, seconds)], 1)
+        level = float(np.quantile(image, 0.999))
+        change = 1 / 2 if level > BRIGHT else 0.7 / max(level, 0.7 / 16) if level < DIM else 1.0
+        if change == 1.0 or _nearest(seconds * change, allowed) == seconds:
+            break
+        seconds *= change
+    return seconds
+
+
+def _nearest(seconds: float, allowed: Any) -> float:
+    if not allowed:
+        return min(max(seconds, 1e-4), 30.0)
+    return min(allowed, key=lambda given: abs(math.log(given / seconds)))

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs on the projector's grid: every projector pixel is a weighted mean of the camera pixels near it.
+
+Camera pixel m at x_m, with footprint J_m, reaches projector pixel n with the weight
+
+    w_nm = |det J_m| k(d^T Q_m^-1 d),  d = n - x_m,  Q_m = C J_m J_m^T + P I,  k(s) = (1 - s)^2 for s < 1
+
+which is an elliptical filter as wide as the two pixels together: where camera pixels are the smaller ones it
+averages them by their area, where they are the larger it interpolates. Rows are then corrected to first
+order, `w_nm (a_n + b_n . d)`, and sum to one: pictures that are constant or linear come out exactly, even
+where the samples lie on one side of n; but only as far as no weight turns negative, at the rim for instance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from ltcl import checks
+from ltcl.acquisition.geometry.correspondence import Correspondence
+from ltcl.acquisition.geometry.footprints import jacobian
+from ltcl.errors import InputError
+
+CAMERA = 1.54  # C: wide enough that samples of a square grid surround every place, however large they are
+PROJECTOR = 1.1  # P: a kernel as wide as a tent over the projector's pixels
+SEEN = 0.05  # of a projector pixel: less is not seen
+STEEP = 1e-4  # smallest spread of the samples, in squared projector pixels, that tells a slope
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """Area-filtered resampling of photographs to the projector's grid.
+
+    Attributes
+    ----------
+    weights : (N, M) csr_array, float32
+        Rows of projector pixels that are seen sum to 1, others are empty; no weight is negative.
+    coverage : (h, w) float32
+        What part of each projector pixel's surroundings camera pixels cover, 0 to 1.
+    grid, camera_grid : (h, w), (H, W)
+
+    Examples
+    --------
+    >>> R = Resampling.of(Correspondence.aligned((4, 5)))
+    >>> bool(np.allclose(R.apply(np.full((4, 5), 3.0)), 3.0)), bool(R.seen.all())
+    (True, True)
+    """
+
+    weights: scipy.sparse.csr_array
+    coverage: np.ndarray
+    grid: tuple[int, int]
+    camera_grid: tuple[int, int]
+
+    @classmethod
+    def of(cls, found: Correspondence) -> Resampling:
+        """The resampling that a measured map tells.
+
+        Raises
+        ------
+        InputError
+            No two neighbouring pixels of the map are valid.
+        """
+        if not isinstance(found, Correspondence):
+            raise InputError(f"found is a {type(found).__name__}; it must be a Correspondence")
+        J, known = jacobian(found)
+        if not known.any():
+            raise InputError("found has no two valid neighbours; nothing tells the size of a camera pixel")
+        samples = _Samples.of(found, J, known)
+        weights = samples.weights(found.grid)
+        coverage = np.asarray(weights.w.sum(axis=1))
+        keep = coverage >= SEEN
+        matrix = _first_order(weights, keep)
+        part = np.minimum(np.where(keep, coverage, 0.0), 1.0).astype(np.float32)
+        return cls(matrix, part.reshape(found.grid), found.grid, found.camera_grid)
+
+    @classmethod
+    def aligned(cls, grid: tuple[int, int]) -> Resampling:
+        """The identity: the camera already on the projector's grid."""
+        h, w = checks.grid("grid", grid)
+        n = np.arange(h * w + 1)
+        one = scipy.sparse.csr_array((np.ones(h * w, np.float32), n[:-1], n))
+        return cls(one, np.ones((h, w), np.float32), (h, w), (h, w))
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(h, w) bool: projector pixels that some camera pixel sees."""
+        return self.coverage > 0
+
+    def apply(self, image: Any) -> np.ndarray:
+        """The photograph (H, W) or (H, W, c) on the projector's grid, (h, w[, c]); 0 where not seen."""
+        return self._product(self.weights, "image", image)
+
+    def variance(self, variance: Any) -> np.ndarray:
+        """The variance of `apply`'s result, of independent pixels with this variance: sum w^2 var."""
+        squared = self.weights.copy()
+        squared.data = squared.data**2
+        return self._product(squared, "variance", variance)
+
+    def _product(self, matrix: scipy.sparse.csr_array, name: str, image: Any) -> np.ndarray:
+        array = checks.real(name, image)
+        H, W = self.camera_grid
+        if array.ndim not in (2, 3) or array.shape[:2] != (H, W):
+            raise InputError(f"{name} has shape {array.shape}; it must be ({H}, {W}) or ({H}, {W}, c)")
+        flat = checks.finite(name, array).reshape(H * W, -1).astype(np.float32, copy=False)
+        return (matrix @ flat).reshape(*self.grid, *array.shape[2:])
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """Pairs of projector and camera pixels, as (N, M) matrices of one pattern: w, and w d in x and y."""
+
+    w: scipy.sparse.csr_array
+    dx: np.ndarray
+    dy: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Camera pixels with a footprint: number, place, area, Q^-1 as a x^2 + 2 b x y + c y^2, extent."""
+
+    m: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    area: np.ndarray
+    form: tuple[np.ndarray, np.ndarray, np.ndarray]
+    reach: tuple[np.ndarray, np.ndarray]
+    pixels: int
+
+    @classmethod
+    def of(cls, found: Correspondence, J: np.ndarray, known: np.ndarray) -> _Samples:
+        (xu, xv), (yu, yv) = np.moveaxis(J[known], 0, -1)
+        xx, yy = (CAMERA * (u**2 + v**2) + PROJECTOR for u, v in ((xu, xv), (yu, yv)))
+        xy = CAMERA * (xu * yu + xv * yv)
+        det = xx * yy - xy**2
+        # The kernel over its ellipse integrates to pi sqrt(det Q) / 3.
+        area = np.abs(xu * yv - xv * yu) * 3 / (np.pi * np.sqrt(det))
+        place = (found.x[known].astype(np.float64), found.y[known].astype(np.float64))
+        form, reach = (yy / det, -xy / det, xx / det), (np.sqrt(xx), np.sqrt(yy))
+        return cls(np.flatnonzero(known), *place, area, form, reach, known.size)
+
+    def weights(self, grid: tuple[int, int]) -> _Weights:
+        """All pairs of a camera pixel and the projector pixels inside its ellipse."""
+        size = np.ceil(np.maximum(*self.reach) - 0.5).astype(int)  # pixels from the nearest one
+        parts = []
+        for far in np.unique(size):
+            some = np.flatnonzero(size == far)
+            offsets = range(-far, far + 1)
+            parts += [self._offset(some, i, j, grid) for j in offsets for i in offsets]
+        n, m, w, dx, dy = (np.concatenate(part) for part in zip(*parts, strict=True))
+        order = np.argsort(n, kind="stable")
+        indptr = np.concatenate([[0], np.cumsum(np.bincount(n, minlength=grid[0] * grid[1]))])
+        shape = (grid[0] * grid[1], self.pixels)
+        matrix = scipy.sparse.csr_array((w[order], m[order], indptr), shape=shape)
+        return _Weights(matrix, dx[order], dy[order])
+
+    def _offset(self, some: np.ndarray, i: int, j: int, grid: tuple[int, int]) -> tuple[np.ndarray, ...]:
+        """Pairs with the projector pixel i columns and j rows from the one nearest to the sample."""
+        x, y = self.x[some], self.y[some]
+        column, row = np.rint(x) + i, np.rint(y) + j
+        dx, dy = column - x, row - y
+        a, b, c = (part[some] for part in self.form)
+        s = a * dx * dx + 2 * b * dx * dy + c * dy * dy
+        h, w = grid
+        good = (s < 1) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
+        n = (row[good] * w + column[good]).astype(np.int64)
+        value = self.area[some[good]] * (1 - s[good]) ** 2
+        return n, self.m[some[good]], value, dx[good], dy[good]
+
+
+def _first_order(weights: _Weights, keep: np.ndarray) -> scipy.sparse.csr_array:
+    """Rows that sum to one and, where no weight turns negative, put the centre of their samples on n."""
+    w, starts = weights.w, np.asarray(weights.w.indptr)
+    n = np.repeat(np.arange(len(keep)), np.diff(starts))
+    total = np.bincount(n, w.data, len(keep))
+    total = np.where(keep, total, np.inf)
+    data = w.data / total[n]
+    dx, dy = weights.dx, weights.dy
+    mx, my = (np.bincount(n, data * d, len(keep)) for d in (dx, dy))
+    xx, xy, yy = (np.bincount(n, data * p, len(keep)) for p in (dx * dx, dx * dy, dy * dy))
+    xx, xy, yy = xx - mx * mx + STEEP, xy - mx * my, yy - my * my + STEEP
+    det = np.maximum(xx * yy - xy * xy, STEEP**2)
+    # data (1 + b . (d - mean)) has the mean of d at 0 for b = -C^-1 mean, C the spread of d.
+    bx, by = -(yy * mx - xy * my) / det, -(xx * my - xy * mx) / det
+    change = bx[n] * (dx - mx[n]) + by[n] * (dy - my[n])
+    worst, some = np.zeros(len(keep)), np.flatnonzero(np.diff(starts))
+    worst[some] = np.minimum.reduceat(change, starts[some]) if len(some) else 0.0
+    data *= 1 + change / np.maximum(1.0, -worst)[n]
+    matrix = scipy.sparse.csr_array((data.astype(np.float32), w.indices, starts), shape=w.shape)
+    matrix.eliminate_zeros()
+    matrix.sort_indices()
+    return matrix

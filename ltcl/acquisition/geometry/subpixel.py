@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Sub-pixel coordinates from Gray code alone: a plane through the edges of stripes near each pixel.
+
+An edge lies where pattern and inverse are equal; between two camera pixels linear interpolation finds it to
+a few hundredths of a pixel, and there the projector coordinate is known: n + 1/2. Every boundary of two
+projector columns is an edge of exactly one bit. A weighted least-squares plane `x = a + b u + c v` through
+the edges in a window, and faintly through the coordinates of the pixels themselves, gives x at the pixel.
+Where the plane leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter (folds, borders of
+objects) the whole number stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from ltcl.acquisition.geometry.decoded import Axis, Edges
+
+LEAVES = 0.25
+ACROSS = 1.5  # edges on each side of a pixel that a window should hold
+LARGEST = 15  # reach of a window, in camera pixels
+STRIP = 1 << 16  # pixels of a strip of rows: its moments stay in the cache
+
+
+def refine(axis: Axis, valid: np.ndarray) -> np.ndarray:
+    """Projector coordinate (H, W) float32 of the valid pixels, to a fraction of a pixel.
+
+    Parameters
+    ----------
+    axis : Axis
+        Decoded with ``edges=True``; one without edges comes back as it is.
+    valid : (H, W) bool
+        Pixels of width 2 at most that agree with their neighbours.
+    """
+    if axis.edges is None:
+        return axis.value
+    H, W = valid.shape
+    reach, plane = _reach(axis.edges, valid), np.empty((H, W))
+    rows = max(STRIP // W, 4 * reach)
+    for top in range(0, H, rows):
+        first, last = max(top - reach, 0), min(top + rows + reach, H)
+        part = _plane(_moments(axis, valid, slice(first, last), 2 * reach + 1))
+        plane[top : top + rows] = part[top - first :][: min(rows, H - top)]
+    far = axis.width / 2
+    inside = valid & (np.abs(plane - axis.value) <= far + LEAVES)
+    cell = np.clip(plane, axis.value - far, axis.value + far)
+    return np.where(inside, cell, axis.value).astype(np.float32)
+
+
+def _reach(edges: Edges, valid: np.ndarray) -> int:
+    """Camera pixels on each side, so that a few edges fit in, as far as their mean distance tells."""
+    count = sum(int(np.count_nonzero(np.isfinite(t))) for t in (edges.right, edges.below))
+    return min(max(int(np.ceil(ACROSS * np.count_nonzero(valid) / max(count, 1))), 2), LARGEST)
+
+
+def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np.ndarray]:
+    """Sums over the window about each pixel of w, w u, w v, w x, w u u, w u v, w v v, w u x and w v x."""
+    total: list[np.ndarray] = []
+    for w, u, v, x in _observations(axis, valid, rows):
+        wu, wv = w * u, w * v
+        moments = [w, wu, wv, w * x, wu * u, wu * v, wv * v, wu * x, wv * x]
+        total = [a + b for a, b in zip(total, moments, strict=True)] if total else moments
+    size = (window, window)
+    return [cv2.boxFilter(m, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT) for m in total]
+
+
+def _observations(axis: Axis, valid: np.ndarray, rows: slice) -> Iterator[tuple[np.ndarray, ...]]:
+    """Weight, place (u, v) and coordinate x of pixels, and of edges to the right and below."""
+    edges, valid, value = axis.edges, valid[rows], axis.value[rows]
+    assert edges is not None  # noqa: S101  (said by `refine`)
+    v, u = (place.astype(np.float64) for place in np.mgrid[: valid.shape[0], : valid.shape[1]])
+    yield np.where(valid, axis.weight, 0.0), u, v, np.where(valid, value, 0.0)
+    place = edges.place[rows]
+    for part, down, right in ((edges.right[rows], 0, 1), (edges.below[rows], 1, 0)):
+        there = (-down, -right)
+        seen = np.isfinite(part) & valid & np.roll(valid, there, (0, 1))
+        if down:
+            seen[-1] = False  # the last row of a strip has no next one
+        t = np.where(seen, part, 0.0)
+        yield (
+            seen.astype(np.float64),
+            u + right * t,
+            v + down * t,
+            (place + np.roll(place, there, (0, 1))) / 2,
+        )
+
+
+def _plane(sums: list[np.ndarray]) -> np.ndarray:
+    """Value of the weighted least-squares plane at each pixel, from its nine moments."""
+    H, W = sums[0].shape
+    v, u = np.mgrid[:H, :W]
+    n, U, V, X, UU, UV, VV, UX, VX = sums
+    n = np.maximum(n, 1e-6)  # no valid pixel near
+    mean_u, mean_v, mean_x = U / n, V / n, X / n
+    uu, uv, vv = UU / n - mean_u**2, UV / n - mean_u * mean_v, VV / n - mean_v**2
+    ux, vx = UX / n - mean_u * mean_x, VX / n - mean_v * mean_x
+    # A little more spread than there is: edges on one line tell the slope across it only.
+    uu, vv = uu + 1e-3, vv + 1e-3
+    det = np.maximum(uu * vv - uv**2, 1e-9)
+    b, c = (ux * vv - vx * uv) / det, (vx * uu - ux * uv) / det
+    return mean_x + b * (u - mean_u) + c * (v - mean_v)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs of a real projector and camera: ../shared/data/graycode-real.
+
+42 photographs, 1280 x 1024, of Gray code for 1024 x 768 in OpenCV's order, and the authors' calibration.
+What was found out about them by measurement: the authors count a step of the code as two projector pixels;
+squares of the chessboard are 75 of their units wide.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ltcl.acquisition.geometry import Correspondence, decode
+
+GRID = (768, 1024)
+STEP = 2.0  # the authors' projector pixels in a step of the code
+
+
+@pytest.fixture(scope="module")
+def photographs(shared_data: Path) -> list[np.ndarray]:
+    paths = sorted((shared_data / "graycode-real").glob("graycode_*.png"))
+    return [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in paths]
+
+
+@pytest.fixture(scope="module")
+def found(photographs) -> Correspondence:
+    return decode(photographs, GRID)
+
+
+@pytest.fixture(scope="module")
+def board(photographs) -> np.ndarray:
+    """Pixels inside the corners of the chessboard."""
+    seen, corners = cv2.findChessboardCorners(photographs[40], (7, 9))
+    assert seen
+    hull = cv2.convexHull(corners.astype(np.float32)).astype(np.int32)
+    return cv2.fillConvexPoly(np.zeros(photographs[0].shape, np.uint8), hull, 1) > 0
+
+
+def test_what_is_lit_is_decoded_and_what_is_not_is_not(photographs, found, board):
+    lit = photographs[40].astype(float) - photographs[41]
+    assert found.valid[lit > 30].mean() > 0.9  # translucent tape washes out the finest stripes
+    assert found.valid[board & (lit > 60)].mean() > 0.999  # the white squares
+    assert found.valid[lit < 5].mean() < 0.03
+    assert found.confidence[found.valid].min() >= 0
+    assert found.confidence[board & (lit > 60)].mean() > 0.2
+
+
+@pytest.mark.parametrize("subpixel", [False, True])
+def test_the_board_is_a_plane(photographs, found, board, subpixel):
+    """But for distortion of the two lenses, a homography takes one picture of a plane to the other."""
+    chosen = found if subpixel else decode(photographs, GRID, subpixel=False)
+    _, distance = chosen.homography(board)
+    off = distance[board & chosen.valid]
+    assert np.median(off) < (0.15 if subpixel else 0.4)
+    assert np.sqrt(np.mean(off**2)) < (0.25 if subpixel else 0.45)
+    assert np.mean(off > 1.0) < (0.001 if subpixel else 0.005)
+
+
+def test_the_calibration_of_the_authors_agrees(shared_data, found, board):
+    """Points triangulated by it fall back on the pixels they came from, within its own residual of 0.86."""
+    file = cv2.FileStorage(
+        str(shared_data / "graycode-real" / "calibration_result.xml"), cv2.FILE_STORAGE_READ
+    )
+    names = ("cam_int", "cam_dist", "proj_int", "proj_dist", "roration", "translation")
+    K, D, P, E, R, t = (file.getNode(name).mat() for name in names)
+    chosen = board & found.valid
+    v, u = np.nonzero(chosen)
+    camera = np.stack([u, v], axis=1)[::20].astype(np.float64)
+    projector = STEP * np.stack([found.x[chosen], found.y[chosen]], axis=1)[::20].astype(np.float64)
+    rays = [
+        cv2.undistortPoints(p[:, None], *lens)[:, 0] for p, lens in ((camera, (K, D)), (projector, (P, E)))
+    ]
+    X = cv2.triangulatePoints(np.eye(3, 4), np.hstack([R, t.reshape(3, 1)]), rays[0].T, rays[1].T)
+    X = (X[:3] / X[3]).T
+    back = cv2.projectPoints(X, cv2.Rodrigues(R)[0], t, P, E)[0][:, 0], projector
+    ahead = cv2.projectPoints(X, np.zeros(3), np.zeros(3), K, D)[0][:, 0], camera
+    for seen, wanted in (back, ahead):
+        assert np.sqrt(np.mean(np.sum((seen - wanted) ** 2, axis=1))) < 0.857
+    flat = X - X.mean(axis=0)
+    spread = np.linalg.svd(flat, full_matrices=False)[1] / np.sqrt(len(X))
+    assert spread[2] < 0.02 * spread[1]  # the board is flat
+
+
+def test_a_missing_photograph_is_missed(photographs):
+    with pytest.raises(ValueError, match="photographs are 41; they must be 42"):
+        decode(photographs[:-1], GRID)

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Photographs on the projector's grid: what is exact, what is averaged, what is masked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ltcl.acquisition.geometry import Correspondence, Resampling
+from ltcl.acquisition.geometry.footprints import jacobian
+from ltcl.acquisition.geometry.resample import CAMERA, PROJECTOR
+from ltcl.errors import InputError
+from tests.acquisition.geometry.scenes import MAPS, homography
+
+# Camera pixels as large as the projector's, a third, three times, and narrow ones.
+SIZES = [((64, 80), (64, 80)), ((64, 80), (200, 260)), ((120, 160), (40, 52)), ((40, 40), (40, 200))]
+
+
+def known(x: np.ndarray, y: np.ndarray, grid: tuple[int, int], valid=None) -> Correspondence:
+    return Correspondence(x, y, np.ones(x.shape), np.ones(x.shape, bool) if valid is None else valid, grid)
+
+
+def picture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Band-limited: waves 25 and 30 projector pixels long."""
+    return 0.5 + 0.2 * np.sin(2 * np.pi * x / 25 + 0.3) + 0.15 * np.cos(2 * np.pi * y / 30)
+
+
+@pytest.fixture(params=[(*size, name) for size in SIZES for name in MAPS], ids=str)
+def case(request):
+    grid, camera, name = request.param
+    x, y = MAPS[name](camera, grid)
+    return Resampling.of(known(x, y, grid)), x, y, np.mgrid[: grid[0], : grid[1]][::-1].astype(float)
+
+
+def test_constants_stay_and_weights_are_means(case):
+    R, x, _, _ = case
+    W = R.weights
+    assert W.data.min() >= 0
+    np.testing.assert_allclose(W.sum(axis=1)[R.seen.ravel()], 1.0, rtol=0, atol=1e-6)
+    assert W[~R.seen.ravel()].nnz == 0
+    np.testing.assert_allclose(R.apply(np.full(x.shape, 7.5))[R.seen], 7.5, rtol=2e-6)
+
+
+def test_a_band_limited_picture_comes_out_but_for_the_blur_of_the_filter(case):
+    """The kernel's variance an axis is q / 8, with q = C s^2 + P for a camera pixel s long."""
+    R, x, y, (X, Y) = case
+    J, _ = jacobian(known(x, y, R.grid))
+    q = CAMERA * (J**2).sum(axis=-1).max() + PROJECTOR
+    curve = q / 16 * (2 * np.pi / 25) ** 2 * 0.35
+    full = R.coverage > 0.9
+    assert full.sum() > 0.4 * full.size
+    off = (R.apply(picture(x, y)) - picture(X, Y))[full]
+    assert np.abs(off).max() < curve + 1e-3
+    assert np.sqrt(np.mean(off**2)) < 0.5 * curve
+
+
+def test_linear_pictures_are_exact_where_samples_surround_the_pixel(case):
+    R, x, y, (X, Y) = case
+    off = np.abs(R.apply(0.3 * x - 0.2 * y) - (0.3 * X - 0.2 * Y))[R.coverage > 0.9]
+    assert np.quantile(off, 0.9) < 1e-3
+    assert np.mean(off) < 2e-3
+
+
+def test_light_is_kept(case):
+    """Coverage times the picture sums to area times the photograph."""
+    R, x, y, _ = case
+    J, _ = jacobian(known(x, y, R.grid))
+    area = np.abs(np.linalg.det(J))
+    inside = (x > 2) & (x < R.grid[1] - 3) & (y > 2) & (y < R.grid[0] - 3)
+    photograph = picture(x, y) * inside
+    # Half a camera pixel is missing at each border, and rows are corrected to first order.
+    assert np.sum(R.coverage * R.apply(photograph)) == pytest.approx(np.sum(area * photograph), rel=0.04)
+
+
+def test_the_adjoint(case):
+    R, x, _, _ = case
+    rng = np.random.default_rng(2)
+    a, b = rng.random(x.shape), rng.random(R.grid)
+    back = R.weights.T @ b.ravel()
+    assert np.sum(R.apply(a) * b) == pytest.approx(a.ravel() @ back, rel=1e-5)
+
+
+def test_coverage_is_whole_inside_and_nothing_outside(case):
+    R, x, y, (X, Y) = case
+    outside = (x.max() + 5 - X < 0) | (y.max() + 5 - Y < 0)
+    assert not R.seen[outside].any()
+    left, right, top, bottom = x[:, 0].max(), x[:, -1].min(), y[0].max(), y[-1].min()
+    inside = np.minimum(np.minimum(X - left, right - X), np.minimum(Y - top, bottom - Y)) > 4
+    assert inside.any()
+    assert np.quantile(R.coverage[inside], 0.05) > 0.85
+
+
+def test_variance_is_that_of_repeated_photographs():
+    x, y = homography((60, 80), (20, 30))
+    R = Resampling.of(known(x, y, (20, 30)))
+    variance = 0.01 * (1 + picture(x, y))
+    expected = (R.weights.toarray() ** 2 @ variance.ravel()).reshape(20, 30)
+    np.testing.assert_allclose(R.variance(variance), expected, rtol=1e-5)
+    rng = np.random.default_rng(4)
+    shots = [R.apply(np.sqrt(variance) * rng.standard_normal(x.shape)) for _ in range(400)]
+    ratio = np.var(shots, axis=0)[R.seen] / expected[R.seen]
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.02)
+    # Small camera pixels are averaged: a projector pixel holds about seven of them.
+    assert np.median(expected[R.coverage > 0.95]) < np.median(variance) / 7
+
+
+def test_nothing_leaks_across_the_border_of_an_object():
+    """The right half lies 12 projector pixels further on: no footprint spans the gap, which stays unseen."""
+    v, u = np.mgrid[:40, :40].astype(float)
+    x = u + np.where(u >= 20, 12.0, 0.0)
+    R = Resampling.of(known(x, v, (40, 52)))
+    assert not R.seen[:, 22:30].any()
+    image = R.apply(np.where(u >= 20, 1.0, 0.0))
+    np.testing.assert_allclose(image[:, :22], 0.0, atol=1e-6)
+    np.testing.assert_allclose(image[:, 30:][R.seen[:, 30:]], 1.0, rtol=1e-5)
+
+
+def test_pixels_that_are_not_valid_have_no_weight():
+    x, y = homography((90, 90), (30, 30))
+    valid = np.random.default_rng(1).random(x.shape) > 0.3
+    image = np.where(valid, picture(x, y), 1e6)
+    R = Resampling.of(known(np.where(valid, x, np.nan), y, (30, 30), valid))
+    Y, X = np.mgrid[:30, :30]
+    full = R.coverage > 0.5
+    assert full.mean() > 0.5
+    assert np.abs(R.apply(image) - picture(X, Y))[full].max() < 0.05
+
+
+def test_aligned_cameras_are_taken_as_they_are():
+    image = np.random.default_rng(0).random((5, 7, 3)).astype(np.float32)
+    R = Resampling.aligned((5, 7))
+    np.testing.assert_array_equal(R.apply(image), image)
+    np.testing.assert_array_equal(R.variance(image), image)
+    assert R.seen.all()
+
+
+@pytest.mark.parametrize("camera", [(1, 1), (1, 30), (30, 1), (2, 2)])
+def test_cameras_of_every_shape(camera):
+    grid = (min(camera[0], 15), min(camera[1], 15))
+    x, y = homography(camera, grid)
+    R = Resampling.of(known(x, y, grid))
+    assert R.seen.any()
+    np.testing.assert_allclose(R.apply(np.ones(camera))[R.seen], 1.0, rtol=1e-6)
+
+
+def test_what_cannot_be_resampled_is_refused():
+    R = Resampling.aligned((4, 5))
+    with pytest.raises(InputError, match=r"image has shape \(5, 4\)"):
+        R.apply(np.ones((5, 4)))
+    with pytest.raises(InputError, match="image has 1 NaN"):
+        R.apply(np.where(np.eye(4, 5) * np.arange(5) == 2, np.nan, 1.0))
+    x, y = homography((6, 6), (4, 4))
+    with pytest.raises(InputError, match="no two valid neighbours"):
+        Resampling.of(known(x, y, (4, 4), np.zeros((6, 6), bool)))
+    with pytest.raises(InputError, match="must be a Correspondence"):
+        Resampling.of(np.ones((4, 4)))  # pyright: ignore[reportArgumentType]
