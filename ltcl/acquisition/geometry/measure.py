@@ -13,7 +13,7 @@ from ltcl.acquisition.geometry.correspondence import Correspondence
 from ltcl.acquisition.geometry.decoded import photographs
 from ltcl.acquisition.geometry.gray import GrayCode
 from ltcl.acquisition.geometry.phase import PhaseShift
-from ltcl.errors import InputError
+from ltcl.errors import AcquisitionError
 
 SMALL = 128  # sides up to here take narrow stripes in every pattern: the wide ones would be whole walls
 PROBES = 8
@@ -70,7 +70,9 @@ def measure(
     Raises
     ------
     InputError
-        Bad arguments, photographs of mixed sizes, or no pixel that could be decoded.
+        Bad arguments, or photographs of mixed sizes.
+    AcquisitionError
+        No pixel could be decoded.
 
     Examples
     --------
@@ -100,7 +102,7 @@ def measure(
         known = shift.decode(images[code.count :], known, sigmas=sigmas, dark=dark)
     found = Correspondence.of(*known, grid)
     if not found.valid.any():
-        raise InputError(
+        raise AcquisitionError(
             "shots: no camera pixel could be decoded; the patterns must be in view, sharp and above the noise"
         )
     return found

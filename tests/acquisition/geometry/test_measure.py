@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ltcl.acquisition.geometry import PhaseShift, measure
-from ltcl.errors import InputError
+from ltcl.errors import AcquisitionError, InputError
 from tests.acquisition.geometry.scenes import MAPS, Rig, homography
 
 GRID, CAMERA = (96, 128), (180, 230)
@@ -110,7 +110,7 @@ def test_what_cannot_be_measured_is_refused():
         def photograph(self, codes, seconds):
             return super().photograph(np.ones((16, 16)) * (self.taken % 29 != 17), seconds)
 
-    with pytest.raises(InputError, match="no camera pixel could be decoded"):
+    with pytest.raises(AcquisitionError, match="no camera pixel could be decoded"):
         measure(Stale(x, y, (16, 16)), (16, 16), seconds=1 / 60)
 
 
