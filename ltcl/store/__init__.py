@@ -16,12 +16,13 @@ from ltcl import checks, parts
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import as_path
 from ltcl.store import arrays, formats
+from ltcl.store.blocks import BlockStore, StoredRows
 from ltcl.store.compressed import Parts
 from ltcl.store.inverses import load_inverse, save_inverse
 from ltcl.store.record import Matrix, Record
 from ltcl.transport import Transport
 
-__all__ = ["Parts", "Record", "load", "load_inverse", "save", "save_inverse"]
+__all__ = ["BlockStore", "Parts", "Record", "StoredRows", "load", "load_inverse", "save", "save_inverse"]
 
 
 def load(

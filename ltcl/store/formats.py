@@ -6,19 +6,18 @@ The modules say what is wrong, and here the file's name is put in front: one lin
 
 from __future__ import annotations
 
-import contextlib
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from ltcl.errors import FileError, InputError, InputTypeError, MemoryLimitError
+from ltcl.errors import FileError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.store import mtx, npy, npz
 from ltcl.store.compressed import Parts
 from ltcl.store.record import Record
+from ltcl.store.refusals import about
 
 logger = logging.getLogger(__name__)
 
@@ -80,19 +79,6 @@ def find(path: Path) -> ModuleType:
     except KeyError:
         known = ", ".join(FORMATS)
         raise FileError(f"{path}: {unknown_extension(path)}; transports are {known}") from None
-
-
-@contextlib.contextmanager
-def about(path: Path) -> Iterator[None]:
-    """Put the name of `path` in front of whatever is refused inside the block."""
-    try:
-        yield
-    except (InputError, InputTypeError) as error:
-        raise FileError(f"{path}: {error}") from error.__cause__
-    except MemoryError as error:
-        raise MemoryLimitError(f"{path}: {error or 'the host has no memory left'}") from None
-    except OSError as error:
-        raise FileError(f"{path}: {error.strerror or error}") from error
 
 
 def _is_diagonal(record: Record) -> bool:
