@@ -14,14 +14,22 @@ import numpy as np
 
 from ltcl.errors import FileError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.store import mtx, npy, npz
+from ltcl.store import hdf5, matlab, mtx, npy, npz, zarr_folder
 from ltcl.store.compressed import Parts
 from ltcl.store.record import Record
 from ltcl.store.refusals import about
 
 logger = logging.getLogger(__name__)
 
-FORMATS: dict[str, ModuleType] = {".npz": npz, ".npy": npy, ".mtx": mtx}
+FORMATS: dict[str, ModuleType] = {
+    ".npz": npz,
+    ".npy": npy,
+    ".mtx": mtx,
+    ".h5": hdf5,
+    ".hdf5": hdf5,
+    ".mat": matlab,
+    ".zarr": zarr_folder,
+}
 
 
 def read(path: str | Path) -> Record | Parts:
@@ -44,7 +52,8 @@ def read(path: str | Path) -> Record | Parts:
     """
     path = as_path(path)
     module = find(path)
-    input_file(path)
+    if module is not zarr_folder:
+        input_file(path)
     with about(path):
         return module.read(path)
 
@@ -62,21 +71,30 @@ def write(path: str | Path, record: Record | Parts) -> None:
     path = as_path(path)
     module = find(path)
     if isinstance(record, Parts):
-        if module is not npz:
-            raise FileError(f"{path}: {path.suffix} does not keep compressed transports; .npz does")
-    elif record.mixing is not None and module is not npz:
+        if module not in (npz, zarr_folder):
+            raise FileError(f"{path}: {path.suffix} does not keep compressed transports; .npz and .zarr do")
+    elif record.mixing is not None and not module.KEEPS_FIRST_BOUNCE:
         raise FileError(f"{path}: {path.suffix} does not keep how the projector's colours mix; .npz does")
     elif not module.KEEPS_FIRST_BOUNCE and not _is_diagonal(record):
         logger.warning("%s: %s does not keep the first bounce; .npz does", path, path.suffix)
+    if module is zarr_folder:
+        with about(path):
+            zarr_folder.write(path, record)
+        return
+    if isinstance(record, Record):
+        with about(path):
+            record = record.in_memory()
     with replace_file(path) as temporary, about(path):
         module.write(temporary, record)
 
 
 def find(path: Path) -> ModuleType:
-    """Module of the format that the extension of `path` names."""
+    """Module of the format that the extension of `path` names; a folder may be a store by any other."""
     try:
         return FORMATS[path.suffix.lower()]
     except KeyError:
+        if path.is_dir():
+            return zarr_folder
         known = ", ".join(FORMATS)
         raise FileError(f"{path}: {unknown_extension(path)}; transports are {known}") from None
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import scipy.sparse
 
 from ltcl import checks
@@ -88,7 +89,7 @@ class BlockStore:
         orientation : "rows" or "columns"
             "columns": `write` takes columns of T, each as a row of (columns, M), and `finalize` turns them.
         provenance : dict
-            Plain JSON: rig, settings, versions, hashes.
+            Plain JSON: rig, settings, hashes; the versions of ltcl, NumPy and SciPy join it.
 
         Raises
         ------
@@ -102,7 +103,8 @@ class BlockStore:
         camera_grid = None if camera_grid is None else checks.grid("camera_grid", camera_grid)
         rows = layout.rows_at_once(shape) if block_rows is None else block_rows
         told = Layout(shape, grid, camera_grid, channels, rows, orientation, kind)
-        attributes = {"ltcl": told.to_json(), "provenance": dict(provenance or {}), "state": {}}
+        own = {"versions": _versions()} | dict(provenance or {})
+        attributes = {"ltcl": told.to_json(), "provenance": own, "state": {}}
         creating.make(path, told, sealed.seal(attributes, nodes.GROUP), overwrite)
         return cls(path, "a")
 
@@ -304,3 +306,9 @@ class BlockStore:
 
     def _document(self) -> dict[str, Any]:
         return sealed.unseal(nodes.read_file(self.path, "zarr.json", sealed.LARGEST), "zarr.json")
+
+
+def _versions() -> dict[str, str]:
+    from ltcl import __version__  # here, because it is set after this module is imported
+
+    return {"ltcl": __version__, "numpy": np.__version__, "scipy": scipy.__version__}

@@ -35,6 +35,9 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
     (4, [0.0, 1.0, 2.0, 3.0])
     """
 
+    dtype: np.dtype
+    shape: tuple[int, int]
+
     def __init__(self, store: BlockStore, channel: int) -> None:
         super().__init__(np.dtype(np.float32), store.layout.shape)
         self.store, self.channel = store, channel

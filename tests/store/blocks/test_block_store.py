@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 import scipy.sparse
 import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import ltcl
 from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.store import BlockStore
 
@@ -151,7 +153,9 @@ def test_attributes(tmp_path: Path) -> None:
     store.update(step=4, name="π")
     BlockStore.open(store.path, "a").update(step=5)
     assert store.attributes == {"step": 5, "name": "π"}
-    assert BlockStore.open(store.path).provenance == {"rig": "virtual", "seed": 3}
+    versions = {"ltcl": ltcl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
+    told = BlockStore.open(store.path).provenance
+    assert told == {"versions": versions, "rig": "virtual", "seed": 3}
     with pytest.raises(InputError, match="plain JSON"):
         store.update(bad=float("nan"))
     with pytest.raises(InputError, match="plain JSON"):
