@@ -10,8 +10,6 @@ import logging
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
-
 from ltcl.errors import FileError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.store import hdf5, matlab, mtx, npy, npz, zarr_folder
@@ -75,7 +73,7 @@ def write(path: str | Path, record: Record | Parts) -> None:
             raise FileError(f"{path}: {path.suffix} does not keep compressed transports; .npz and .zarr do")
     elif record.mixing is not None and not module.KEEPS_FIRST_BOUNCE:
         raise FileError(f"{path}: {path.suffix} does not keep how the projector's colours mix; .npz does")
-    elif not module.KEEPS_FIRST_BOUNCE and not _is_diagonal(record):
+    elif not module.KEEPS_FIRST_BOUNCE and not record.bounces_from_diagonal:
         logger.warning("%s: %s does not keep the first bounce; .npz does", path, path.suffix)
     if module is zarr_folder:
         with about(path):
@@ -97,11 +95,3 @@ def find(path: Path) -> ModuleType:
             return zarr_folder
         known = ", ".join(FORMATS)
         raise FileError(f"{path}: {unknown_extension(path)}; transports are {known}") from None
-
-
-def _is_diagonal(record: Record) -> bool:
-    """Whether a first bounce taken from the diagonal of T, the default on loading, would be the same."""
-    if record.first_bounce is None or record.shape[0] != record.shape[1]:
-        return True
-    diagonals = np.stack([T.diagonal() for T in record.matrices])
-    return np.allclose(record.first_bounce, diagonals, rtol=1e-6, atol=0)

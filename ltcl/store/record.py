@@ -83,6 +83,14 @@ class Record:
         """Whether the matrices are in a store, and not in memory."""
         return isinstance(self.matrices[0], StoredRows)
 
+    @property
+    def bounces_from_diagonal(self) -> bool:
+        """Whether a first bounce taken from the diagonal of T, the default on loading, would be the same."""
+        if self.first_bounce is None or self.shape[0] != self.shape[1]:
+            return True
+        diagonals = np.stack([T.diagonal() for T in self.matrices])
+        return np.allclose(self.first_bounce, diagonals, rtol=1e-6, atol=0)
+
     def in_memory(self) -> Record:
         """The same, of a store's blocks all loaded."""
         matrices = tuple(T.tocsr() if isinstance(T, StoredRows) else T for T in self.matrices)

@@ -62,7 +62,7 @@ def _fill(folder: Path, record: Record | Parts) -> None:
         for channel, matrix in enumerate(record.matrices):
             for block in range(store.layout.blocks()):
                 store.write(channel, block, _rows(matrix, *store.layout.span(block)))
-        if record.first_bounce is not None:
+        if record.first_bounce is not None and not record.bounces_from_diagonal:  # else of T as it is kept
             store.extra("first_bounce", np.atleast_2d(record.first_bounce))
         if record.mixing is not None:
             store.extra("mixing", record.mixing)

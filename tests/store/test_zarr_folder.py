@@ -176,3 +176,11 @@ def test_a_grid_is_needed(tmp_path: Path) -> None:
     (tmp_path / "T.zarr" / "thesis.txt").write_text("years of work")
     with pytest.raises(FileError, match="is no store of ltcl"):
         formats.write(tmp_path / "T.zarr", Record((dense(),), (3, 4)))
+
+
+def test_a_diagonal_of_float64_is_the_one_that_is_kept(tmp_path: Path) -> None:
+    """Else R would have a diagonal of rounding errors."""
+    ltcl.save(tmp_path / "T.zarr", ltcl.Transport(dense(dtype="float64"), grid=(3, 4)))
+    T = ltcl.load(tmp_path / "T.zarr")
+    np.testing.assert_array_equal(T.systems[0].R.diagonal(), 0.0)
+    np.testing.assert_array_equal(T.first_bounce, dense(dtype="float64").diagonal().astype(np.float32))

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 import scipy.sparse
 
 from ltcl import checks
@@ -103,7 +102,7 @@ class BlockStore:
         camera_grid = None if camera_grid is None else checks.grid("camera_grid", camera_grid)
         rows = layout.rows_at_once(shape) if block_rows is None else block_rows
         told = Layout(shape, grid, camera_grid, channels, rows, orientation, kind)
-        own = {"versions": _versions()} | dict(provenance or {})
+        own = {"versions": creating.versions()} | dict(provenance or {})
         attributes = {"ltcl": told.to_json(), "provenance": own, "state": {}}
         creating.make(path, told, sealed.seal(attributes, nodes.GROUP), overwrite)
         return cls(path, "a")
@@ -306,9 +305,3 @@ class BlockStore:
 
     def _document(self) -> dict[str, Any]:
         return sealed.unseal(nodes.read_file(self.path, "zarr.json", sealed.LARGEST), "zarr.json")
-
-
-def _versions() -> dict[str, str]:
-    from ltcl import __version__  # here, because it is set after this module is imported
-
-    return {"ltcl": __version__, "numpy": np.__version__, "scipy": scipy.__version__}

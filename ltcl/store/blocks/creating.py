@@ -10,6 +10,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+import scipy
+
 from ltcl.errors import FileError
 from ltcl.store.blocks import aside, nodes
 from ltcl.store.blocks.layout import Layout
@@ -58,6 +61,13 @@ def groups(layout: Layout) -> list[str]:
     """The plain groups of a store, by name."""
     kinds = ["channel"] if layout.orientation == "rows" else ["channel", "columns"]
     return [aside.FOLDER, "extra", *(f"{kind}_{c}" for kind in kinds for c in range(layout.channels))]
+
+
+def versions() -> dict[str, str]:
+    """Of what makes a store."""
+    from ltcl import __version__  # here, because it is set after this module is imported
+
+    return {"ltcl": __version__, "numpy": np.__version__, "scipy": scipy.__version__}
 
 
 def _refuse_other(path: Path, target: Path, overwrite: bool) -> None:
