@@ -42,7 +42,7 @@ def read(path: str | Path) -> Record | Parts:
 
     Examples
     --------
-    >>> import tempfile
+    >>> import tempfile, numpy as np
     >>> path = Path(tempfile.mkdtemp()) / "T.npz"
     >>> write(path, Record((np.eye(6),), grid=(2, 3)))
     >>> read(path).grid
