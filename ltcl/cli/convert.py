@@ -14,7 +14,7 @@ from ltcl.cli import console, info, options
 from ltcl.errors import InputError
 from ltcl.store import Parts, Record, formats
 
-_IN = Annotated[Path, typer.Argument(metavar="IN", help="Light transport: .npz, .npy or .mtx.")]
+_IN = Annotated[Path, typer.Argument(metavar="IN", help=options.FORMATS)]
 _OUT = Annotated[Path, typer.Argument(metavar="OUT", help="The new file; its extension names the format.")]
 
 
@@ -43,7 +43,12 @@ def run(
     if json:
         console.answer({"source": source, **facts})
     else:
-        typer.echo(f"{target}: {facts['stored']}, {checks.size(target.stat().st_size)} on disk")
+        typer.echo(f"{target}: {facts['stored']}, {checks.size(_on_disk(target))} on disk")
+
+
+def _on_disk(path: Path) -> int:
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _with_grids(record: Record | Parts, grid: Any, camera_grid: Any) -> Record | Parts:

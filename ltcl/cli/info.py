@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 import typer
 
 from ltcl import checks
@@ -85,9 +86,9 @@ def describe(file: Path, record: Record | Parts) -> dict[str, Any]:
     """
     if isinstance(record, Parts):
         return _of_parts(file, record)
-    parts = [_values(T) for T in record.matrices]
-    for values in parts:
-        checks.finite("T", values)
+    if not record.stored:  # a store's blocks have been checked
+        for T in record.matrices:
+            checks.finite("T", _values(T))
     _check_extras(record)
     F = _first_bounce(record)
     return {
@@ -96,9 +97,9 @@ def describe(file: Path, record: Record | Parts) -> dict[str, Any]:
         "channels": len(record.matrices),
         "grid": record.grid,
         "camera_grid": record.camera_grid,
-        "stored": "dense" if record.dense else "sparse",
+        "stored": "dense" if record.dense else "row blocks" if record.stored else "sparse",
         "dtype": str(record.matrices[0].dtype),
-        "entries": sum(int(np.count_nonzero(values)) if record.dense else values.size for values in parts),
+        "entries": sum(map(_entries, record.matrices)),
         "nbytes": sum(_nbytes(T) for T in record.matrices),
         "first_bounce": None if F is None else (float(F.min()), float(F.max())),
         "first_bounce_from": "diagonal" if record.first_bounce is None else "file",
@@ -143,8 +144,14 @@ def _values(T: Any) -> np.ndarray:
     return T if isinstance(T, np.ndarray) else T.data
 
 
+def _entries(T: Any) -> int:
+    return int(np.count_nonzero(T)) if isinstance(T, np.ndarray) else T.nnz
+
+
 def _nbytes(T: Any) -> int:
-    return T.nbytes if isinstance(T, np.ndarray) else T.data.nbytes + T.indices.nbytes + T.indptr.nbytes
+    if isinstance(T, scipy.sparse.csr_array):
+        return T.data.nbytes + T.indices.nbytes + T.indptr.nbytes
+    return T.nbytes
 
 
 def _first_bounce(record: Record) -> np.ndarray | None:

@@ -60,10 +60,9 @@ def solves(method: str, channels: int) -> int:
     return 1 if method in SAMPLED else channels
 
 
-Matrix = Annotated[Path, typer.Argument(metavar="TRANSPORT", help="Light transport: .npz, .npy or .mtx.")]
-Matrices = Annotated[
-    list[Path], typer.Argument(metavar="FILE...", help="Light transports: .npz, .npy or .mtx.")
-]
+FORMATS = "Light transport: .npz, .npy, .mtx, .h5, .mat (v7.3) or .zarr."
+Matrix = Annotated[Path, typer.Argument(metavar="TRANSPORT", help=FORMATS)]
+Matrices = Annotated[list[Path], typer.Argument(metavar="FILE...", help=FORMATS)]
 Pictures = Annotated[
     list[Path], typer.Argument(metavar="PICTURE...", help="Pictures: .png, .jpg, .tif, .bmp or .exr.")
 ]

@@ -143,11 +143,15 @@ def _column_norms(matrix: Any, device: Device) -> np.ndarray:
     """Euclidean norms of the columns, (N,) float64; of products alone, with random signs v, E (A^T v)^2."""
     if isinstance(matrix, np.ndarray):
         return np.sqrt(np.einsum("ij,ij->j", matrix, matrix, dtype=np.float64))
+    if hasattr(matrix, "row_blocks"):
+        return np.sqrt(sum(_squares(block) for _, block in matrix.row_blocks()))
     if isinstance(matrix, scipy.sparse.csr_array):
-        squares = np.bincount(
-            matrix.indices, matrix.data.astype(np.float64) ** 2, minlength=matrix.T.shape[0]
-        )
-        return np.sqrt(squares)
+        return np.sqrt(_squares(matrix))
     A = as_operator(matrix, device)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (A.shape[0], _PROBES))
     return np.sqrt(np.mean(np.square(A.T @ signs, dtype=np.float64), axis=1))
+
+
+def _squares(matrix: Any) -> np.ndarray:
+    """Of the entries of each column of a csr_array, their sum."""
+    return np.bincount(matrix.indices, matrix.data.astype(np.float64) ** 2, minlength=matrix.T.shape[0])

@@ -20,6 +20,7 @@ from ltcl.operators.named_bases import basis, basis_of
 from ltcl.operators.orders import hilbert, relatives
 from ltcl.operators.packing import smallest, spread
 from ltcl.operators.pyramid import Pyramid
+from ltcl.operators.row_blocks import RowBlocks
 from ltcl.operators.selected import Selected, active, chosen, on_active
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
@@ -81,6 +82,8 @@ def as_operator(matrix: Any, device: Device | None = None) -> Operator:
     device = device if device is not None else open_device()
     if scipy.sparse.issparse(matrix):
         return CSR(device, matrix)
+    if hasattr(matrix, "row_blocks"):
+        return RowBlocks(device, matrix.shape, matrix.row_blocks, matrix.nnz)
     if hasattr(matrix, "matvec"):
         return Host(device, matrix)
     return Dense(device, matrix)

@@ -18,6 +18,7 @@ from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted, 
 from ltcl.operators.compressed import Compressed, Sum
 from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
+from ltcl.operators.row_blocks import RowBlocks
 
 
 def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> tuple[IdentityPlus, ...]:
@@ -60,7 +61,8 @@ def made_with(matrix: Any) -> IdentityPlus | None:
 
 def maskable(matrix: Any) -> bool:
     """Whether pixels of it may be dropped: others of somebody's own LinearOperator would stay in products."""
-    return isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) or made_with(matrix) is not None
+    own = isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) or hasattr(matrix, "row_blocks")
+    return own or made_with(matrix) is not None
 
 
 def device_of(rows: Sequence[Sequence[Any]], wanted: Device | str | None) -> Device | None:
@@ -106,6 +108,9 @@ def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Patter
         return Dense(device, _dense_R(matrix, divisor, lit))
     if isinstance(matrix, scipy.sparse.csr_array):
         return CSR(device, _sparse_R(matrix, divisor, lit), pattern)
+    if hasattr(matrix, "row_blocks"):
+        rows = lambda: ((k, _sparse_R(block, divisor, lit, k)) for k, block in matrix.row_blocks())  # noqa: E731
+        return RowBlocks(device, matrix.shape, rows, matrix.nnz + len(F))
     operator = matrix if isinstance(matrix, Operator) else Host(device, matrix)
     return Shifted(ScaledColumns(operator, 1.0 / divisor), None if lit.all() else lit)
 
@@ -123,17 +128,21 @@ def _dense_R(T: np.ndarray, divisor: np.ndarray, lit: np.ndarray) -> np.ndarray:
     return R
 
 
-def _sparse_R(T: Any, divisor: np.ndarray, lit: np.ndarray) -> scipy.sparse.csr_array:
-    """T F^-1 - I that keeps T's pattern, or drops its whole diagonal, so that channels stay alike."""
-    row = np.repeat(np.arange(T.shape[0]), np.diff(T.indptr))
+def _sparse_R(T: Any, divisor: np.ndarray, lit: np.ndarray, first: int = 0) -> scipy.sparse.csr_array:
+    """T F^-1 - I that keeps T's pattern, or drops its whole diagonal, so that channels stay alike.
+
+    T may be rows `first` and on of one.
+    """
+    row = first + np.repeat(np.arange(T.shape[0]), np.diff(T.indptr))
     on_diagonal = T.indices == row
     data = T.data / divisor[T.indices]
     data[on_diagonal] -= lit[row[on_diagonal]]
     if np.count_nonzero(on_diagonal) < T.shape[0]:  # some F was given where T stores nothing
-        missing = lit.copy()
-        missing[row[on_diagonal]] = False
+        missing = lit[first : first + T.shape[0]].copy()
+        missing[row[on_diagonal] - first] = False
         R = scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
-        return scipy.sparse.csr_array(R - scipy.sparse.diags_array(missing.astype(np.float64)))
+        there = missing.astype(np.float64)
+        return scipy.sparse.csr_array(R - scipy.sparse.diags_array(there, offsets=first, shape=T.shape))
     if data[on_diagonal].any():
         return scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
     keep = ~on_diagonal

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Transports on disk: load one from, and save one to, .npz, .npy and .mtx files.
+"""Transports on disk: load one from, and save one to, .npz, .npy, .mtx, .h5, .mat and .zarr.
 
-Everything that a file declares is checked before memory is taken for it; pickles are never loaded.
+Everything that a file declares is checked before memory is taken for it; pickles are never loaded. A .zarr
+folder is a `BlockStore` (`ltcl.store.blocks`): it grows block by block, and is read block by block.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from ltcl import checks, parts
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import as_path
 from ltcl.store import arrays, formats
+from ltcl.store.blocks import BlockStore, StoredRows
 from ltcl.store.compressed import Parts
 from ltcl.store.inverses import load_inverse, save_inverse
 from ltcl.store.record import Matrix, Record
 from ltcl.transport import Transport
 
-__all__ = ["Parts", "Record", "load", "load_inverse", "save", "save_inverse"]
+__all__ = ["BlockStore", "Parts", "Record", "StoredRows", "load", "load_inverse", "save", "save_inverse"]
 
 
 def load(
@@ -39,7 +41,8 @@ def load(
     ----------
     path
         A .npz file (SciPy's sparse layouts, or arrays: `T` (M, N) or (3, M, N), and perhaps `grid`,
-        `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy or a .mtx file.
+        `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy, .mtx, .h5 or (MATLAB
+        v7.3) .mat file, or the folder of a store, whose blocks go to the device one by one.
     grid, camera_grid
         (h, w) of projector and camera; needed where the file does not tell, and preferred to what it tells.
     first_bounce
@@ -102,8 +105,8 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     Parameters
     ----------
     path
-        .npz keeps everything, and alone compressed operators; .npy (dense only) the matrix; .mtx (one
-        channel only) matrix and grids.
+        .npz and .zarr (as float32) keep everything, and they alone compressed operators; .h5 and .mat all
+        else; .npy (dense only) the matrix; .mtx (one channel only) matrix and grids.
     T
         A transport made of matrices, or compressed.
 
@@ -130,7 +133,8 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
         raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport")
     if T.blocks is not None:
         raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
-    if not any(isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) for matrix in T.matrices):
+    held = (np.ndarray, scipy.sparse.csr_array, StoredRows)
+    if not any(isinstance(matrix, held) for matrix in T.matrices):
         formats.write(as_path(path), Parts(parts.of(T)))
         return
     matrices = tuple(_entries(matrix) for matrix in T.matrices)
@@ -144,6 +148,8 @@ def _entries(matrix: Any) -> Matrix:
         return scipy.sparse.csr_array(parts, shape=matrix.shape)
     if isinstance(matrix, np.ndarray):
         return arrays.as_floats("T", matrix)
+    if isinstance(matrix, StoredRows):
+        return matrix
     raise InputTypeError(
         f"T is made of {type(matrix).__name__}; only arrays and sparse matrices can be saved"
     )

@@ -6,23 +6,28 @@ The modules say what is wrong, and here the file's name is put in front: one lin
 
 from __future__ import annotations
 
-import contextlib
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
-
-from ltcl.errors import FileError, InputError, InputTypeError, MemoryLimitError
+from ltcl.errors import FileError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.store import mtx, npy, npz
+from ltcl.store import hdf5, matlab, mtx, npy, npz, zarr_folder
 from ltcl.store.compressed import Parts
 from ltcl.store.record import Record
+from ltcl.store.refusals import about
 
 logger = logging.getLogger(__name__)
 
-FORMATS: dict[str, ModuleType] = {".npz": npz, ".npy": npy, ".mtx": mtx}
+FORMATS: dict[str, ModuleType] = {
+    ".npz": npz,
+    ".npy": npy,
+    ".mtx": mtx,
+    ".h5": hdf5,
+    ".hdf5": hdf5,
+    ".mat": matlab,
+    ".zarr": zarr_folder,
+}
 
 
 def read(path: str | Path) -> Record | Parts:
@@ -37,7 +42,7 @@ def read(path: str | Path) -> Record | Parts:
 
     Examples
     --------
-    >>> import tempfile
+    >>> import tempfile, numpy as np
     >>> path = Path(tempfile.mkdtemp()) / "T.npz"
     >>> write(path, Record((np.eye(6),), grid=(2, 3)))
     >>> read(path).grid
@@ -45,7 +50,8 @@ def read(path: str | Path) -> Record | Parts:
     """
     path = as_path(path)
     module = find(path)
-    input_file(path)
+    if module is not zarr_folder:
+        input_file(path)
     with about(path):
         return module.read(path)
 
@@ -63,41 +69,29 @@ def write(path: str | Path, record: Record | Parts) -> None:
     path = as_path(path)
     module = find(path)
     if isinstance(record, Parts):
-        if module is not npz:
-            raise FileError(f"{path}: {path.suffix} does not keep compressed transports; .npz does")
-    elif record.mixing is not None and module is not npz:
+        if module not in (npz, zarr_folder):
+            raise FileError(f"{path}: {path.suffix} does not keep compressed transports; .npz and .zarr do")
+    elif record.mixing is not None and not module.KEEPS_FIRST_BOUNCE:
         raise FileError(f"{path}: {path.suffix} does not keep how the projector's colours mix; .npz does")
-    elif not module.KEEPS_FIRST_BOUNCE and not _is_diagonal(record):
+    elif not module.KEEPS_FIRST_BOUNCE and not record.bounces_from_diagonal:
         logger.warning("%s: %s does not keep the first bounce; .npz does", path, path.suffix)
+    if module is zarr_folder:
+        with about(path):
+            zarr_folder.write(path, record)
+        return
+    if isinstance(record, Record):
+        with about(path):
+            record = record.in_memory()
     with replace_file(path) as temporary, about(path):
         module.write(temporary, record)
 
 
 def find(path: Path) -> ModuleType:
-    """Module of the format that the extension of `path` names."""
+    """Module of the format that the extension of `path` names; a folder may be a store by any other."""
     try:
         return FORMATS[path.suffix.lower()]
     except KeyError:
+        if path.is_dir():
+            return zarr_folder
         known = ", ".join(FORMATS)
         raise FileError(f"{path}: {unknown_extension(path)}; transports are {known}") from None
-
-
-@contextlib.contextmanager
-def about(path: Path) -> Iterator[None]:
-    """Put the name of `path` in front of whatever is refused inside the block."""
-    try:
-        yield
-    except (InputError, InputTypeError) as error:
-        raise FileError(f"{path}: {error}") from error.__cause__
-    except MemoryError as error:
-        raise MemoryLimitError(f"{path}: {error or 'the host has no memory left'}") from None
-    except OSError as error:
-        raise FileError(f"{path}: {error.strerror or error}") from error
-
-
-def _is_diagonal(record: Record) -> bool:
-    """Whether a first bounce taken from the diagonal of T, the default on loading, would be the same."""
-    if record.first_bounce is None or record.shape[0] != record.shape[1]:
-        return True
-    diagonals = np.stack([T.diagonal() for T in record.matrices])
-    return np.allclose(record.first_bounce, diagonals, rtol=1e-6, atol=0)

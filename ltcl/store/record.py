@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
 
 from ltcl import channels, checks
 from ltcl.errors import InputError, InputTypeError
+from ltcl.store.blocks import StoredRows
 
-Matrix = np.ndarray | scipy.sparse.csr_array
+Matrix = np.ndarray | scipy.sparse.csr_array | StoredRows
+_KINDS = (np.ndarray, scipy.sparse.csr_array, StoredRows)
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Record:
     ----------
     matrices
         One matrix, or three for red, green and blue, each (M, N): M camera pixels, N projector pixels, both
-        row-major. All dense or all `csr_array`, real.
+        row-major. All dense, all `csr_array` or all `StoredRows`, real.
     grid
         (h, w) of the projector, or None where the file does not tell.
     camera_grid
@@ -52,11 +54,8 @@ class Record:
     def __post_init__(self) -> None:
         if len(self.matrices) not in (1, 3):
             raise InputError(f"matrices are {len(self.matrices)}; they must be one, or three for RGB")
-        kinds = {isinstance(T, np.ndarray) for T in self.matrices}
-        if (
-            not all(isinstance(T, (np.ndarray, scipy.sparse.csr_array)) for T in self.matrices)
-            or len(kinds) > 1
-        ):
+        kinds = {next((kind for kind in _KINDS if isinstance(T, kind)), None) for T in self.matrices}
+        if None in kinds or len(kinds) > 1:
             names = ", ".join(type(T).__name__ for T in self.matrices)
             raise InputTypeError(f"matrices are {names}; they must be all arrays or all csr_array")
         shapes = {_shape(T) for T in self.matrices}
@@ -78,6 +77,24 @@ class Record:
     def dense(self) -> bool:
         """Whether the matrices are plain arrays."""
         return isinstance(self.matrices[0], np.ndarray)
+
+    @property
+    def stored(self) -> bool:
+        """Whether the matrices are in a store, and not in memory."""
+        return isinstance(self.matrices[0], StoredRows)
+
+    @property
+    def bounces_from_diagonal(self) -> bool:
+        """Whether a first bounce taken from the diagonal of T, the default on loading, would be the same."""
+        if self.first_bounce is None or self.shape[0] != self.shape[1]:
+            return True
+        diagonals = np.stack([T.diagonal() for T in self.matrices])
+        return np.allclose(self.first_bounce, diagonals, rtol=1e-6, atol=0)
+
+    def in_memory(self) -> Record:
+        """The same, of a store's blocks all loaded."""
+        matrices = tuple(T.tocsr() if isinstance(T, StoredRows) else T for T in self.matrices)
+        return replace(self, matrices=matrices)
 
 
 def _shape(T: Matrix) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from ltcl.store import Record, formats
 from .conftest import Program
 
 
-@pytest.mark.parametrize("extension", [".npz", ".npy"])
+@pytest.mark.parametrize("extension", [".npz", ".npy", ".h5", ".mat", ".zarr"])
 def test_values_survive(program: Program, transport: Path, tmp_path: Path, extension: str) -> None:
     there, back = tmp_path / f"there{extension}", tmp_path / "back.npz"
     assert program("convert", transport, there).code == 0
@@ -21,7 +21,9 @@ def test_values_survive(program: Program, transport: Path, tmp_path: Path, exten
     assert isinstance(before, Record)
     assert isinstance(after, Record)
     assert after.grid == (5, 10)
-    np.testing.assert_array_equal(np.asarray(before.matrices[0]), np.asarray(after.matrices[0]))
+    T, again = (scipy.sparse.csr_array(one.in_memory().matrices[0]).toarray() for one in (before, after))
+    kept = np.float32 if extension == ".zarr" else np.float64
+    np.testing.assert_array_equal(T.astype(kept), again)
 
 
 def test_sparse_to_matrix_market(program: Program, tmp_path: Path) -> None:
@@ -75,3 +77,15 @@ def test_compressed_ones_stay_what_they_are(
     assert {**a, "file": None} == {**b, "file": None}
     program("convert", compressed_transport, tmp_path / "T.mtx").refused(".mtx does not keep compressed")
     program("convert", compressed_transport, copy, "--grid", "10x5").refused("compressed on its own, (5, 10)")
+
+
+def test_a_store_is_told_of_and_converted(program: Program, transport: Path, tmp_path: Path) -> None:
+    there = tmp_path / "T.zarr"
+    assert f"{there}: dense, " in program("convert", transport, there).out
+    (entry,) = program("info", there, "--json").json
+    assert (entry["stored"], entry["dtype"], entry["entries"]) == ("row blocks", "float32", 2500)
+    assert (entry["shape"], entry["grid"]) == ([50, 50], [5, 10])
+    values = there / "channel_0" / "block_000000.0" / "values" / "c" / "0"
+    values.write_bytes(values.read_bytes()[:-1])
+    program("info", there).refused("T.zarr: channel_0/block_000000.0/values", "declares")
+    program("convert", there, tmp_path / "back.npz").refused("T.zarr: channel_0/block_000000.0/values")

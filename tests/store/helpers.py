@@ -49,7 +49,7 @@ def same_matrix(x: Matrix, y: Matrix) -> None:
 
 
 def as_dense(T: Matrix) -> np.ndarray:
-    return T if isinstance(T, np.ndarray) else T.toarray()
+    return T if isinstance(T, np.ndarray) else scipy.sparse.csr_array(T.tocsr()).toarray()
 
 
 def record_in(path: Path) -> Record:

@@ -143,7 +143,7 @@ def test_what_is_known_without_a_device(device, tmp_path):
 def test_other_formats_and_operators_are_refused(device, tmp_path):
     C = compressed(device)
     for name in ("C.npy", "C.mtx"):
-        with pytest.raises(FileError, match=r"does not keep compressed transports; \.npz does"):
+        with pytest.raises(FileError, match=r"does not keep compressed transports; \.npz and \.zarr do"):
             ltcl.save(tmp_path / name, C)
     plain = ltcl.Transport(Dense(device, np.eye(N)), GRID)
     with pytest.raises(

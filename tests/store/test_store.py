@@ -157,7 +157,7 @@ def test_paths_that_lead_nowhere(tmp_path):
         "none.npz": "no such file",
         "empty.npz": "the file is empty",
         "folder.npz": "is a folder",
-        "T.mat": r"extension \.mat is unknown; transports are \.npz, \.npy, \.mtx",
+        "T.xyz": r"extension \.xyz is unknown; transports are \.npz, \.npy, \.mtx",
         "T": "has no extension",
     }
     for name, text in wanted.items():
@@ -165,7 +165,7 @@ def test_paths_that_lead_nowhere(tmp_path):
             store.load(tmp_path / name)
         assert str(error.value).startswith(str(tmp_path / name))
     with pytest.raises(FileError, match="unknown"):
-        store.save(tmp_path / "T.mat", Transport(dense(), grid=(3, 4)))
+        store.save(tmp_path / "T.xyz", Transport(dense(), grid=(3, 4)))
     with pytest.raises(InputTypeError, match="path is 3"):
         store.load(3)  # pyright: ignore[reportArgumentType]
 
