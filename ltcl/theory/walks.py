@@ -14,7 +14,7 @@ and the mean exists: by Cauchy and Schwarz rho(|R|)^2 <= q rho(Q).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -115,7 +115,7 @@ def _powers(Q: Operator) -> np.ndarray:
     return found[1:]
 
 
-def chance_to_go_on(radius: float, albedo: float | None) -> float:
+def chance_to_go_on(radius: float, albedo: float | None, others: Sequence[str] = ()) -> float:
     """q = m / (1 - m) of eq. 24; where no albedo m is given sqrt(radius), at which rho(Q) = q.
 
     For equal row sums that is rho(R), hence the m of a closed scene (eq. 14).
@@ -125,6 +125,8 @@ def chance_to_go_on(radius: float, albedo: float | None) -> float:
     radius : float
         From `second_moment_radius`.
     albedo : float, optional
+    others : names of options
+        That the polynomial which is advised in its place excludes, as it does the albedo.
 
     Raises
     ------
@@ -141,23 +143,29 @@ def chance_to_go_on(radius: float, albedo: float | None) -> float:
         if not q < _LONGEST:  # NaN neither, where moments overflow
             raise InputError(
                 "walks over R have no finite variance: the second moments of their weights "
-                f"{_growth(radius)}, which must be below 1; use series='chebyshev' or method='chebyshev'"
+                f"{_growth(radius)}, which must be below 1; use {_polynomial(others)} or method='auto'"
             )
         return q
-    m = checks.number("albedo", albedo, above=0.0)
+    m, instead = checks.number("albedo", albedo, above=0.0), _polynomial([*others, "albedo"])
     if m >= 0.5 or m / (1.0 - m) > _LONGEST:
         raise InputError(
             f"albedo is {m:.12g}; walks go on with chance m / (1 - m) (eq. 24), so they need m below 1/2, at "
-            f"most {_LONGEST / (1.0 + _LONGEST):.6g}: beyond use series='chebyshev' or method='chebyshev'"
+            f"most {_LONGEST / (1.0 + _LONGEST):.6g}: beyond use {instead} or method='auto'"
         )
     q = m / (1.0 - m)
     if not radius < q:
         least = f"below {radius / (1.0 + radius):.3g}" if radius < 1.0 else "whatever it is"
+        advice = "leave albedo out" if radius < _LONGEST**2 else f"use {instead} or method='auto'"
         raise InputError(
             f"albedo is {m:g}; over this R the variance of walks is infinite {least}: the second moments of "
-            f"weights {_growth(radius / q)}; leave albedo out, or use series='chebyshev'"
+            f"weights {_growth(radius / q)}; {advice}"
         )
     return q
+
+
+def _polynomial(others: Sequence[str]) -> str:
+    without = " and ".join(f"{name}=" for name in others)
+    return "series='chebyshev'" + (f" without {without}" if without else "")
 
 
 def _growth(radius: float) -> str:
