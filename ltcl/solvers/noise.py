@@ -23,6 +23,7 @@ from ltcl.operators import CSR, Dense
 from ltcl.operators.alias import Tables
 from ltcl.operators.certainty import reached, without_noise
 from ltcl.operators.entrywise import squares
+from ltcl.operators.links import Links
 from ltcl.operators.walks import Lengths, Sums
 from ltcl.solvers.sampled import side_by_side
 from ltcl.theory.unmet import Weights, largest_square, weights
@@ -71,6 +72,7 @@ class Noise:
     def _unmet(self, samples: int, pixels: np.ndarray) -> np.ndarray:
         """Root of the squares that may be added by what no sample has met, (P, columns)."""
         scores = self._lengths.scores(self._estimator)
+        rare = not isinstance(self._made, Links) and self._made.sampler != "uniform"
         found = []
         for w, (_, light) in zip(
             weights(self._channels[0][0], self._made, self._adjoint), self._channels, strict=True
@@ -79,7 +81,7 @@ class Noise:
             if self._adjoint:
                 found.append(_from(bright, w, scores, samples)[pixels])
             else:
-                root = np.sqrt(largest_square(w.of(pixels), *scores, samples))
+                root = np.sqrt(largest_square(w, *scores, samples, rare))[pixels]
                 found.append(np.multiply.outer(root, bright.max(axis=0)))
         return side_by_side(found)
 
@@ -95,7 +97,7 @@ def _from(bright: np.ndarray, w: Weights, scores: tuple[np.ndarray, np.ndarray],
     columns = bright.reshape(len(bright), -1).astype(np.float64).T
     whole = columns.sum(axis=1, keepdims=True)
     chosen = columns / np.where(whole > 0.0, whole, 1.0)
-    roots = [np.sqrt(largest_square(w.from_light(one), *scores, samples)) for one in chosen]
+    roots = [np.sqrt(largest_square(w.from_light(one), *scores, samples, rare=False)) for one in chosen]
     return np.broadcast_to((whole * roots).reshape(bright.shape[1:]), bright.shape)
 
 

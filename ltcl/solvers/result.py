@@ -84,7 +84,8 @@ class Solution:
         certain; NaN or infinite of a single sample. It has two parts. That of the spread of n samples falls
         as 1 / sqrt(n). That of light which they may not have met falls as 1 / n: by the rule of three it is
         about 1.7 |R_i| max |b| / n, whatever walks have found, and more where rows far heavier than others
-        are seldom met. Of pictures with ordinary contrast and 256
+        are seldom met: but not of uniform walks, of those from b, or of those that channels share.
+        Of pictures with ordinary contrast and 256
         samples the second is small, and x is within 2 of both together some 95 times in 100. Where most of
         the light is in few pixels it is the larger one until walks have met them, and x within 2 of it more
         often; so, too, of few samples, and of polynomials that the picture leaves hardly any noise.

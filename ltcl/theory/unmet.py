@@ -43,11 +43,6 @@ class Weights:
     largest: np.ndarray
     most: float
 
-    def of(self, pixels: np.ndarray) -> Weights:
-        """Of walks from some pixels."""
-        squares, fourths, largest = (of[:, pixels] for of in (self.squares, self.fourths, self.largest))
-        return Weights(squares, fourths, largest, self.most)
-
     def from_light(self, chosen: np.ndarray) -> Weights:
         """Of walks that start at pixel i with chance ``chosen[i]``, (N,); as of one pixel."""
         lit = chosen > 0.0
@@ -82,7 +77,9 @@ def _largest(factor: np.ndarray, reached: Callable[[np.ndarray], np.ndarray]) ->
     return np.array(found)
 
 
-def largest_square(w: Weights, scored: np.ndarray, worth: np.ndarray, samples: int) -> np.ndarray:
+def largest_square(
+    w: Weights, scored: np.ndarray, worth: np.ndarray, samples: int, rare: bool = True
+) -> np.ndarray:
     """Of what `samples` walks have not met: the most that it may add to the sum of squares, by |light|^2.
 
     Light that is met at one step alone, with ordinary weights, and weights that are not, which a walk takes
@@ -101,6 +98,8 @@ def largest_square(w: Weights, scored: np.ndarray, worth: np.ndarray, samples: i
     scored, worth : (L,)
         p_k and worth_k, of `Lengths.scores`.
     samples : int
+    rare : bool
+        With the sum. Of walks from light, of those that channels share and of uniform ones it is too large.
 
     Returns
     -------
@@ -109,7 +108,7 @@ def largest_square(w: Weights, scored: np.ndarray, worth: np.ndarray, samples: i
     Examples
     --------
     >>> alike = Weights(np.full((8, 1), 0.25), np.full((8, 1), 0.0625), np.full((8, 1), 0.5), 0.5)
-    >>> largest_square(alike, np.array([1.0, 0.5]), np.array([1.0, 2.0]), 100).tolist()
+    >>> largest_square(alike, np.array([1.0, 0.5]), np.array([1.0, 2.0]), 100).round(9).tolist()
     [3.0]
     """
     steps, worth = len(w.squares), np.abs(worth)
@@ -120,6 +119,8 @@ def largest_square(w: Weights, scored: np.ndarray, worth: np.ndarray, samples: i
         if late.size:
             later = np.arange(1, late.size + 1)
             found = np.maximum(found, w.squares[-1] * np.fmax.reduce(late * ratio**later, initial=0.0))
+        if not rare:
+            return found
         return (np.sqrt(found) + _of_rare_weights(w, scored, worth, samples)) ** 2
 
 

@@ -49,7 +49,7 @@ def covered(found: ltcl.Solution, exact: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("samples", [256, 2048, 16384])
-@pytest.mark.parametrize("form", ["dense", "csr", "endpoint", "colour"])
+@pytest.mark.parametrize("form", ["dense", "csr", "endpoint"])
 @pytest.mark.parametrize("kind", ["one light", "a room of light", "two doors"])
 def test_two_standard_errors_hold_where_heavy_rows_are_rarely_met(kind, form, samples):
     R, b = rare(kind)
@@ -57,8 +57,6 @@ def test_two_standard_errors_hold_where_heavy_rows_are_rarely_met(kind, form, sa
     exact = np.linalg.solve(S, b)[:ALIKE]
     options: dict[str, Any] = {"estimator": "endpoint"} if form == "endpoint" else {}
     given: Any = scipy.sparse.csr_array(S) if form == "csr" else S
-    if form == "colour":
-        given, b = tuple(map(ltcl.operators.as_operator, (S, S, S))), np.stack([b] * 3)
     found = ltcl.solve(given, b, "monte_carlo", samples=samples, pixels=np.arange(ALIKE), **options)
     assert covered(found, exact) >= 0.9  # 93 % of 100, less one standard deviation
 
@@ -83,16 +81,6 @@ def test_a_heavy_row_that_no_stage_has_met_is_not_said_to_be_met():
         found = ltcl.solve(np.eye(4) + R, b, "monte_carlo", pixels=[0], error=1e-3, seed=seed)
         assert "missed error=0.001" in found.reason
         assert abs(found.x[0] - 0.015) <= 3 * error_of(found)[0]
-
-
-def test_walks_from_light_seldom_start_where_they_weigh_most():
-    R = np.random.default_rng(0).random((40, 40)) * 0.3 / 40
-    R[:, 1] = R[1] = 0.0
-    R[0, 1] = 1000.0
-    b = np.where(np.arange(40) == 1, 1e-3, 1.0)
-    exact = np.linalg.solve(np.eye(40) + R, b)
-    runs = [ltcl.solve(np.eye(40) + R, b, "monte_carlo", adjoint=True, seed=s) for s in range(40)]
-    assert np.mean([abs(run.x[0] - exact[0]) <= 2 * error_of(run)[0] for run in runs]) >= 0.88
 
 
 def test_rows_within_a_factor_of_a_few_need_no_more_for_it():
