@@ -46,8 +46,8 @@ class Tables:
         Weights of a walk; with more than one also `links`, see `Links`.
     radius : float, optional
         See `ltcl.theory.walks.second_moment_radius`, which keeps it here.
-    growth : array, optional
-        See `ltcl.theory.walks.growth_of_weights`, which keeps it here.
+    weights : optional
+        See `ltcl.theory.unmet.weights`, which keeps them here.
     least : float, optional
         Samples of `ltcl.solvers.hybrid`, which keeps it here.
 
@@ -73,7 +73,7 @@ class Tables:
         self.entries = self.device.empty((self._used + behind,), np.uint64)
         self.links = self.records  # no kernel reads it
         self.radius: float | None = None
-        self.growth: np.ndarray | None = None
+        self.weights: Any = None
         self.least: float | None = None
         for slab in M.slabs:
             self._build(M.file, slab, slab.first, self._base(M, slab))

@@ -47,6 +47,8 @@ class Links(Tables):
     ----------
     links : Array, (entries, 4) uint32
         Of each entry: column, bits of the three factors.
+    indptr : (N + 1,)
+        Where rows begin among the entries.
     others : tuple
         All of Rs but the first.
     """
@@ -59,7 +61,7 @@ class Links(Tables):
         checks.fits_host("links of walks that channels share", _BYTES * entries)
         pattern, values = _together([_in_rows(R) for R in Rs])
         self._check_room(pattern.nnz, 16)
-        self._indptr, self._P = pattern.indptr, _pooled(pattern.indptr, values)
+        self.indptr, self._P = pattern.indptr, _pooled(pattern.indptr, values)
         places = np.arange(pattern.nnz) - _per_entry(pattern.indptr, pattern.indptr[:-1])
         super().__init__(CSR(self.device, _with(pattern, self._P, places)), sampler)
         self.links = self.device.upload(self._linked(pattern.indices, signs, values), np.uint32)
@@ -69,27 +71,32 @@ class Links(Tables):
         """Bytes on the device."""
         return super().nbytes + self.links.nbytes
 
-    def second_moments(self) -> Iterator[CSR]:
-        """Of each channel R_cij^2 / p(j | i), which a step makes of the second moments of weights."""
-        made, inverse = self.links.get(), self._inverse_chances()
-        for bits in made.T[1:]:
-            squares = np.square(bits.view(np.float32), dtype=np.float64)
-            Q = np.divide(squares, inverse, out=np.zeros_like(squares), where=inverse > 0.0)
-            Q, columns = np.minimum(Q, _LARGEST), made[:, 0].astype(np.int32)
-            yield CSR(self.device, scipy.sparse.csr_array((Q, columns, self._indptr), shape=self.shape))
+    def moments(self, power: int = 2) -> Iterator[CSR]:
+        """Of each channel p(j | i) (R_cij / p(j | i))^power, what a step makes of moments of weights."""
+        columns, inverse = self.links.get()[:, 0].astype(np.int32), self._inverse_chances()
+        for factor in self.factors():
+            powers = factor**power
+            Q = np.divide(powers, inverse, out=np.zeros_like(powers), where=inverse > 0.0)
+            Q = np.minimum(Q, _LARGEST)
+            yield CSR(self.device, scipy.sparse.csr_array((Q, columns, self.indptr), shape=self.shape))
+
+    def factors(self) -> Iterator[np.ndarray]:
+        """Of each channel what an entry multiplies weights by, absolute, (entries,) float64."""
+        for bits in self.links.get().T[1:]:
+            yield np.abs(bits.view(np.float32).astype(np.float64))
 
     def drawn(self) -> np.ndarray:
         """Entries of each row that a walk may draw, (rows,)."""
         if self.sampler == "uniform":
             return self.counts()
-        rows = _per_entry(self._indptr, np.arange(self.shape[0]))
+        rows = _per_entry(self.indptr, np.arange(self.shape[0]))
         return np.bincount(rows, self._P > 0.0, self.shape[0])
 
     def _inverse_chances(self) -> np.ndarray:
         """1 / p(j | i) of each entry, float64; 0 where it is never drawn."""
         if self.sampler == "uniform":
-            return _per_entry(self._indptr, self.counts().astype(np.float64))
-        total = _per_entry(self._indptr, self.sums().astype(np.float64))
+            return _per_entry(self.indptr, self.counts().astype(np.float64))
+        total = _per_entry(self.indptr, self.sums().astype(np.float64))
         return np.divide(total, self._P, out=np.zeros_like(total), where=self._P > 0.0)
 
     def _linked(self, columns: np.ndarray, signs: Sequence[float], values: list[np.ndarray]) -> np.ndarray:

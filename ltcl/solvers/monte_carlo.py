@@ -32,7 +32,7 @@ from ltcl.operators.entrywise import rows_of_R
 from ltcl.operators.walks import ESTIMATORS, Lengths, Sums, Walker, geometric, whole
 from ltcl.solvers import noise, sampled
 from ltcl.solvers.noise import Noise
-from ltcl.solvers.polynomials import bias_in_words, chebyshev_coefficients, chebyshev_degree
+from ltcl.solvers.polynomials import bias_in_words, chebyshev_bias, chebyshev_coefficients, chebyshev_degree
 from ltcl.solvers.sampled import Channel, Estimate
 from ltcl.solvers.stopping import System
 from ltcl.solvers.target_error import MOST, Measured, Staged, sample_to
@@ -62,7 +62,9 @@ class MonteCarlo:
     estimator : str, optional
         "collision": walks score at every step. "endpoint": where they end (eq. 26, the paper's).
     sampler : str
-        "alias" (eq. 25); "uniform", which the paper compares with; "cdf", for reference.
+        "alias" (eq. 25); "uniform", which the paper compares with; "cdf", for reference. Alias tables leave
+        out what is drawn less than once in about 2^19 times the entries of its row, and round the rest as
+        finely: a bias beside the standard error, which "cdf" hardly has. It may show beyond 2^20 samples.
     albedo : float, optional
         m of eq. 24, in (0, 1/2); by default such that walks are as long as their variance asks for.
     adjoint : bool
@@ -101,10 +103,16 @@ class MonteCarlo:
         checks.flag("adjoint", self.adjoint)
         checks.flag("gather", self.gather)
         if self.albedo is not None:
-            chance_to_go_on(0.0, self.albedo)
+            chance_to_go_on(0.0, self.albedo, self._only_neumann)
         if self.degree is not None:
             checks.count("degree", self.degree, most=_HIGHEST)
         self._refuse_together()
+
+    @property
+    def _only_neumann(self) -> list[str]:
+        """Options given that the polynomial excludes, beside the albedo."""
+        given = {"adjoint": self.adjoint, "estimator": self.estimator == "endpoint"}
+        return [name for name, there in given.items() if there]
 
     def check(self, n: int) -> None:
         """Refuse what does not fit S, (n, n)."""
@@ -120,7 +128,7 @@ class MonteCarlo:
             return sampled.each_alone(self, channels, "those from b are of one channel")
         try:
             made, sign = self._tables(channels)
-            first, lengths, reason = self._lengths(channels, made, sign)
+            first, lengths, reason, bias = self._lengths(channels, made, sign)
         except (InputError, MemoryLimitError) as error:
             if len(channels) == 1:
                 raise
@@ -132,7 +140,7 @@ class MonteCarlo:
                 self._estimate(one, first, mean, error, reason)
                 for one, mean, error in zip(channels, *parts, strict=True)
             ]
-            return self._told(found, rest, channels)
+            return self._told(found, rest, channels, bias)
         return sampled.each_alone(self, channels, why)
 
     def _tables(self, channels: Sequence[Channel]) -> tuple[Tables, float]:
@@ -157,8 +165,10 @@ class MonteCarlo:
         rows = channel.x.shape[0]
         return np.arange(rows) if self.pixels is None else _pixels(self.pixels, rows)
 
-    def _lengths(self, channels: Sequence[Channel], made: Tables, sign: float) -> tuple[float, Lengths, str]:
-        """c_0, the terms that walks estimate, and both in words."""
+    def _lengths(
+        self, channels: Sequence[Channel], made: Tables, sign: float
+    ) -> tuple[float, Lengths, str, float]:
+        """c_0, the terms that walks estimate, both in words, and what others may add to x, by the light."""
         Rs = [rows_of_R(one.system.S, self.name)[0] for one in channels]
         moments = second_moment_radius(Rs[0], made, self.adjoint)
         if self.series == "chebyshev":
@@ -170,19 +180,20 @@ class MonteCarlo:
                 "walks by sampler='uniform' have no finite variance over this R: the second moments of their "
                 f"weights grow by {moments:.3g} a step, which must be below 1; use sampler='alias'"
             )
-        q = chance_to_go_on(moments, self.albedo)
-        return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}"
+        q = chance_to_go_on(moments, self.albedo, self._only_neumann)
+        return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}", 0.0
 
     def _polynomial(
         self, bounds: tuple[float, float], sign: float, rtol: float, moments: float
-    ) -> tuple[float, Lengths, str]:
+    ) -> tuple[float, Lengths, str, float]:
         """That of Chebyshev, to the degree given, or to that of rtol where noise leaves anything of it."""
         degree = max(1, chebyshev_degree(rtol, bounds)) if self.degree is None else self.degree
         if degree > _HIGHEST:
             raise InputError(
                 f"rtol is {rtol:g}, which takes a degree of {degree}; degree= must be at most {_HIGHEST}"
             )
-        c = chebyshev_coefficients(degree, bounds) * sign ** np.arange(degree + 1)
+        lower = "raise rtol=" if self.degree is None else "lower degree="
+        c = chebyshev_coefficients(degree, bounds, lower) * sign ** np.arange(degree + 1)
         most = self.samples or (self.usual if self.error is None else MOST)
         noise = noise_of_terms(c, moments) / math.sqrt(most)
         if self.degree is None and not noise < 1.0:
@@ -193,13 +204,13 @@ class MonteCarlo:
             )
         if not noise * math.sqrt(most) <= _LOUDEST:
             raise InputError(
-                f"degree is {degree}; its terms over this R are beyond float32: lower degree=, or use "
+                f"degree is {degree}; its terms over this R are beyond float32: {lower}, or use "
                 "method='chebyshev'"
             )
         reason = f"Chebyshev series of degree {degree}, which leaves {bias_in_words(degree, bounds)}"
         if self.error is None:  # else nobody knows how many samples there will be
             reason += f", and noise of about {noise:.2g} times b with {most} samples"
-        return float(c[0]), whole(c[1:]), reason
+        return float(c[0]), whole(c[1:]), reason, chebyshev_bias(degree, bounds) / bounds[0]
 
     def _walk(self, channels: Sequence[Channel], made: Tables, lengths: Lengths) -> Staged:
         """Estimates of the terms k >= 1 of channels side by side, and their standard errors."""
@@ -229,7 +240,9 @@ class MonteCarlo:
         sums = Sums(self._count(len(r)), total, squares)
         return Staged.fixed(sums, measured(sums, np.arange(len(r))))
 
-    def _told(self, found: list[Estimate], rest: Staged, channels: Sequence[Channel]) -> list[Estimate]:
+    def _told(
+        self, found: list[Estimate], rest: Staged, channels: Sequence[Channel], bias: float
+    ) -> list[Estimate]:
         """Whether the error is as small as wanted, what was spent on it, and what to try next."""
         gather = "" if self.gather or self.pixels is not None else ", or gather=True"
         if self.error is None:
@@ -239,7 +252,13 @@ class MonteCarlo:
             assert one.standard_error is not None  # noqa: S101 - Monte Carlo always tells it
             within = one.standard_error * channel.unit <= self.error
             met = met & within.reshape(len(within), -1).all(axis=1)
-        what = rest.told(met, self.error, self.samples or MOST, "" if met.all() else self._instead(channels))
+        off = bias * max(float(np.max(_mean_square(one) ** 0.5 * one.unit)) for one in channels)
+        instead = "" if met.all() else self._instead(channels)
+        biased = off > self.error
+        by = "the noise alone, with " if biased else ""
+        what = rest.told(met, self.error, self.samples or MOST, instead, by)
+        if biased:
+            met, what = met & False, f"{what}; {self._more_terms(off)}"
         advice = f"try a smaller error={gather}" if self.pixels is None else ""
         return [
             dataclasses.replace(one, reason=f"{one.reason}; {what}", met=bool(met.all()), advice=advice)
@@ -260,6 +279,10 @@ class MonteCarlo:
             return "adjoint=True suits few lights"
         return "allow a larger error=" if self.samples is None else "allow more samples="
 
+    def _more_terms(self, off: float) -> str:
+        more = "lower rtol=" if self.degree is None else "raise degree="
+        return f"the series may be off by up to {off:.2g} in the root mean square over pixels: {more}"
+
     def _count(self, n: int) -> int:
         return n * (self.samples or self.usual)
 
@@ -279,6 +302,11 @@ class MonteCarlo:
             raise InputTypeError("adjoint=True estimates whole pictures; leave pixels= and error= out")
         if self.estimator == "collision" or self.sampler != "alias":
             raise InputTypeError("adjoint=True has estimator='endpoint' and sampler='alias'; leave them out")
+
+
+def _mean_square(channel: Channel) -> np.ndarray:
+    """Of each column of the light."""
+    return np.mean(channel.r.get().astype(np.float64) ** 2, axis=0)
 
 
 def _pixels(pixels: Any, n: int) -> np.ndarray:

@@ -6,7 +6,8 @@ most about 3 / n of n samples, and so its share of the variance of a mean at mos
 
     3 (W_i max |b|)^2 / n^2,    W_i the root mean square of what a score is worth by its light
 
-(`ltcl.theory.walks.largest_square`). That is added to s^2 / n, the estimate by the samples' own spread s, but
+and likewise of weights, where some of what walks may meet multiplies them by far more than the rest
+(`ltcl.theory.unmet.largest_square`). That is added to s^2 / n, the estimate by the samples' own spread s, but
 where there is no noise for certain. Of pictures with ordinary contrast it is a few hundredths of it; where
 few samples have met the light, or none, it is most of it.
 """
@@ -22,9 +23,10 @@ from ltcl.operators import CSR, Dense
 from ltcl.operators.alias import Tables
 from ltcl.operators.certainty import reached, without_noise
 from ltcl.operators.entrywise import squares
+from ltcl.operators.links import Links
 from ltcl.operators.walks import Lengths, Sums
 from ltcl.solvers.sampled import side_by_side
-from ltcl.theory.walks import growth_of_weights, largest_square
+from ltcl.theory.unmet import Weights, largest_square, weights
 
 
 class Noise:
@@ -64,19 +66,23 @@ class Noise:
         if sums.samples < 2:
             found = np.where(alike, np.nan, sums.standard_error)
         else:
-            found = np.hypot(sums.standard_error, self._unmet(sums.samples)[pixels] / sums.samples)
+            found = np.hypot(sums.standard_error, self._unmet(sums.samples, pixels) / sums.samples)
         return np.where(self._certain[pixels], 0.0, found) if alike.any() else found
 
-    def _unmet(self, samples: int) -> np.ndarray:
-        """Root of the squares that light may add which no sample has met, (N, columns)."""
+    def _unmet(self, samples: int, pixels: np.ndarray) -> np.ndarray:
+        """Root of the squares that may be added by what no sample has met, (P, columns)."""
         scores = self._lengths.scores(self._estimator)
-        growth = growth_of_weights(self._channels[0][0], self._made, self._adjoint)
+        rare = not isinstance(self._made, Links) and self._made.sampler != "uniform"
         found = []
-        for moments, (_, light) in zip(growth, self._channels, strict=True):
-            root, bright = np.sqrt(largest_square(moments, *scores, samples)), np.abs(light)
-            found.append(
-                _from(bright, root) if self._adjoint else np.multiply.outer(root, bright.max(axis=0))
-            )
+        for w, (_, light) in zip(
+            weights(self._channels[0][0], self._made, self._adjoint), self._channels, strict=True
+        ):
+            bright = np.abs(light)
+            if self._adjoint:
+                found.append(_from(bright, w, scores, samples)[pixels])
+            else:
+                root = np.sqrt(largest_square(w, *scores, samples, rare))[pixels]
+                found.append(np.multiply.outer(root, bright.max(axis=0)))
         return side_by_side(found)
 
     @functools.cached_property
@@ -86,12 +92,13 @@ class Noise:
         return side_by_side(found)
 
 
-def _from(bright: np.ndarray, root: np.ndarray) -> np.ndarray:
+def _from(bright: np.ndarray, w: Weights, scores: tuple[np.ndarray, np.ndarray], samples: int) -> np.ndarray:
     """Of walks that begin in proportion to the light, (N,) or (N, k), each with the weight of all of it."""
-    whole = bright.sum(axis=0, dtype=np.float64)
-    chosen = bright / np.where(whole > 0.0, whole, 1.0)
-    with np.errstate(invalid="ignore"):
-        return np.broadcast_to(whole * np.sqrt(root**2 @ chosen), bright.shape)
+    columns = bright.reshape(len(bright), -1).astype(np.float64).T
+    whole = columns.sum(axis=1, keepdims=True)
+    chosen = columns / np.where(whole > 0.0, whole, 1.0)
+    roots = [np.sqrt(largest_square(w.from_light(one), *scores, samples, rare=False)) for one in chosen]
+    return np.broadcast_to((whole * roots).reshape(bright.shape[1:]), bright.shape)
 
 
 def gathered(R: CSR | Dense, error: np.ndarray) -> np.ndarray:

@@ -10,11 +10,14 @@ import numpy as np
 from ltcl.errors import InputError
 
 
-def chebyshev_coefficients(degree: int, bounds: tuple[float, float]) -> np.ndarray:
+def chebyshev_coefficients(
+    degree: int, bounds: tuple[float, float], lower: str = "lower degree="
+) -> np.ndarray:
     """c_0 .. c_degree of p(R) = sum c_k R^k near (I + R)^-1 for a spectrum of S = I + R within `bounds`.
 
     It is the iterate after degree + 1 steps from zero: Saad, Iterative Methods for Sparse Linear Systems, 2nd
-    ed., algorithm 12.1, carried out on the coefficients. Refused as soon as one is beyond float32.
+    ed., algorithm 12.1, carried out on the coefficients. Refused as soon as one is beyond float32;
+    `lower` tells how the degree is made lower.
 
     >>> chebyshev_coefficients(0, (0.5, 1.5)).tolist()
     [1.0]
@@ -27,7 +30,7 @@ def chebyshev_coefficients(degree: int, bounds: tuple[float, float]) -> np.ndarr
         if not np.all(np.abs(x) <= np.finfo(np.float32).max):
             raise InputError(
                 f"degree is {degree}; over a spectrum within {_shown(bounds)} coefficients are beyond "
-                f"float32 from degree {k} on: lower degree=, or use method='chebyshev'"
+                f"float32 from degree {k} on: {lower}, or use method='chebyshev'"
             )
         r = -np.append(x, 0.0) - np.append(0.0, x)  # 1 - (1 + R) x
         r[0] += 1.0

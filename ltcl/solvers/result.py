@@ -78,10 +78,14 @@ class Solution:
         Residual of the best iterate; the least of `residuals` when not given. Residuals that gmres foresees
         are no iterate's.
     standard_error : like x, optional
-        Of "monte_carlo": of the noise, without the bias of a polynomial. 0 only where there is none for
+        Of "monte_carlo": of the noise, without the bias of a polynomial, and without that of alias tables,
+        which leave out entries drawn less than once in about 2^19 times the entries of their row: beyond
+        2^20 samples it may show, and sampler="cdf" hardly has it. 0 only where there is none for
         certain; NaN or infinite of a single sample. It has two parts. That of the spread of n samples falls
         as 1 / sqrt(n). That of light which they may not have met falls as 1 / n: by the rule of three it is
-        about 1.7 |R_i| max |b| / n, whatever walks have found. Of pictures with ordinary contrast and 256
+        about 1.7 |R_i| max |b| / n, whatever walks have found, and more where rows far heavier than others
+        are seldom met: but not of uniform walks, of those from b, or of those that channels share.
+        Of pictures with ordinary contrast and 256
         samples the second is small, and x is within 2 of both together some 95 times in 100. Where most of
         the light is in few pixels it is the larger one until walks have met them, and x within 2 of it more
         often; so, too, of few samples, and of polynomials that the picture leaves hardly any noise.

@@ -52,11 +52,11 @@ class Staged:
         pixels = len(standard)
         return cls(sums.mean, standard, np.ones(pixels, bool), np.full(pixels, sums.samples))
 
-    def told(self, met: np.ndarray, error: float, most: int, instead: str) -> str:
+    def told(self, met: np.ndarray, error: float, most: int, instead: str, by: str = "") -> str:
         """How many pixels met the error, (P,) bool, what they took, and what to try where some did not."""
         spent = f"{self.samples.mean():.3g} samples a pixel, {self.samples.sum():.3g} in all"
         if met.all():
-            return f"error={error:g} met by {spent}"
+            return f"error={error:g} met by {by}{spent}"
         missed = f"{np.sum(~met)} of {len(met)} pixels missed error={error:g} within {most} samples"
         return f"{missed}: {instead} ({spent})"
 

@@ -14,7 +14,7 @@ and the mean exists: by Cauchy and Schwarz rho(|R|)^2 <= q rho(Q).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -28,13 +28,13 @@ from ltcl.operators.links import Links
 from ltcl.theory.spectrum import spectral_radius
 
 _LONGEST = 0.9999  # chance to go on; beyond, walks of many thousand steps would carry nothing
-_SETTLED = 8  # steps, after which second moments of weights grow alike at all pixels
+SETTLED = 8  # steps, after which second moments of weights grow alike at all pixels
+_LARGEST = float(np.finfo(np.float32).max)
 _SHORTEST = 1 / 16  # below, terms that matter little are seen so rarely that nobody can tell their error
-_UNMET = 3.0  # rule of three
 
 
-class SecondMoments(Operator):
-    """q Q: what a step makes of the second moments of weights.
+class Moments(Operator):
+    """q Q: what a step makes of the second moments of weights, or of those of a higher power.
 
     Parameters
     ----------
@@ -42,24 +42,34 @@ class SecondMoments(Operator):
     made : Tables
         Of R for the sampler in question, or with `columns` of R^T, over which the walks of the adjoint go.
     columns : bool
+    power : int
+        2, of second moments.
     """
 
-    def __init__(self, R: CSR | Dense, made: Tables, columns: bool = False) -> None:
+    def __init__(self, R: CSR | Dense, made: Tables, columns: bool = False, power: int = 2) -> None:
         super().__init__(R.device, R.shape)
         uniform = made.sampler == "uniform"
-        self._entries, self._columns = mapped(R, np.square if uniform else np.abs), columns
-        d = made.counts() if uniform else made.sums()
-        self._d = R.device.upload(d[: R.shape[0]])
+        self._entries, self._columns = mapped(R, _power(power) if uniform else np.abs), columns
+        d = (made.counts() if uniform else made.sums()).astype(np.float64) ** (power - 1)
+        self._d = R.device.upload(np.minimum(d[: R.shape[0]], _LARGEST))
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
         if transpose or add is not None:
-            raise TypeError("SecondMoments is for power iteration only")
+            raise TypeError("Moments is for power iteration only")
         self._entries._product(x, out, scale, None, self._columns)
         vectors.scale_rows(self._d, out, out)
 
 
+def _power(power: int) -> Callable[[np.ndarray], np.ndarray]:
+    def raised(entries: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            return np.minimum(entries**power, np.float32(_LARGEST))
+
+    return raised
+
+
 def second_moment_radius(R: CSR | Dense, made: Tables, columns: bool = False) -> float:
-    """q times the spectral radius of Q, by power iteration; kept with the tables. See `SecondMoments`.
+    """q times the spectral radius of Q, by power iteration; kept with the tables. See `Moments`.
 
     Of `Links` the largest of all channels; R is not looked at.
 
@@ -74,15 +84,16 @@ def second_moment_radius(R: CSR | Dense, made: Tables, columns: bool = False) ->
     return made.radius
 
 
-def second_moments(R: CSR | Dense, made: Tables, columns: bool = False) -> Iterable[Operator]:
-    """q Q, of `Links` that of each channel, for which R is not looked at. See `SecondMoments`."""
-    return made.second_moments() if isinstance(made, Links) else [SecondMoments(R, made, columns)]
+def second_moments(R: CSR | Dense, made: Tables, columns: bool = False, power: int = 2) -> Iterable[Operator]:
+    """q Q, of `Links` that of each channel, for which R is not looked at. See `Moments`."""
+    return made.moments(power) if isinstance(made, Links) else [Moments(R, made, columns, power)]
 
 
-def growth_of_weights(R: CSR | Dense, made: Tables, columns: bool = False) -> np.ndarray:
-    """(q Q)^k 1, k = 1 .. 8, of each channel, (channels, 8, N) float64; kept with the tables.
+def growth_of_weights(R: CSR | Dense, made: Tables, columns: bool = False, power: int = 2) -> np.ndarray:
+    """(q Q)^k 1, k = 1 .. 8, of each channel, (channels, 8, N) float64.
 
-    The mean square of the weight that walks have after k steps, without what their lengths divide it by.
+    The mean square of the weight that walks have after k steps, without what their lengths divide it by; or
+    the mean of its fourth `power`.
 
     >>> import ltcl
     >>> from ltcl.operators.alias import tables
@@ -90,15 +101,13 @@ def growth_of_weights(R: CSR | Dense, made: Tables, columns: bool = False) -> np
     >>> growth_of_weights(R, tables(R))[0, :3, 0].tolist()
     [0.25, 0.0625, 0.015625]
     """
-    if made.growth is None:
-        made.growth = np.stack([_powers(Q) for Q in second_moments(R, made, columns)])
-    return made.growth
+    return np.stack([_powers(Q) for Q in second_moments(R, made, columns, power)])
 
 
 def _powers(Q: Operator) -> np.ndarray:
-    found, unit = np.ones((_SETTLED + 1, Q.shape[0])), 1.0
-    for k in range(_SETTLED):  # float32 holds what is near 1
-        found[k + 1] = Q.apply(Q.device.upload(found[k] / unit)).get() * unit
+    found, unit = np.ones((SETTLED + 1, Q.shape[0])), 1.0
+    for k in range(SETTLED):  # float32 holds what is near 1
+        found[k + 1] = Q.apply(Q.device.upload(found[k] / unit)).get().astype(np.float64) * unit
         unit = float(found[k + 1].max()) or 1.0
         if not math.isfinite(unit):
             found[k + 1 :] = math.inf
@@ -106,44 +115,7 @@ def _powers(Q: Operator) -> np.ndarray:
     return found[1:]
 
 
-def largest_square(growth: np.ndarray, scored: np.ndarray, worth: np.ndarray, samples: int) -> np.ndarray:
-    """Of what `samples` walks have not met: the most that it may add to the sum of squares, by |light|^2.
-
-    An event that n samples have not met has a chance of 3 / n at most, with 95 % confidence (the rule of
-    three: Hanley and Lippman-Hand, 1983), and not more than that to be scored at the step in question. Its
-    score is light times the worth of the step times the weight of the walk; of that the mean square is known:
-
-        n E[score^2] / |light|^2 <= max over steps k of min(3, n p_k) worth_k^2 ((q Q)^k 1)_i
-
-    Parameters
-    ----------
-    growth : (8, N)
-        From `growth_of_weights`; of later steps all pixels grow alike, as they did at last.
-    scored, worth : (L,)
-        p_k and worth_k, of `Lengths.scores`.
-    samples : int
-
-    Returns
-    -------
-    (N,) float64
-
-    Examples
-    --------
-    >>> largest_square(np.full((8, 1), 0.25), np.array([1.0, 0.5]), np.array([1.0, 2.0]), 100).tolist()
-    [3.0]
-    """
-    with np.errstate(over="ignore", invalid="ignore"):
-        times = np.minimum(_UNMET, samples * scored) * worth**2
-        early, late = times[:_SETTLED, None], times[_SETTLED:]
-        found = np.max(early * growth[: len(early)], axis=0)
-        if late.size:
-            later = np.arange(1, late.size + 1)
-            ratio = float(growth[-1].max() / (growth[-2].max() or 1.0))
-            found = np.maximum(found, growth[-1] * np.fmax.reduce(late * ratio**later, initial=0.0))
-    return found
-
-
-def chance_to_go_on(radius: float, albedo: float | None) -> float:
+def chance_to_go_on(radius: float, albedo: float | None, others: Sequence[str] = ()) -> float:
     """q = m / (1 - m) of eq. 24; where no albedo m is given sqrt(radius), at which rho(Q) = q.
 
     For equal row sums that is rho(R), hence the m of a closed scene (eq. 14).
@@ -153,6 +125,8 @@ def chance_to_go_on(radius: float, albedo: float | None) -> float:
     radius : float
         From `second_moment_radius`.
     albedo : float, optional
+    others : names of options
+        That the polynomial which is advised in its place excludes, as it does the albedo.
 
     Raises
     ------
@@ -169,23 +143,29 @@ def chance_to_go_on(radius: float, albedo: float | None) -> float:
         if not q < _LONGEST:  # NaN neither, where moments overflow
             raise InputError(
                 "walks over R have no finite variance: the second moments of their weights "
-                f"{_growth(radius)}, which must be below 1; use series='chebyshev' or method='chebyshev'"
+                f"{_growth(radius)}, which must be below 1; use {_polynomial(others)} or method='auto'"
             )
         return q
-    m = checks.number("albedo", albedo, above=0.0)
+    m, instead = checks.number("albedo", albedo, above=0.0), _polynomial([*others, "albedo"])
     if m >= 0.5 or m / (1.0 - m) > _LONGEST:
         raise InputError(
             f"albedo is {m:.12g}; walks go on with chance m / (1 - m) (eq. 24), so they need m below 1/2, at "
-            f"most {_LONGEST / (1.0 + _LONGEST):.6g}: beyond use series='chebyshev' or method='chebyshev'"
+            f"most {_LONGEST / (1.0 + _LONGEST):.6g}: beyond use {instead} or method='auto'"
         )
     q = m / (1.0 - m)
     if not radius < q:
         least = f"below {radius / (1.0 + radius):.3g}" if radius < 1.0 else "whatever it is"
+        advice = "leave albedo out" if radius < _LONGEST**2 else f"use {instead} or method='auto'"
         raise InputError(
             f"albedo is {m:g}; over this R the variance of walks is infinite {least}: the second moments of "
-            f"weights {_growth(radius / q)}; leave albedo out, or use series='chebyshev'"
+            f"weights {_growth(radius / q)}; {advice}"
         )
     return q
+
+
+def _polynomial(others: Sequence[str]) -> str:
+    without = " and ".join(f"{name}=" for name in others)
+    return "series='chebyshev'" + (f" without {without}" if without else "")
 
 
 def _growth(radius: float) -> str:

@@ -99,7 +99,7 @@ def test_equal_channels_have_the_table_of_one(device, form, sampler):
 def test_second_moments_are_those_of_a_step(device, name, sampler):
     """R^2 / p of each channel; by the alias table at most three times what the channel has by itself."""
     made = made_of(device, name, "csr", sampler)
-    for M, Q in zip(CHANNELS[name], made.second_moments(), strict=True):
+    for M, Q in zip(CHANNELS[name], made.moments(), strict=True):
         M = M.astype(np.float64)
         found, own = Q.to_dense(), np.abs(M).sum(axis=1)
         if sampler == "uniform":

@@ -445,3 +445,30 @@ def test_stored_rows_that_overflow_are_refused_in_one_line(device, options):
         ltcl.solve(scipy.sparse.csr_array(S), np.ones(8), "monte_carlo", **options)
     assert "\n" not in str(caught.value)
     assert "nan" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("options", "advice"), [
+    ({}, "use series='chebyshev' or method='auto'"),
+    ({"albedo": 0.4}, "use series='chebyshev' without albedo= or method='auto'"),
+    ({"adjoint": True}, "use series='chebyshev' without adjoint= or method='auto'"),
+    ({"estimator": "endpoint"}, "use series='chebyshev' without estimator= or method='auto'"),
+    ({"estimator": "endpoint", "albedo": 0.4}, "without estimator= and albedo= or method='auto'"),
+    ({"estimator": "endpoint", "albedo": 0.5}, "without estimator= and albedo= or method='auto'"),
+])  # fmt: skip
+def test_no_refusal_advises_what_is_refused_too(options, advice):
+    S, b = np.eye(4) + 1.5 * np.eye(4)[[1, 0, 3, 2]], np.ones(4)
+    with pytest.raises(InputError) as caught:
+        ltcl.solve(S, b, "monte_carlo", **options)
+    assert str(caught.value).endswith(advice)
+    kept = {k: v for k, v in options.items() if f"{k}=" not in advice}
+    assert ltcl.solve(S, b, "monte_carlo", series="chebyshev", **kept).converged
+    assert ltcl.solve(S, b, "auto").converged
+
+
+def test_a_degree_that_nobody_gave_is_lowered_by_rtol():
+    G = np.random.default_rng(1).standard_normal((30, 30))
+    G *= 0.5 / np.abs(np.linalg.eigvals(G)).max()
+    with pytest.raises(InputError, match=r"degree is \d+; .*: raise rtol=, or use method='chebyshev'"):
+        ltcl.solve(np.eye(30) + G, np.ones(30), "monte_carlo", series="chebyshev")
+    with pytest.raises(InputError, match=r"degree is 124; .*: lower degree=, or use method='chebyshev'"):
+        ltcl.solve(np.eye(30) + G, np.ones(30), "monte_carlo", series="chebyshev", degree=124)

@@ -164,3 +164,23 @@ def test_the_samples_of_all_stages_are_told(monkeypatch):
     total = sum(count for count, _ in drawn)
     assert f"{total / 108:.3g} samples a pixel, {total:.3g} in all" in found.reason
     assert len({stream for _, stream in drawn}) > 2
+
+
+@pytest.mark.parametrize(
+    ("options", "advice"), [({"rtol": 0.05}, "lower rtol="), ({"degree": 3}, "raise degree=")]
+)
+def test_an_error_that_the_series_exceeds_is_met_by_the_noise_alone(options, advice):
+    S = ltcl.scenes.box(5, sides=6, albedo=0.6).transport().systems[0]
+    b = 1e3 * np.random.default_rng(0).random(150)
+    exact = np.linalg.solve(S.to_dense().astype(float), b)
+    found = ltcl.solve(S, b, "monte_carlo", series="chebyshev", error=10.0, **options)
+    said = re.search(
+        r"met by the noise alone, with .*; the series may be off by up to (\S+) in", found.reason
+    )
+    assert said is not None
+    assert found.reason.endswith(f"over pixels: {advice}")
+    assert float(said[1]) > 10.0
+    assert np.sqrt(np.mean((found.x - exact) ** 2)) <= float(said[1]) + 10.0
+    assert found.status is Status.SAMPLED
+    enough = ltcl.solve(S, b, "monte_carlo", series="chebyshev", error=300.0, **options)
+    assert "alone" not in enough.reason

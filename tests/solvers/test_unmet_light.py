@@ -15,7 +15,8 @@ from ltcl.operators import CSR, Dense, IdentityPlus, as_operator
 from ltcl.operators.alias import tables, tables_of_columns
 from ltcl.operators.links import links
 from ltcl.solvers import Solution
-from ltcl.theory.walks import growth_of_weights, largest_square
+from ltcl.theory.unmet import Weights, largest_square
+from ltcl.theory.walks import growth_of_weights
 from tests import gallery
 from tests.problems import lambertian
 
@@ -143,10 +144,11 @@ def test_weights_grow_by_the_powers_of_their_moments(device, form):
 def test_steps_beyond_those_kept_grow_as_the_last_did():
     """Equal rows: every power is known; the largest of c_k^2 Q^k is that of the last step."""
     growth = 2.0 ** np.arange(1, 9)[:, None] * np.ones((8, 3))
+    alike = Weights(growth, growth**2, np.sqrt(growth), 2.0**0.5)
     worth = np.full(12, 0.5)
-    np.testing.assert_allclose(largest_square(growth, np.ones(12), worth, 50), 3 * 0.25 * 2.0**12)
+    np.testing.assert_allclose(largest_square(alike, np.ones(12), worth, 50), 3 * 0.25 * 2.0**12)
     rare = np.append(np.ones(11), 0.01)  # 50 samples are scored there half a time
-    np.testing.assert_allclose(largest_square(growth, rare, worth, 50), 3 * 0.25 * 2.0**11)
+    np.testing.assert_allclose(largest_square(alike, rare, worth, 50), 3 * 0.25 * 2.0**11)
 
 
 @pytest.mark.parametrize("sampler", ["alias", "cdf"])

@@ -14,7 +14,7 @@ from ltcl.operators.alias import tables
 from ltcl.operators.links import links
 from ltcl.theory import sampled_products
 from ltcl.theory.sampled_products import least_samples
-from ltcl.theory.walks import SecondMoments, second_moment_radius
+from ltcl.theory.walks import Moments, second_moment_radius
 from tests import gallery
 from tests.problems import lambertian
 
@@ -60,7 +60,7 @@ def growth(R: np.ndarray, Q: np.ndarray, s: float) -> float:
 def test_noise_dies_away_from_the_least_samples_on_and_not_below(device, name, sampler):
     R = SIGNED[name].astype(np.float32).astype(float)
     M, Q = Dense(device, R), moments(R, sampler)
-    least = least_samples(M, SecondMoments(M, tables(M, sampler)))
+    least = least_samples(M, Moments(M, tables(M, sampler)))
     assert growth(R, Q, least) < 1
     if least > 1:
         assert growth(R, Q, 0.97 * (least - 1)) > 1  # the one below, less what is kept in reserve
@@ -79,9 +79,9 @@ def test_of_shared_columns_each_channel_has_its_least(device):
     P = np.sqrt(np.mean(np.square(rows), axis=0))
     p = P / P.sum(axis=1)[:, None]
     Ms = [Dense(device, R) for R in Rs]
-    for R, M, moments in zip(Rs, Ms, links(Ms, (1.0,) * 3).second_moments(), strict=True):
+    for R, M, moments in zip(Rs, Ms, links(Ms, (1.0,) * 3).moments(), strict=True):
         least = least_samples(M, moments)
-        assert least >= least_samples(M, SecondMoments(M, tables(M))) - 1
+        assert least >= least_samples(M, Moments(M, tables(M))) - 1
         assert growth(R, R**2 / p, least) < 1
         assert least == 1 or growth(R, R**2 / p, 0.97 * (least - 1)) > 1
 
@@ -89,21 +89,21 @@ def test_of_shared_columns_each_channel_has_its_least(device):
 def test_random_probes_come_close(device, monkeypatch):
     R = _normal(200, 0.7)
     M = Dense(device, R)
-    exact = least_samples(M, SecondMoments(M, tables(M)))
+    exact = least_samples(M, Moments(M, tables(M)))
     monkeypatch.setattr(sampled_products, "_EXACT", 0)
-    assert exact <= least_samples(M, SecondMoments(M, tables(M))) <= 1.2 * exact + 1
+    assert exact <= least_samples(M, Moments(M, tables(M))) <= 1.2 * exact + 1
 
 
 def test_powers_that_do_not_fall_need_infinitely_many(device):
     M = Dense(device, _normal(9, 1.05))
-    assert least_samples(M, SecondMoments(M, tables(M))) == np.inf
+    assert least_samples(M, Moments(M, tables(M))) == np.inf
 
 
 @pytest.mark.parametrize("form", ["csr", "dense"])
 def test_hybrid_takes_the_least_samples_and_refuses_one_less(device, form):
     R = _normal(31, 0.75)
     A = CSR(device, scipy.sparse.csr_array(R)) if form == "csr" else Dense(device, R)
-    least = int(least_samples(A, SecondMoments(A, tables(A))))
+    least = int(least_samples(A, Moments(A, tables(A))))
     b = np.random.default_rng(0).standard_normal(31)
     assert least > 5
     says = (
