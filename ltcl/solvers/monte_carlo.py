@@ -18,7 +18,6 @@ coefficients alternate and grow, and with them the noise, which `reason` foretel
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -29,17 +28,15 @@ from ltcl import checks, theory
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators.alias import SAMPLERS, Tables, tables, tables_of_columns
 from ltcl.operators.entrywise import rows_of_R
-from ltcl.operators.walks import ESTIMATORS, Lengths, Sums, Walker, geometric, whole
+from ltcl.operators.walks import ESTIMATORS, Lengths, Sums, Walker, geometric
 from ltcl.solvers import noise, sampled
 from ltcl.solvers.noise import Noise
-from ltcl.solvers.polynomials import bias_in_words, chebyshev_bias, chebyshev_coefficients, chebyshev_degree
 from ltcl.solvers.sampled import Channel, Estimate
+from ltcl.solvers.sampled_polynomial import HIGHEST, USUAL, sampled_terms
 from ltcl.solvers.stopping import System
 from ltcl.solvers.target_error import MOST, Measured, Staged, sample_to
-from ltcl.theory.walks import chance_to_go_on, noise_of_terms, second_moment_radius
+from ltcl.theory.walks import chance_to_go_on, second_moment_radius
 
-_HIGHEST = 10_000  # degree: walks are as long
-_LOUDEST = 2.0**63  # noise of a sample whose square float32 still holds
 _FEW = 0.1  # of the pixels lit: then walks from the light find more of it
 
 
@@ -77,7 +74,7 @@ class MonteCarlo:
     """
 
     name: ClassVar[str] = "monte_carlo"
-    usual: ClassVar[int] = 256
+    usual: ClassVar[int] = USUAL
     samples: int | None = None
     seed: int = 0
     pixels: Any = None
@@ -105,7 +102,7 @@ class MonteCarlo:
         if self.albedo is not None:
             chance_to_go_on(0.0, self.albedo, self._only_neumann)
         if self.degree is not None:
-            checks.count("degree", self.degree, most=_HIGHEST)
+            checks.count("degree", self.degree, most=HIGHEST)
         self._refuse_together()
 
     @property
@@ -173,7 +170,8 @@ class MonteCarlo:
         moments = second_moment_radius(Rs[0], made, self.adjoint)
         if self.series == "chebyshev":
             lowest, largest = zip(*(theory.free_bounds(one.system.S) for one in channels), strict=True)
-            return self._polynomial((min(lowest), max(largest)), sign, channels[0].rule.rtol, moments)
+            wanted = self.degree, self.samples, self.error is None
+            return sampled_terms((min(lowest), max(largest)), sign, channels[0].rule.rtol, moments, *wanted)
         own = self.sampler == "uniform" and len(Rs) == 1  # of walks that are shared each is tried next
         if own and moments >= 1.0 > second_moment_radius(Rs[0], tables(Rs[0])):
             raise InputError(
@@ -182,35 +180,6 @@ class MonteCarlo:
             )
         q = chance_to_go_on(moments, self.albedo, self._only_neumann)
         return 1.0, geometric(q, -sign), f"series of eq. 10, lengths of walks by m = {q / (1.0 + q):.3g}", 0.0
-
-    def _polynomial(
-        self, bounds: tuple[float, float], sign: float, rtol: float, moments: float
-    ) -> tuple[float, Lengths, str, float]:
-        """That of Chebyshev, to the degree given, or to that of rtol where noise leaves anything of it."""
-        degree = max(1, chebyshev_degree(rtol, bounds)) if self.degree is None else self.degree
-        if degree > _HIGHEST:
-            raise InputError(
-                f"rtol is {rtol:g}, which takes a degree of {degree}; degree= must be at most {_HIGHEST}"
-            )
-        lower = "raise rtol=" if self.degree is None else "lower degree="
-        c = chebyshev_coefficients(degree, bounds, lower) * sign ** np.arange(degree + 1)
-        most = self.samples or (self.usual if self.error is None else MOST)
-        noise = noise_of_terms(c, moments) / math.sqrt(most)
-        if self.degree is None and not noise < 1.0:
-            instead = "or use series='neumann'" if moments < 1.0 else "or use method='chebyshev'"
-            raise InputError(
-                f"samples is {most}; of the polynomial of degree {degree} that rtol={rtol:g} asks for they "
-                f"leave noise of about {noise:.2g} times b: give a lower degree=, more samples=, {instead}"
-            )
-        if not noise * math.sqrt(most) <= _LOUDEST:
-            raise InputError(
-                f"degree is {degree}; its terms over this R are beyond float32: {lower}, or use "
-                "method='chebyshev'"
-            )
-        reason = f"Chebyshev series of degree {degree}, which leaves {bias_in_words(degree, bounds)}"
-        if self.error is None:  # else nobody knows how many samples there will be
-            reason += f", and noise of about {noise:.2g} times b with {most} samples"
-        return float(c[0]), whole(c[1:]), reason, chebyshev_bias(degree, bounds) / bounds[0]
 
     def _walk(self, channels: Sequence[Channel], made: Tables, lengths: Lengths) -> Staged:
         """Estimates of the terms k >= 1 of channels side by side, and their standard errors."""
