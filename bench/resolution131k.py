@@ -114,7 +114,7 @@ def times(given: Options, built: Built, wanted: np.ndarray) -> dict[str, float]:
 
     def solve() -> None:
         for c, S in enumerate(built.lighter.systems):
-            ltcl.solve(S, pixels[:, c], "chebyshev", rtol=ERROR)
+            ltcl.solve(S, pixels[:, c], rtol=ERROR)
 
     actions: dict[str, Any] = {
         "product, on coefficients": on_coefficients,
