@@ -12,7 +12,6 @@ import numpy as np
 from ltcl.operators.alias import Tables
 from ltcl.operators.csr import CSR
 from ltcl.operators.dense import Dense
-from ltcl.operators.entrywise import mapped
 from ltcl.operators.links import Links
 from ltcl.operators.walks import Lengths
 
@@ -51,8 +50,16 @@ def _drawn(R: CSR | Dense, made: Tables) -> np.ndarray:
         return made.drawn()
     if made.sampler == "uniform":
         return made.counts()
-    nonzero = mapped(R, lambda entries: (entries != 0.0).astype(np.float32))
-    return nonzero.apply(R.device.upload(np.ones(R.shape[1]))).get()
+    if "entries" not in R.tables:
+        R.tables["entries"] = _entries(R)
+    return R.tables["entries"]
+
+
+def _entries(R: CSR | Dense) -> np.ndarray:
+    """How many of each row are not zero."""
+    if isinstance(R, CSR):
+        return np.diff(np.concatenate([[0], np.cumsum(R.data != 0.0)])[R.pattern.indptr])
+    return np.concatenate([np.count_nonzero(slab.arguments[1].get(), axis=1) for slab in R.slabs])
 
 
 def reached(R: CSR | Dense, goal: np.ndarray, steps: int) -> np.ndarray:
