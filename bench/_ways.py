@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Four ways to the direct light of a picture, for `fig7.py`: each ready to run.
 
-Dense R is (I - A)^-1 - I by factorization. Both compressed forms come from C of R = W^T C W, which eq. 21
-makes on coefficients from rows of A that stream by, as in `resolution131k.py`; rows in wavelets are
-R W^T = W^T C. So neither of these needs a dense R, and both go to any N.
+Dense R is (I - A)^-1 - I by factorization (`_corner.py`). Both compressed forms come from C of
+R = W^T C W, which eq. 21 makes on coefficients from rows of A that stream by, as in `resolution131k.py`; rows
+in wavelets are R W^T = W^T C. So neither of these needs a dense R, and both go to any N.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 from rich.console import Console
 
 import ltcl
+from _corner import interreflection
 from _harness import Options
 from _kept import bisect
 from ltcl.compression.coefficients import coefficients
@@ -87,11 +87,7 @@ def by_steps(S: IdentityPlus, at: Problem, kept: float) -> Way:
 
 def dense(given: Options, at: Problem) -> IdentityPlus:
     """S with every number of R."""
-    n = len(at.l_out)
-    less = -at.rows.rows(0, n).T  # in Fortran's order, which LAPACK inverts in place
-    less[np.diag_indices(n)] += 1.0
-    R = scipy.linalg.inv(less, overwrite_a=True, check_finite=False).T
-    R[np.diag_indices(n)] -= 1.0
+    R = interreflection(at.rows.n, ALBEDO, lambda said: note(f"N = {len(at.l_out)}: {said.strip()}"))
     return IdentityPlus(Dense(given.device, R))
 
 

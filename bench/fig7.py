@@ -47,8 +47,8 @@ from ltcl import checks
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SIZES, SMOKE = (8, 11, 16, 23, 32, 45, 64, 91, 128, 181, 256), (2, 4, 8)  # patches along a wall, N = 2 n^2
-SERIES, DENSE, SQUARES = 4096, 16562, 4  # the largest N; arrays of N x N float32 on the way
+SIZES, SMOKE = (8, 12, 16, 22, 32, 46, 64, 90, 128, 182, 256), (2, 4, 8)  # patches along a wall, N = 2 n^2
+SERIES, DENSE, SQUARES = 4232, 32768, 4  # the largest N; arrays of N x N float32 on the way
 PATIENCE, REPEATS = 3.0, 15  # s: what takes longer runs once
 ABOVE, LEAST = 5.0, 3  # times the launch floor: where a slope begins; of so many points at least
 MANY = 2000  # pixels from which on W is judged: few have few wavelets
