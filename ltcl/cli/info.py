@@ -120,7 +120,7 @@ def _of_parts(file: Path, parts: Parts) -> dict[str, Any]:
         "grid": parts.grid,
         "camera_grid": parts.camera_grid,
         "stored": "compressed",
-        "dtype": f"{', '.join(parts.kinds)}; error {parts.error:.2g}",
+        "dtype": f"{', '.join(parts.kinds)}; error {checks.upwards(parts.error)}",
         "entries": parts.entries,
         "nbytes": parts.nbytes,
         "first_bounce": (float(F.min()), float(F.max())),
