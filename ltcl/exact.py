@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from ltcl import checks
+from ltcl.errors import InputTypeError
 from ltcl.operators import IdentityPlus
 from ltcl.transport import Transport, refuse_other, require
 
@@ -30,6 +32,20 @@ def beside(T: Transport, exact: Any) -> tuple[Transport, tuple[IdentityPlus | No
     if exact is None:
         return T, (None,) * T.channels
     require(T)
+    if not isinstance(exact, Transport):
+        raise InputTypeError(
+            f"exact is a {type(exact).__name__}; it must be a ltcl.Transport: give exact=T, the uncompressed "
+            "transport"
+        )
     require(exact, name="exact")
     refuse_other("exact", exact, T, "it must be that of T, or T made from exact")
     return exact, exact.systems
+
+
+def itself(error: float) -> str:
+    """Behind a result, what the T that it is of is off by; nothing where that is 0.
+
+    >>> itself(0.0412), itself(0.0)
+    (' with a T that itself is off by 0.042', '')
+    """
+    return f" with a T that itself is off by {checks.upwards(error)}" if error else ""

@@ -26,7 +26,7 @@ import numpy as np
 
 from ltcl import checks, layout
 from ltcl.errors import InputTypeError
-from ltcl.exact import beside
+from ltcl.exact import beside, itself
 from ltcl.single_view import negative_bounces
 from ltcl.solvers import Inverse, Solution, sampled, solve_each
 from ltcl.solvers.precomputed import require_inverse
@@ -66,6 +66,9 @@ class Separation:
     warning : str
         Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 and the
         negative light at most 0.005, or unknown; of a compressed T both may be more by its error.
+    transport_error : float
+        ``.error`` of the T that all of this is of, the one that was given, or `exact` where that was: what a
+        compressed one may be off by itself, beyond the tolerance of each solve; 0 of others.
     """
 
     direct: np.ndarray
@@ -76,10 +79,11 @@ class Separation:
     reciprocity_defect: float = float("nan")
     negative_bounce: float = float("nan")
     warning: str = ""
+    transport_error: float = 0.0
 
     def __repr__(self) -> str:
-        shape = " x ".join(map(str, self.direct.shape))
-        return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces>"
+        shape, off = " x ".join(map(str, self.direct.shape)), itself(self.transport_error)
+        return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces{off}>"
 
 
 def separate(
@@ -107,7 +111,8 @@ def separate(
         Of `ltcl.solve`; rtol is per bounce, 1e-3 when not given, or what a compressed T or an inverse is
         off by where that is more.
     exact : Transport, optional
-        What a compressed T stands for: T then solves, to any `rtol`, and all that is told is of `exact`.
+        The uncompressed transport that a compressed T stands for: T then solves, to any `rtol`, and all that
+        is told is of `exact`.
     inverse : Inverse, optional
         Of T, as `ltcl.invert` makes it: each bounce is then one product, and `rtol` the error it may have.
 
@@ -141,8 +146,7 @@ def separate(
     true, judges = beside(T, exact)
     if inverse is not None:
         _check_inverse(T, inverse, method, rtol, exact, options)
-    if rtol is None:
-        rtol = max(_RTOL, inverse.error if inverse is not None else T.error if exact is None else 0.0)
+    rtol = usual_rtol(T, exact, inverse) if rtol is None else rtol
     undo = partial(_undo, T, inverse, method, {"rtol": rtol, **options, "exact": judges})
     chain = _chain(undo, columns, bounces)
 
@@ -163,7 +167,18 @@ def separate(
         reciprocity_defect=true.reciprocity_defect,
         negative_bounce=negative,
         warning=warning,
+        transport_error=true.error,
     )
+
+
+def usual_rtol(T: Transport, exact: Transport | None = None, inverse: Inverse | None = None) -> float:
+    """Of each bounce where none is given: 1e-3, or what a compressed T or an inverse is off by.
+
+    >>> usual_rtol(Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2)))
+    0.001
+    """
+    error = inverse.error if inverse is not None else T.error if exact is None else 0.0
+    return max(_RTOL, error) if error < 1.0 else _RTOL  # which is refused, with the reason
 
 
 def _check_inverse(

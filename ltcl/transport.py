@@ -127,7 +127,7 @@ class Transport:
         kind = {1: "grey", 3: "colour"}[self.channels]
         (rows, columns), (h, w) = self.shape, self.grid
         size = ""
-        if self._has_systems:
+        if self.is_compressed:
             size = f", compressed to {checks.size(self.nbytes)} with an error of {self.error:.2g}"
         return f"<ltcl Transport {rows} x {columns}, {kind}, grid {h} x {w}{size}>"
 
@@ -188,11 +188,11 @@ class Transport:
     @property
     def error(self) -> float:
         """The largest `solution_error` of the systems: what light may be off by; 0 where all are exact."""
-        return max(S.solution_error for S in self.systems) if self._has_systems else 0.0
+        return max(S.solution_error for S in self.systems) if self.is_compressed else 0.0
 
     @property
-    def _has_systems(self) -> bool:
-        """Whether some channel was given as S F."""
+    def is_compressed(self) -> bool:
+        """Whether some channel was given as S F, as `ltcl.compress` does; `error` is what that may cost."""
         return self.is_square and any(made_with(T) is not None for T in self.matrices)
 
     @property

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl import exact, reciprocity
+from ltcl import checks, exact, reciprocity, separation
 from ltcl.device import Device
 from ltcl.errors import DeviceError, InputError, InputTypeError
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, ScaledColumns, Shifted, Wavelet
@@ -146,8 +149,44 @@ def test_tolerances_below_the_error_are_refused_with_the_figure(device):
     C, T = pair(device)
     picture = T @ np.full(GRID, 0.5)
     for task in (ltcl.compensate, ltcl.separate):
-        with pytest.raises(InputError, match=r"rtol is 1e-06; S is compressed and .* off by 0\.\d+: ask"):
+        with pytest.raises(InputError) as refused:
             task(C, picture, rtol=1e-6)
+        assert re.fullmatch(
+            r"rtol is 1e-06; S is compressed and its solutions may be off by 0\.\d+: ask for no less, or "
+            r"give exact=T, the uncompressed transport",
+            str(refused.value),
+        )
+
+
+def test_results_tell_of_which_T_they_are(device):
+    """A target that is met with T~ is missed with T by at most T~.error of T~ p: ||E S~^-1|| is below it."""
+    C, T = pair(device)
+    desired = T @ rng.uniform(0.3, 0.7, GRID)
+    alone = ltcl.compensate(C, desired, rtol=C.error)
+    missed = np.linalg.norm(T @ alone.pattern - alone.appearance) / np.linalg.norm(alone.appearance)
+    assert 0.0 < missed <= alone.transport_error == C.error
+    assert f" with a T that itself is off by {checks.upwards(C.error)}, " in repr(alone)
+    parts = ltcl.separate(C, desired, 1)
+    assert parts.transport_error == C.error
+    assert repr(parts).endswith(f"1 bounces with a T that itself is off by {checks.upwards(C.error)}>")
+    for found in (
+        ltcl.compensate(C, desired, exact=T, rtol=1e-4),
+        ltcl.compensate(T, desired),
+        ltcl.separate(C, desired, 1, exact=T),
+        ltcl.separate(T, desired, 1),
+    ):
+        assert found.transport_error == 0.0
+        assert "itself" not in repr(found)
+
+
+def test_a_bounce_is_as_exact_as_T_is(device):
+    C, T = pair(device)
+    assert separation.usual_rtol(T) == separation.usual_rtol(C, T) == 1e-3
+    assert separation.usual_rtol(C) == max(C.error, 1e-3)
+    R = two_sided(device, SCENES[1].R, 0.5)
+    unknown = ScaledColumns(IdentityPlus(R, solution_error=np.inf), F[1])
+    with pytest.raises(InputError, match=r"rtol is 0\.001; .* off by inf: .* or give exact=T,"):
+        ltcl.separate(ltcl.Transport(unknown, GRID, first_bounce=F[1]), np.ones(GRID))
 
 
 def test_compensation_is_as_good_as_it_says(device):
@@ -202,8 +241,10 @@ def test_what_does_not_lie_beside(device, small_device):
     C, T = pair(device)
     rgb = colour(device)[1]
     matrix = T.matrices[0]
+    S: Any = T.interreflection
     for other, kind, part in (
-        (matrix, InputTypeError, "exact is a ndarray; it must be a ltcl.Transport"),
+        (matrix, InputTypeError, "exact is a ndarray; it must be a ltcl.Transport: give exact=T, the unc"),
+        (S, InputTypeError, "exact is a IdentityPlus; .* give exact=T, the uncompressed"),
         (rgb, InputError, "exact has channels 3; it must be that of T, 1"),
         (
             ltcl.Transport(matrix, (7, 6)),

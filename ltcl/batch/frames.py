@@ -29,6 +29,7 @@ from ltcl.batch.result import CompensatedFrames
 from ltcl.batch.run import Run, staying
 from ltcl.compensation import compensate, inputs
 from ltcl.errors import InputError
+from ltcl.exact import beside
 from ltcl.files import as_path
 from ltcl.images.codes import Encoding
 from ltcl.images.frames import check_video, open_frames, write_video
@@ -68,7 +69,9 @@ def compensate_frames(
         A folder: pattern_000001.png and so on, and frames.json, which tells settings and frames done. What is
         in it already stays.
     batch : int
-        Frames solved at once; more need more memory and, up to a point, less time for each.
+        Frames solved at once; more need more memory and, up to a point, less time for each. What a solve
+        leaves within `rtol` depends on the frames beside, and the sample for a gain is as large: when
+        resuming it has to be the same.
     resume : bool
         Go on where an earlier run with the same T, settings and frames ended; from the beginning where there
         was none. Without it, a folder with frames of an earlier run is refused.
@@ -93,7 +96,7 @@ def compensate_frames(
         Called after every batch with the number of frames done, of earlier runs, too; total is None where the
         source does not tell.
     **options
-        Of `ltcl.compensate`: bounds, method, rtol, and so on; background and weights are one picture.
+        Of `ltcl.compensate`: bounds, method, rtol, exact, and so on; background and weights are one picture.
 
     Returns
     -------
@@ -152,6 +155,7 @@ def compensate_frames(
 def _checked(T: Transport, gain: Any, loss: Any, options: dict[str, Any]) -> tuple[float, float]:
     """The bounds, (low, high); refuses what `compensate` would, and pictures that are not for all frames."""
     require(T, square=False)
+    beside(T, options.get("exact"))
     inputs.gain(gain, loss)
     for name in ("background", "weights"):
         value = options.get(name)

@@ -19,7 +19,8 @@ _FEW = 8  # numbers are shown as they are, more by a digest
 def of_transport(T: Transport) -> dict[str, Any]:
     """Sizes and a SHA-256 of all entries; of operators without entries, some numbers u.(T v) instead.
 
-    Not of the first bounce: compensation does not depend on it.
+    Not of the first bounce: compensation does not depend on it. The error of a compressed T may; it is told,
+    not compared.
     """
     matrices = T.matrices if T.blocks is None else tuple(part for row in T.blocks for part in row)
     digest, probes = hashlib.sha256(), []
@@ -36,6 +37,7 @@ def of_transport(T: Transport) -> dict[str, Any]:
         "channels": T.channels,
         "grid": list(T.grid),
         "camera_grid": list(T.camera_grid),
+        "error": T.error,
         "digest": digest.hexdigest(),
         "probes": probes,
     }
@@ -43,7 +45,8 @@ def of_transport(T: Transport) -> dict[str, Any]:
 
 def same_transport(one: dict[str, Any], other: dict[str, Any]) -> bool:
     """Whether two of these are of the same T."""
-    exact = [{key: value for key, value in part.items() if key != "probes"} for part in (one, other)]
+    told = ("probes", "error")
+    exact = [{key: value for key, value in part.items() if key not in told} for part in (one, other)]
     probes = [part.get("probes", []) for part in (one, other)]
     return (
         exact[0] == exact[1]

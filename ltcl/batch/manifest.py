@@ -40,7 +40,7 @@ class Record:
     digest : str
         SHA-256 of what it holds.
     error, clipped : float
-        Of this frame, as in `ltcl.Compensation`.
+        Of this frame, as in `ltcl.Compensation`: with T, or with `exact` where that is among the settings.
     """
 
     number: int

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ltcl.batch.manifest import Record
+from ltcl.exact import itself
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,6 +27,8 @@ class CompensatedFrames:
         Frames of this run.
     seconds : float
         That they took, reading and writing included.
+    transport_error : float
+        As in `ltcl.Compensation`: what is not in the errors of the records, where T is compressed.
     """
 
     folder: Path
@@ -34,6 +37,7 @@ class CompensatedFrames:
     records: tuple[Record, ...]
     solved: int
     seconds: float
+    transport_error: float = 0.0
 
     @property
     def frames_per_second(self) -> float:
@@ -52,5 +56,5 @@ class CompensatedFrames:
 
     def __repr__(self) -> str:
         worst = self.worst
-        off = f"at worst off by {worst.error:.2%}, frame {worst.number}"
+        off = f"at worst off by {worst.error:.2%}{itself(self.transport_error)}, frame {worst.number}"
         return f"<ltcl CompensatedFrames {len(self.records)} in {self.folder}, {off}>"

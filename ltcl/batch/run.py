@@ -65,7 +65,10 @@ class Run:
         """What came out of it."""
         assert self.kept.gain is not None  # noqa: S101 - a source has a frame, or refuses
         records = tuple(self.kept.records[number] for number in self.passed)
-        return CompensatedFrames(self.output.folder, video, self.kept.gain, records, self.solved, seconds)
+        told = (self.options.get("exact") or self.T).error
+        return CompensatedFrames(
+            self.output.folder, video, self.kept.gain, records, self.solved, seconds, told
+        )
 
     def _batches(self) -> Iterator[Batch]:
         for frames in batched(self.reader.frames(), self.size):

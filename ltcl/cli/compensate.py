@@ -65,7 +65,8 @@ _BATCH = Annotated[
     typer.Option(
         min=1,
         metavar="N",
-        help="Frames solved at once. Default: 8.",
+        help="Frames solved at once. Patterns depend on it, within RTOL, so --resume needs the same. "
+        "Default: 8.",
         show_default=False,
         rich_help_panel=_PANEL,
     ),
@@ -121,6 +122,7 @@ def run(
     method: options.Method = "auto",
     rtol: options.Rtol = 1e-2,
     inverse: options.Inverse = None,
+    exact: options.Exact = None,
     samples: options.Samples = None,
     seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
@@ -168,6 +170,7 @@ def run(
         on_dark=on_dark,
     )
     known = transports.load_inverse(inverse, T)
+    judge = transports.load_exact(exact, T, grid=grid, on_dark=on_dark)
     reader = pictures.Reader(T.camera_grid, "the camera", encoding, resize)
     desired = {} if source else reader.read_all(picture)
     dark, counts = (None if file is None else reader.read(file) for file in (background, weights))
@@ -180,6 +183,7 @@ def run(
         method=method,
         rtol=rtol,
         inverse=inverse,
+        exact=exact,
         **drawn,
         first_bounce=first_bounce,
         on_dark=on_dark,
@@ -196,21 +200,22 @@ def run(
     )
     settings: dict[str, Any] = {"bounds": (low, high), "gain": gain, "loss": loss, "method": method}
     settings |= {"rtol": rtol, **drawn, "background": dark, "weights": counts}
-    settings |= {"inverse": known, "clamp": clamp}
+    settings |= {"inverse": known, "exact": judge, "clamp": clamp}
+    told = transports.caveat("errors are", T, exact)
     if source:
         settings |= {"resize": resize, "encoding": encoding}
         done = compensate_frames.run(T, source, out, {**film, **settings})
         if json:
             console.answer({"folder": out, **text, **compensate_frames.entry(source, done)})
         else:
-            compensate_frames.show(done)
+            compensate_frames.show(done, told)
         return
     names = {"background": background, "weights": weights}
     entries = compensate_pictures.run(T, picture, desired, out, text, names, settings)
     if json:
         console.answer({"folder": out, **text})
     else:
-        compensate_pictures.show(out, entries, advise=gain != "auto")
+        compensate_pictures.show(out, entries, told, advise=gain != "auto")
 
 
 def _check(gain: float | str, loss: float | None) -> None:

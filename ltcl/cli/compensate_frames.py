@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from ltcl.cli import console
-from ltcl.errors import InputError
+from ltcl.errors import FileError, InputError
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
@@ -26,10 +26,11 @@ def source(paths: Sequence[Path], film: dict[str, Any]) -> Path | None:
     Raises
     ------
     InputError
-        It is not alone, or there is none and an option in `film` asks for one.
+        It is not alone, or there is none and an option in `film` asks for one; nothing is there.
     """
     from ltcl.images.frames import is_frames
 
+    _require_there(paths)
     found = [path for path in paths if is_frames(path)]
     if found and len(paths) > 1:
         raise InputError(
@@ -39,6 +40,16 @@ def source(paths: Sequence[Path], film: dict[str, Any]) -> Path | None:
         if not found and value not in (None, False):
             raise InputError(f"--{name} is given, but {paths[0]} is a picture; it is for a folder or a video")
     return found[0] if found else None
+
+
+def _require_there(paths: Sequence[Path]) -> None:
+    for path in paths:
+        try:
+            path.stat()
+        except FileNotFoundError:
+            raise FileError(f"{path}: no such file or folder") from None
+        except (OSError, ValueError):  # no permission, a NUL byte: whoever opens it says so
+            continue
 
 
 def run(T: Transport, path: Path, out: Path, settings: dict[str, Any]) -> CompensatedFrames:
@@ -63,14 +74,15 @@ def entry(path: Path, done: CompensatedFrames) -> dict[str, Any]:
         "solved": done.solved,
         "seconds": done.seconds,
         "frames_per_second": done.frames_per_second,
+        "transport_error": done.transport_error,
         "worst": dataclasses.asdict(done.worst),
         "most_clipped": dataclasses.asdict(done.most_clipped),
         "frames": [dataclasses.asdict(record) for record in done.records],
     }
 
 
-def show(done: CompensatedFrames) -> None:
-    """Print what came out, and on stderr what would help."""
+def show(done: CompensatedFrames, told: str) -> None:
+    """Print what came out, what is `told` of the errors, and on stderr what would help."""
     worst, most = done.worst, done.most_clipped
     console.table(
         ("frames", "of this run", "a second", "gain", "worst error", "in frame", "most clipped", "in frame"),
@@ -89,6 +101,8 @@ def show(done: CompensatedFrames) -> None:
     )
     also = "" if done.video is None else f", as a video in {done.video}"
     typer.echo(f"\npatterns and frames.json in {done.folder}{also}")
+    if told:
+        typer.echo(told)
     if most.clipped > _MANY:
         count = sum(record.clipped > _MANY for record in done.records)
         console.note(

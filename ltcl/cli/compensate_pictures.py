@@ -86,6 +86,7 @@ def _entry(T: Transport, done: Compensation, low: float, high: float) -> dict[st
         "asks_above": float(np.mean(np.greater(light, high))),
         "brightest": float(np.max(light)),
         "error": done.error,
+        "transport_error": done.transport_error,
         "gap": done.gap,
         "channels": report.solution(solutions),
         "limited": report.solution(done.limited),
@@ -123,8 +124,8 @@ def _diverging(missing: np.ndarray) -> np.ndarray:
     return images.from_srgb(0.5 + shade)
 
 
-def show(out: Path, entries: list[dict[str, Any]], advise: bool) -> None:
-    """Print what came out, and on stderr what would help."""
+def show(out: Path, entries: list[dict[str, Any]], told: str, advise: bool) -> None:
+    """Print what came out, what is `told` of the errors, and on stderr what would help."""
     console.table(
         ("picture", "method", "products", "gain", "clipped", "error", "pattern"),
         [
@@ -141,6 +142,8 @@ def show(out: Path, entries: list[dict[str, Any]], advise: bool) -> None:
         ],
     )
     typer.echo(f"\npatterns, appearances and what is out of reach as .exr and .png in {out}")
+    if told:
+        typer.echo(told)
     if any(entry["too_dark"] or entry["too_bright"] for entry in entries):
         typer.echo("out of reach: orange stays too dark, blue too bright")
     for entry in entries if advise else ():

@@ -115,9 +115,10 @@ def _show(text: dict[str, Any]) -> None:
     typer.echo(
         "  dropped, rounded: Frobenius norms; error: 2-norm of all that was; solution: error times norm"
     )
+    within = checks.upwards(text["solution_error"])
     before, after = (checks.size(text[name]) for name in ("bytes", "bytes_compressed"))
     typer.echo(
-        f"\n{text['out']}: {before} to {after}, solutions within {text['solution_error']:.2g}, "
+        f"\n{text['out']}: {before} to {after}, solutions within {within}, "
         f"{checks.size(text['bytes_on_disk'])} on disk, in {made['seconds']:.3g} s"
     )
 

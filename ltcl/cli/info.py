@@ -14,13 +14,13 @@ import typer
 from ltcl import checks
 from ltcl.cli import console, options
 from ltcl.errors import InputError, LtclError
-from ltcl.store import Parts, Record, formats
+from ltcl.store import Parts, Record, formats, inverses
 
 
 def run(files: options.Matrices, json: options.Json = False) -> None:
     """Tell what transport files hold: size, channels, grid, entries, first bounce. Needs no device.
 
-    A bad file does not keep the others from being told; the exit code is then 1.
+    Of inverses, too. A bad file does not keep the others from being told; the exit code is then 1.
     """
     found, errors = [], []
     with console.Steps(len(files)) as steps:
@@ -42,6 +42,8 @@ def run(files: options.Matrices, json: options.Json = False) -> None:
 
 
 def _facts(file: Path) -> dict[str, Any]:
+    if inverses.is_inverse(file):
+        return {**_of_parts(file, inverses.read(file)), "stored": "inverse"}
     record = formats.read(file)
     with formats.about(file):
         return describe(file, record)
@@ -118,7 +120,7 @@ def _of_parts(file: Path, parts: Parts) -> dict[str, Any]:
         "grid": parts.grid,
         "camera_grid": parts.camera_grid,
         "stored": "compressed",
-        "dtype": f"{', '.join(parts.kinds)}; error {parts.error:.2g}",
+        "dtype": f"{', '.join(parts.kinds)}; error {checks.upwards(parts.error)}",
         "entries": parts.entries,
         "nbytes": parts.nbytes,
         "first_bounce": (float(F.min()), float(F.max())),

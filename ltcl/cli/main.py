@@ -54,8 +54,11 @@ def _failed(message: str, code: int) -> typer.Exit:
 
 # How the library's messages name arguments that are options here.
 _ARGUMENT = re.compile(
-    r"\b(grid|camera_grid|on_dark|first_bounce|method|rtol)=(?:'([\w-]+)'|\((\w+), (\w+)\)|([\d.e-]+))"
+    r"\b(grid|camera_grid|on_dark|first_bounce|method|rtol|gain|loss|batch|format|encoding)="
+    r"(?:'([\w-]+)'|\((\w+), (\w+)\)|(\d[\d.e-]*))"
 )
+_SUBJECT = re.compile(r"(^|: |; )(rtol|method|exact|inverse|budget|fps)(?= (?:is|has|mixes) )")
+_COMMAND = re.compile(r"ltcl\.(invert|compress)\(T(?:, (\w+)=(?:\.\.\.|'(\w+)'))?\)")
 
 _WORDS = {
     "rtol and atol are both 0; one of them must be positive": "--rtol is 0; it must be above 0",
@@ -63,6 +66,10 @@ _WORDS = {
     "bounds[1] is": "--high is",
     "resume=True": "--resume",
     "resize=True": "--resize",
+    "exact=T, the": "--exact FILE, the",
+    "exact= corrects": "--exact corrects",
+    "but inverse takes": "but --inverse takes",
+    "load it with ltcl.load_inverse and give it as inverse= to": "give it as --inverse FILE to",
 }
 
 
@@ -78,8 +85,13 @@ def as_options(message: str) -> str:
         value = word or number or f"{rows}x{columns}".replace("hxw", "HxW")
         return f"--{name.replace('_', '-')} {value}"
 
+    def command(found: re.Match[str]) -> str:
+        name, given, value = found.groups(default="")
+        return f"'{' '.join(filter(None, ('ltcl', name, given and f'--{given}', value)))}'"
+
     for words, shown in _WORDS.items():
         message = message.replace(words, shown)
+    message = _SUBJECT.sub(r"\1--\2", _COMMAND.sub(command, message))
     return _ARGUMENT.sub(option, message)
 
 

@@ -60,7 +60,10 @@ def solves(method: str, channels: int) -> int:
     return 1 if method in SAMPLED else channels
 
 
-FORMATS = "Light transport: .npz, .npy, .mtx, .h5, .mat (v7.3) or .zarr."
+FORMATS = (
+    "Light transport: .npz, .npy, .mtx or .zarr; with the extra hdf5 also .h5, .hdf5, and .mat of MATLAB's "
+    "v7.3, variable LTM."
+)
 Matrix = Annotated[Path, typer.Argument(metavar="TRANSPORT", help=FORMATS)]
 Matrices = Annotated[list[Path], typer.Argument(metavar="FILE...", help=FORMATS)]
 Pictures = Annotated[
@@ -105,6 +108,15 @@ Inverse = Annotated[
     typer.Option(
         metavar="FILE",
         help="What 'ltcl invert' made of the transport: then each picture takes one product and no solve.",
+        show_default=False,
+    ),
+]
+Exact = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="What a compressed TRANSPORT was compressed from: solves are then corrected to any RTOL, and "
+        "everything that is told is of FILE.",
         show_default=False,
     ),
 ]

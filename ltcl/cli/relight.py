@@ -59,3 +59,5 @@ def run(
     ]
     console.table(("pattern", "brightest", "white in png", "picture"), rows)
     typer.echo(f"\npictures as .exr and .png in {out}")
+    if told := transports.caveat("they are", T):
+        typer.echo(told)

@@ -13,6 +13,15 @@ from ltcl import report
 from ltcl.cli import console, options, pictures, results, transports
 from ltcl.separation import Separation
 
+_RTOL = Annotated[
+    float | None,
+    typer.Option(
+        metavar="FRACTION",
+        help="Relative residual at which a solve is done. Default: 0.001, or what a compressed TRANSPORT "
+        "without --exact, or the inverse, is off by.",
+        show_default=False,
+    ),
+]
 _BOUNCES = Annotated[int, typer.Option(metavar="N", min=0, help="Indirect bounces to tell apart.")]
 
 
@@ -23,8 +32,9 @@ def run(
     bounces: _BOUNCES = 4,
     grid: options.Grid = None,
     method: options.Method = "auto",
-    rtol: options.Rtol = 1e-3,
+    rtol: _RTOL = None,
     inverse: options.Inverse = None,
+    exact: options.Exact = None,
     samples: options.Samples = None,
     seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
@@ -40,11 +50,13 @@ def run(
     little negative) and for the eye as .png, each at its own brightness, which separate.json tells. Several
     pictures get a folder each.
     """
-    from ltcl.separation import separate
+    from ltcl.separation import separate, usual_rtol
 
     drawn = options.sampling(method, samples, seed)
     T = transports.load(transport, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
     known = transports.load_inverse(inverse, T)
+    judge = transports.load_exact(exact, T, grid=grid, on_dark=on_dark)
+    rtol = usual_rtol(T, judge, known) if rtol is None else rtol
     seen = pictures.Reader(T.grid, "the camera", encoding, resize).read_all(picture)
     text = transports.heading(
         "separate",
@@ -55,6 +67,7 @@ def run(
         method=method,
         rtol=rtol,
         inverse=inverse,
+        exact=exact,
         **drawn,
         first_bounce=first_bounce,
         on_dark=on_dark,
@@ -67,15 +80,16 @@ def run(
     with console.Steps(len(seen), solves) as steps, results.fill(out, text) as folder:
         for (name, image), file in zip(seen.items(), picture, strict=True):
             steps.item(file.name)
-            settings = {"method": method, "rtol": rtol, "inverse": known, **drawn}
+            settings = {"method": method, "rtol": rtol, "inverse": known, "exact": judge, **drawn}
             done = separate(T, image, bounces, callback=steps.solve(rtol), **settings)
             # Several pictures get a folder each.
             place = f"{name}/" if len(seen) > 1 else ""
-            entries.append({"file": str(file), "parts": _write(folder, place, done, image)})
+            parts = _write(folder, place, done, image)
+            entries.append({"file": str(file), "transport_error": done.transport_error, "parts": parts})
     if json:
         console.answer({"folder": out, **text})
     else:
-        _show(out, entries)
+        _show(out, entries, transports.caveat("all of this is", T, exact))
 
 
 def _write(folder: Path, place: str, done: Separation, image: np.ndarray) -> list[dict[str, Any]]:
@@ -103,7 +117,7 @@ def _light(part: np.ndarray) -> float:
     return float(np.sum(part, dtype=np.float64)) * (1 if part.ndim == 3 else 3)
 
 
-def _show(out: Path, entries: list[dict[str, Any]]) -> None:
+def _show(out: Path, entries: list[dict[str, Any]], told: str) -> None:
     console.table(
         ("picture", "part", "share of light", "products", "residual", "white in png"),
         [
@@ -121,3 +135,5 @@ def _show(out: Path, entries: list[dict[str, Any]]) -> None:
     )
     places = [out / Path(entry["parts"][0]["exr"]).parent for entry in entries]
     typer.echo(f"\neach part as .exr and .png in {', '.join(map(str, places))}")
+    if told:
+        typer.echo(told)

@@ -6,13 +6,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from ltcl import report, store
+import numpy as np
+
+from ltcl import checks, report, store
 from ltcl.cli import console
 from ltcl.device import open_device
-from ltcl.errors import FileError
+from ltcl.errors import FileError, InputError
+from ltcl.exact import beside
 from ltcl.solvers import Inverse
 from ltcl.store import formats
 from ltcl.transport import Transport
+
+_ROUNDING = 1e-5  # of float32, in a picture
 
 
 def load(
@@ -49,6 +54,57 @@ def load_inverse(path: Path | None, T: Transport) -> Inverse | None:
     return None if path is None else store.load_inverse(path, device=T.device)
 
 
+def load_exact(path: Path | None, T: Transport, **options: Any) -> Transport | None:
+    """What T was compressed from, of the same first bounce and on its device; None where there is no file.
+
+    Raises
+    ------
+    FileError
+        As `store.load`.
+    InputError
+        It is another transport, told by pixels, colours, or one random pattern.
+    """
+    if path is None:
+        return None
+    exact = store.load(path, device=T.device, **options)
+    if exact.is_square and (exact.grid, exact.channels) == (T.grid, T.channels):
+        exact = _with_first_bounce(exact, T)
+    beside(T, exact)  # refuses others
+    pattern = np.random.default_rng(0).random((*T.grid, *(3,) * (T.channels == 3)))
+    ours, theirs = T @ pattern, exact @ pattern
+    missed, allowed = float(np.linalg.norm(ours - theirs) / np.linalg.norm(ours)), T.error + _ROUNDING
+    if not missed <= allowed:
+        raise InputError(
+            f"{path}: is not what TRANSPORT was compressed from: under a random pattern they differ by "
+            f"{missed:.2g}, which may be {checks.upwards(allowed)} at most"
+        )
+    return exact
+
+
+def _with_first_bounce(exact: Transport, T: Transport) -> Transport:
+    """The same transport, split as T is, whose first bounce may have been chosen when it was compressed."""
+    return Transport(
+        exact.matrices if exact.channels == 3 else exact.matrices[0],
+        T.grid,
+        T.first_bounce,
+        device=T.device,
+        on_dark="mask" if T.masked.any() else "raise",
+        mixing=exact.mixing,
+    )
+
+
+def caveat(what: str, T: Transport, exact: Path | None = None) -> str:
+    """A line on which transport `what` is shown is of; none where T is no compressed one.
+
+    >>> caveat("errors are", Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2)))
+    ''
+    """
+    if exact is not None:
+        return f"{what} of {exact}, by which solutions were corrected"
+    off = f"which itself is off by up to {100 * float(checks.upwards(T.error)):.2g} %"
+    return f"{what} of the compressed transport, {off}" if T.error else ""
+
+
 def _require_square(path: Path) -> None:
     rows, columns = formats.read(path).shape
     if rows != columns:
@@ -68,6 +124,8 @@ def heading(command: str, path: Path, T: Transport, **options: Any) -> dict[str,
             "grid": T.grid,
             "camera_grid": T.camera_grid,
             "masked": int(T.masked.sum()),
+            "compressed": T.is_compressed,
+            "error": T.error,
         },
         "options": options,
     }

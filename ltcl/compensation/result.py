@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ltcl.exact import itself
 from ltcl.solvers import Bounded, Solution
 
 
@@ -33,7 +34,8 @@ class Compensation:
         abs(target - appearance) is at most 3 times what ``max(rtol ||W target||, atol)`` of this frame and
         colour makes in the root mean square. So it is 0 where the weight is.
     error : float
-        ``||W (appearance - target)|| / ||W target||`` of all frames and colours together.
+        ``||W (appearance - target)|| / ||W target||`` of all frames and colours together, with the T that was
+        given, or `exact` where that was: what `transport_error` tells of that T is not in it.
     gap : float
         What the error is above the least that the bounds allow, at most: no pattern within them has an error
         below error - gap. A bound that was computed for this result.
@@ -44,6 +46,9 @@ class Compensation:
     limited : tuple of Bounded
         The solves within the bounds; empty where the bounds cost nothing. Their products are those of the
         search for a gain, too.
+    transport_error : float
+        ``.error`` of that T: what a compressed one may be off by itself, 0 of others. The scene may look that
+        much farther from the target, in relation to T pattern.
     """
 
     pattern: np.ndarray
@@ -58,7 +63,9 @@ class Compensation:
     frame_clipped: np.ndarray
     solution: Solution | tuple[Solution, ...]
     limited: tuple[Bounded, ...]
+    transport_error: float = 0.0
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.pattern.shape))
-        return f"<ltcl Compensation {shape}, off by {self.error:.2%}, {self.clipped:.2%} clipped>"
+        off = f"off by {self.error:.2%}{itself(self.transport_error)}"
+        return f"<ltcl Compensation {shape}, {off}, {self.clipped:.2%} clipped>"

@@ -71,7 +71,8 @@ def compensate(
         gain * desired - background. Where no bound holds, noise of a method that samples stays; it is part of
         `error` and `gap`, and makes the gain that gain="auto" finds smaller.
     exact : Transport, optional
-        What a compressed T stands for: T then solves, to any `rtol`, and everything else is of `exact`.
+        The uncompressed transport that a compressed T stands for: T then solves, to any `rtol`, and
+        everything else is of `exact`.
     inverse : Inverse, optional
         Of T, as `ltcl.invert` makes it: the light without bounds is then one product, whatever the method.
     clamp : bool
@@ -180,6 +181,7 @@ def _result(
         frame_clipped=np.mean([p.reshape(len(p), frames, -1).mean(axis=(0, 2)) for p in held], axis=0),
         solution=solutions[0] if len(solutions) == 1 else solutions,
         limited=solved,
+        transport_error=T.error,
     )
 
 

@@ -15,19 +15,23 @@ S and by S~ together.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, vectors
-from ltcl.errors import InputError
+from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator, as_operator
 from ltcl.solvers import coefficients
 from ltcl.solvers.direct import Direct
 from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import Monitor, Rule, System
 
+_OF_S = "exact=T.interreflection of the uncompressed T"
+_OF_A_TASK = "exact=T, the uncompressed transport"
 _LEAST, _MOST = 1e-3, 0.1  # of the tolerance of a step: many short steps waste products by S, long ones by S~
 _HALF = 0.5  # of a residual: a solve that ended early but left no more is a step, too
 
@@ -39,12 +43,29 @@ def refuse_beyond(S: Operator, rule: Rule, wanted: float) -> None:
         atol = f" and atol {rule.atol:g}" if np.any(rule.atol) else ""
         raise InputError(
             f"rtol is {rule.rtol:g}{atol}; S is compressed and its solutions may be off by "
-            f"{checks.upwards(error)}: ask for no less, or give exact= the uncompressed S"
+            f"{checks.upwards(error)}: ask for no less, or give {_OF_S}"
         )
+
+
+@contextmanager
+def of_a_task() -> Iterator[None]:
+    """Refusals of the block advise what a task takes as `exact`, a transport and no S."""
+    try:
+        yield
+    except InputError as error:
+        if _OF_S not in str(error):
+            raise
+        raise type(error)(str(error).replace(_OF_S, _OF_A_TASK)) from None
 
 
 def exact_operator(exact: Any, S: Operator) -> Operator:
     """`exact` on the device of S, checked."""
+    if hasattr(type(exact), "interreflection"):  # asked of the object, it would upload
+        raise InputTypeError(f"exact is a {type(exact).__name__}; it must be like S: give {_OF_S}")
+    if isinstance(exact, (tuple, list)) and any(isinstance(part, Operator) for part in exact):
+        raise InputTypeError(f"exact is {len(exact)} operators, S is one; give that of the same colour")
+    if not hasattr(exact, "shape"):
+        checks.real("exact", exact)
     found = as_operator(exact, S.device)
     if found.shape != S.shape:
         raise InputError(f"exact has shape {found.shape}; it must be that of S, {S.shape}")

@@ -93,8 +93,9 @@ def solve(
         Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that sample,
         whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
     exact : like S, optional
-        What a compressed S stands for: S then makes the steps, and the residual is that of `exact`, for a
-        tolerance that S alone cannot keep; see `ltcl.solvers.refinement`.
+        What a compressed S stands for, ``T.interreflection`` of the uncompressed T: S then makes the steps,
+        and the residual is that of `exact`, for a tolerance that S alone cannot keep; see
+        `ltcl.solvers.refinement`.
     **options
         Of the method, for instance ``spectrum=(0.5, 4.0)`` of chebyshev. An unknown one is an error.
 
@@ -172,6 +173,7 @@ def solve(
     return solution
 
 
+@refinement.of_a_task()
 def solve_each(
     systems: Sequence[Operator],
     parts: Sequence[np.ndarray],
@@ -183,7 +185,7 @@ def solve_each(
     """One solution a colour channel, as `solve` gives; methods that sample take walks that all three share.
 
     `parts` are b of each, (N,) or (N, k); `exact` is that of each, where there is one; `settings` are those
-    of `solve`, but for x0.
+    of `solve`, but for x0. Refusals advise the ``exact=`` of a task.
     """
     judges = exact or [None] * len(systems)
     if len(systems) == 1 or method not in SAMPLED or any(judge is not None for judge in judges):
@@ -269,7 +271,7 @@ def _refuse_matrices(S: Any) -> None:
 
 def _shape(S: Any) -> tuple[int, ...]:
     """The shape of whatever was given for S, before it becomes an operator on a device."""
-    if hasattr(S, "interreflection"):
+    if hasattr(type(S), "interreflection"):
         raise InputTypeError(
             f"S is a {type(S).__name__}; give its interreflection operator, T.interreflection"
         )

@@ -26,7 +26,7 @@ _MAY_BE_INFINITE = ".solution_error"
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Contents of a file of a compressed transport: arrays by name.
+    """Contents of a file of a compressed transport, or of an inverse: arrays by name.
 
     Raises
     ------
@@ -80,9 +80,11 @@ class Parts:
 
     @property
     def error(self) -> float:
-        """What solutions may be off by: the largest of all channels."""
-        found = [array for name, array in self.arrays.items() if name.endswith(_MAY_BE_INFINITE)]
-        return float(np.max(np.concatenate([np.ravel(array) for array in found]), initial=0.0))
+        """What solutions may be off by: the largest of all channels, and of the errors of an inverse."""
+        ends = (_MAY_BE_INFINITE, "errors")
+        found = [array for name, array in self.arrays.items() if name.endswith(ends)]
+        numbers = [array for array in found if array.dtype.kind in "fiu"]
+        return max((float(np.max(array, initial=0.0)) for array in numbers), default=0.0)
 
     @property
     def nbytes(self) -> int:

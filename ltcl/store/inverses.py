@@ -63,16 +63,31 @@ def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse
     MemoryLimitError
         It does not fit the memory of the host or of the device.
     """
+    parts = read(path)
+    with formats.about(as_path(path)):
+        return Inverse.from_arrays(parts.arrays, device)
+
+
+def read(path: str | os.PathLike[str]) -> compressed.Parts:
+    """The arrays in a file of an inverse; needs no device. Raises as `load_inverse`."""
     path = check_name(path)
     input_file(path)
-    with formats.about(path):
+    with formats.about(path), Archive(path) as archive:
+        if not compressed.is_layout(archive, compressed.INVERSE):
+            raise FileError(f"is no inverse, whose format is {compressed.INVERSE}; ltcl.invert(T) makes one")
+        return compressed.read(archive)
+
+
+def is_inverse(path: str | os.PathLike[str]) -> bool:
+    """Whether a file says that it holds an inverse; not what is damaged, which its reader refuses."""
+    path = as_path(path)
+    if path.suffix.lower() != _EXTENSION or not path.is_file():
+        return False
+    try:
         with Archive(path) as archive:
-            if not compressed.is_layout(archive, compressed.INVERSE):
-                raise FileError(
-                    f"is no inverse, whose format is {compressed.INVERSE}; 'ltcl invert' makes one"
-                )
-            parts = compressed.read(archive)
-        return Inverse.from_arrays(parts.arrays, device)
+            return compressed.is_layout(archive, compressed.INVERSE)
+    except (FileError, OSError):
+        return False
 
 
 def check_name(path: str | os.PathLike[str]) -> Path:

@@ -43,6 +43,11 @@ def read(path: Path) -> Record | Parts:
     with Archive(path) as archive:
         if compressed.is_layout(archive):
             return compressed.read(archive)
+        if compressed.is_layout(archive, compressed.INVERSE):
+            raise FileError(
+                "is a precomputed inverse, no transport; load it with ltcl.load_inverse and give it as "
+                "inverse= to compensate or separate"
+            )
         matrices = _dense(archive) if _SPARSE_PARTS.isdisjoint(archive.names) else _sparse(archive)
         bounce, mixing = (
             arrays.as_floats(name, archive.numbers(name)) if name in archive.names else None

@@ -17,7 +17,7 @@ import pytest
 
 import ltcl
 from ltcl import files, images
-from ltcl.batch import CompensatedFrames, compensate_frames
+from ltcl.batch import CompensatedFrames, compensate_frames, identity
 from ltcl.errors import ConvergenceError, FileError, InputError, InputTypeError
 from ltcl.images.frames import open_frames, write_video
 from tests.problems import lambertian
@@ -370,6 +370,14 @@ def test_operators_without_entries_are_known_by_their_products(source, tmp_path,
     assert compensate_frames(T(nearly), source, tmp_path / "out", resume=True).solved == COUNT - 8
 
 
+def test_what_T_is_off_by_is_told_and_not_compared(T):
+    """It depends on the first bounce, and patterns do not."""
+    known = identity.of_transport(T)
+    assert known["error"] == T.error == 0.0
+    assert identity.same_transport(known, {**known, "error": 0.01})
+    assert not identity.same_transport(known, {**known, "channels": 3})
+
+
 def test_other_frames_are_refused_by_the_first(T, source, tmp_path):
     folder = tmp_path / "in"
     shutil.copytree(source, folder)
@@ -419,6 +427,11 @@ def test_resuming_nothing_begins(T, source, tmp_path):
         ({"loss": 0.1}, InputError, "loss is 0.1, but gain is 1.0"),
         ({"bounds": (1, 0)}, InputError, r"bounds\[1\] is 0"),
         ({"video": "a.gif"}, FileError, r"a\.gif: extension \.gif is unknown"),
+        (
+            {"exact": np.eye(64)},
+            InputTypeError,
+            "exact is a ndarray; it must be a ltcl.Transport: give exact=T",
+        ),
         ({"nonsense": 1}, InputTypeError, "frames 1 to 8: unknown option 'nonsense'"),
         ({"encoding": "log"}, InputError, "encoding is 'log'"),
         ({"weights": [[1.0], [1.0, 2.0]]}, InputError, "weights is ragged"),

@@ -165,7 +165,9 @@ def test_earlier_results_give_way_to_new_ones(
     [
         (["{transport}", "{large}"], ["20 x 30", "5 x 10", "--resize"]),
         (["{transport}", "nowhere.png"], ["nowhere.png: no such file"]),
-        (["{transport}", "sky.xyz"], ["extension .xyz is unknown"]),
+        (["{transport}", "{transport}"], ["extension .npz is unknown"]),
+        (["{transport}", "nofolder"], ["nofolder: no such file or folder"]),
+        (["{transport}", "{picture}", "sky.xyz"], ["sky.xyz: no such file or folder"]),
         (["nowhere.npz", "{picture}"], ["nowhere.npz: no such file"]),
         (["{transport}", "{picture}", "--device", "nonsense"], ["device is 'nonsense'"]),
         (["{transport}", "{picture}", "--grid", "7x7"], ["h * w must be 50"]),
@@ -314,4 +316,62 @@ def test_a_compressed_transport_keeps_to_what_it_is_worth(
     images.write(picture, np.full((5, 10), 0.4, np.float32))
     arguments = ("compensate", compressed_transport, picture, "--out", tmp_path / "out")
     assert program(*arguments, "--rtol", "0.0041").code == 0
-    program(*arguments, "--rtol", "1e-5").refused("solutions may be off by 0.0041")
+    program(*arguments, "--rtol", "1e-5").refused(
+        "error: --rtol is 1e-05; ",
+        "solutions may be off by 0.0041: ask for no less, or give --exact FILE, the uncompressed transport",
+    )
+
+
+def test_reports_tell_that_a_transport_is_compressed(
+    program: Program, transport: Path, compressed_transport: Path, tmp_path: Path
+) -> None:
+    picture = tmp_path / "grey.exr"
+    images.write(picture, np.full((5, 10), 0.4, np.float32))
+    arguments = ("compensate", compressed_transport, picture, "--out", tmp_path / "out")
+    line = "errors are of the compressed transport, which itself is off by up to 0.41 %\n"
+    assert line in program(*arguments).out
+    told = program(*arguments, "--json").json
+    assert (told["transport"]["compressed"], told["transport"]["error"]) == (True, 0.0041)
+    assert told["pictures"][0]["transport_error"] == 0.0041
+    told = program("compensate", transport, *arguments[2:], "--json").json
+    assert (told["transport"]["compressed"], told["transport"]["error"]) == (False, 0.0)
+    assert told["pictures"][0]["transport_error"] == 0.0
+    assert "which itself" not in program("compensate", transport, *arguments[2:]).out
+
+
+def test_what_a_transport_was_compressed_from_corrects_it(
+    program: Program, transport: Path, compressed_transport: Path, tmp_path: Path
+) -> None:
+    picture, out = tmp_path / "grey.exr", tmp_path / "out"
+    images.write(picture, np.full((5, 10), 0.4, np.float32))
+    arguments = ("compensate", compressed_transport, picture, "--exact", transport, "--out", out)
+    outcome = program(*arguments, "--rtol", "1e-5")
+    assert outcome.code == 0, outcome.err
+    assert f"errors are of {transport}, by which solutions were corrected\n" in outcome.out
+    seen = ltcl.load(transport) @ images.read(out / "grey_pattern.exr")
+    assert np.linalg.norm(seen - 0.4) <= 2e-5 * np.linalg.norm(np.full((5, 10), 0.4))
+    told = program(*arguments, "--rtol", "1e-5", "--json").json
+    assert told["options"]["exact"] == str(transport)
+    assert told["transport"]["error"] == 0.0041
+    (entry,) = told["pictures"]
+    assert entry["transport_error"] == 0.0
+    assert entry["error"] <= 2e-5
+
+
+def test_what_it_was_not_compressed_from_is_refused(
+    program: Program, transport: Path, colour_transport: Path, compressed_transport: Path, tmp_path: Path
+) -> None:
+    picture, out = tmp_path / "grey.exr", tmp_path / "out"
+    images.write(picture, np.full((5, 10), 0.4, np.float32))
+    other, untold = tmp_path / "other.npz", tmp_path / "untold.npy"
+    T = ltcl.load(transport)
+    matrix = T.matrices[0]
+    ltcl.save(other, ltcl.Transport(matrix + 0.5 * (matrix - np.diag(np.diag(matrix))), T.grid))
+    np.save(untold, matrix)
+    common = ("compensate", compressed_transport, picture, "--out", out, "--exact")
+    program(*common, other).refused(f"{other}: is not what TRANSPORT was compressed from", "0.0042 at most")
+    program(*common, colour_transport).refused("error: --exact has grid (4, 12); it must be that of")
+    program(*common, tmp_path / "none.npz").refused("none.npz: no such file")
+    program(*common, untold).refused(f"{untold}: does not tell", "give --grid HxW")
+    assert program(*common, untold, "--grid", "5x10", "--rtol", "1e-4").code == 0
+    program(*common, transport, "--method", "monte_carlo").refused("--exact corrects iterates, but method")

@@ -98,6 +98,7 @@ def test_resume_goes_on_and_says_what_there_is(
     assert program(*common, "--frames", "6").code == 0
     program(*common).refused(f"{out}: holds 6 frame(s) of an earlier run; give --resume to go on")
     program(*common, "--resume", "--rtol", "1e-3").refused("that run had --rtol 0.01, this one has 0.001")
+    program(*common, "--resume", "--batch", "2").refused("that run had --batch 3, this one has 2")
     outcome = program(*common, "--resume", "--json")
     assert outcome.code == 0, outcome.err
     assert outcome.json["solved"] == COUNT - 6
@@ -223,3 +224,26 @@ def test_refusals_leave_no_folder(
     filled = [argument.format(**names) for argument in arguments]
     program("compensate", transport, *filled, "--out", tmp_path / "out").refused(*parts)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_compressed_transport_is_told_and_corrected(
+    program: Program, transport: Path, compressed_transport: Path, film: Path, tmp_path: Path
+) -> None:
+    common = ["compensate", compressed_transport, film, "--frames", "3", "--format", "exr"]
+    alone = program(*common, "--out", tmp_path / "alone")
+    assert alone.code == 0, alone.err
+    assert "errors are of the compressed transport, which itself is off by up to 0.41 %\n" in alone.out
+    kept = json.loads((tmp_path / "alone" / "frames.json").read_text())
+    assert (kept["transport"]["error"], kept["settings"]["exact"]) == (0.0041, None)
+    again = program(*common, "--out", tmp_path / "alone", "--resume", "--json").json
+    assert (again["solved"], again["transport_error"]) == (0, 0.0041)
+    exact = [*common, "--out", tmp_path / "exact", "--exact", transport, "--rtol", "1e-5"]
+    outcome = program(*exact)
+    assert outcome.code == 0, outcome.err
+    assert f"errors are of {transport}, by which solutions were corrected\n" in outcome.out
+    told = program(*exact, "--resume", "--json").json
+    assert (told["solved"], told["transport_error"]) == (0, 0.0)
+    T = ltcl.load(transport)
+    for frame in list(open_frames(film))[:3]:
+        pattern = images.read(tmp_path / "exact" / f"pattern_{frame.number:06}.exr")
+        assert np.linalg.norm(T @ pattern - frame.picture()) <= 2e-5 * np.linalg.norm(frame.picture())

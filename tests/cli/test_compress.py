@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ltcl
+from ltcl import checks
 
 from .conftest import Program
 
@@ -33,6 +34,8 @@ def test_the_tables_tell_what_was_tried(program: Program, colour_transport: Path
     assert outcome.code == 0
     for part in ("red", "green", "blue", "haar", "pixels", "solutions within", "on disk"):
         assert part in outcome.out
+    within = checks.upwards(ltcl.load(tmp_path / "C.npz").error)  # enough to ask for
+    assert f"solutions within {within}, " in outcome.out
 
 
 def test_refusals(program: Program, transport: Path, tmp_path: Path) -> None:

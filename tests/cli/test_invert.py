@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl import images
+from ltcl import checks, images
 
 from .conftest import Program
 
@@ -92,13 +92,38 @@ def test_what_does_not_fit_is_refused(
     )
     program("compensate", transport, picture, "--inverse", tmp_path / "none.npz", *out).refused("none.npz")
     program("compensate", transport, picture, "--inverse", inverse, "--rtol", "1e-6", *out).refused(
-        "rtol is 1e-06, but what this inverse gives may be off by 0.0"
+        "error: --rtol is 1e-06, but what this inverse gives may be off by 0.0",
+        "ask for no less, or make a better one with 'ltcl invert --rtol'",
     )
     program("compensate", transport, picture, "--inverse", inverse, "--method", "cg", *out).refused(
-        "method is given"
+        "error: --method is given, but --inverse takes"
     )
     program("separate", colour_transport, picture, "--inverse", inverse, "--resize", *out).refused(
         "inverse has"
     )
-    program("relight", inverse, picture, *out).refused("inverse.npz", "ltcl-inverse-1")
+    for command in (["relight", inverse, picture, *out], ["convert", inverse, tmp_path / "T.mtx"]):
+        program(*command).refused(
+            f"{inverse}: is a precomputed inverse, no transport; give it as --inverse FILE to compensate or"
+        )
+    program("compensate", transport, picture, "--inverse", inverse, "--exact", transport, *out).refused(
+        "--exact is given, but --inverse takes the place of all solves"
+    )
     assert not (tmp_path / "out").exists()
+
+
+def test_info_tells_of_an_inverse(
+    program: Program, inverse: Path, transport: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = ltcl.load_inverse(inverse)
+    monkeypatch.setenv("LTCL_DEVICE", "nonsense")  # none is needed
+    entry, other = program("info", inverse, transport, "--json").json
+    assert (entry["stored"], other["stored"]) == ("inverse", "dense")
+    assert (entry["shape"], entry["grid"], entry["channels"]) == ([50, 50], [5, 10], 1)
+    assert entry["solution_error"] == kept.error > 0.0
+    assert entry["dtype"].endswith(f"; error {checks.upwards(kept.error)}")
+    assert entry["nbytes"] > 0
+    assert entry["first_bounce"] == other["first_bounce"]
+    assert f"inverse {entry['dtype']}" in program("info", inverse).out
+    cut = inverse.with_name("cut.npz")
+    cut.write_bytes(inverse.read_bytes()[:-40])
+    program("info", cut).refused(f"{cut}: ")

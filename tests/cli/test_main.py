@@ -17,7 +17,7 @@ from .conftest import Program
 
 COMMANDS = [
     *("devices", "doctor", "demo", "info", "analyze"),
-    *("convert", "compress", "compensate", "separate", "relight"),
+    *("convert", "compress", "invert", "compensate", "separate", "relight"),
 ]
 
 
@@ -109,6 +109,15 @@ def test_what_a_command_raises_becomes_a_line(
         ("the grid is (4, 5)", "the grid is (4, 5)"),
         ("bounds[0] is nan", "--low is nan"),
         ("bounds[1] is 0.0; it must be above 1", "--high is 0.0; it must be above 1"),
+        ("rtol is 0.001; S is compressed", "--rtol is 0.001; S is compressed"),
+        ("frames 1 to 8: rtol is 0.001", "frames 1 to 8: --rtol is 0.001"),
+        ("T.npz: grid is 4 x 9 = 36 pixels", "T.npz: grid is 4 x 9 = 36 pixels"),  # the file's own
+        ("or give exact=T, the uncompressed transport", "or give --exact FILE, the uncompressed transport"),
+        ("make it with ltcl.invert(T)", "make it with 'ltcl invert'"),
+        ("make a better one with ltcl.invert(T, rtol=...)", "make a better one with 'ltcl invert --rtol'"),
+        ("such as ltcl.compress(T, basis='db2') has it", "such as 'ltcl compress --basis db2' has it"),
+        ("that run had batch=1, this one has 4", "that run had --batch 1, this one has 4"),
+        ("that run had encoding='auto', this one", "that run had --encoding auto, this one"),
         ("rtol and atol are both 0; one of them must be positive", "--rtol is 0; it must be above 0"),
     ],
 )

@@ -35,3 +35,13 @@ def test_refusals(program: Program, transport: Path, large_picture: Path, tmp_pa
     program("relight", transport, large_picture, "--out", tmp_path / "out").refused("20 x 30", "--resize")
     program("relight", transport, "nowhere.exr", "--out", tmp_path / "out").refused("no such file")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_of_a_compressed_transport_are_told_from_those_of_the_scene(
+    program: Program, compressed_transport: Path, picture: Path, tmp_path: Path
+) -> None:
+    arguments = ("relight", compressed_transport, picture, "--out", tmp_path / "out")
+    assert (
+        "they are of the compressed transport, which itself is off by up to 0.41 %" in program(*arguments).out
+    )
+    assert program(*arguments, "--json").json["transport"]["error"] == 0.0041

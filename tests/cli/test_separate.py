@@ -66,3 +66,33 @@ def test_wrong_size_is_refused(
 ) -> None:
     program("separate", transport, large_picture, "--out", tmp_path / "out").refused("--resize")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_compressed_transport_separates_as_well_as_it_can(
+    program: Program, transport: Path, compressed_transport: Path, photo: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    common = ("separate", compressed_transport, photo, "--bounces", "1", "--out", out)
+    outcome = program(*common)
+    assert outcome.code == 0, outcome.err
+    assert "all of this is of the compressed transport, which itself is off by up to 0.41 %\n" in outcome.out
+    told = program(*common, "--json").json
+    assert told["options"]["rtol"] == 0.0041  # as `ltcl.separate` does
+    assert (told["transport"]["error"], told["pictures"][0]["transport_error"]) == (0.0041, 0.0041)
+    program(*common, "--rtol", "1e-3").refused("error: --rtol is 0.001; ", "give --exact FILE")
+    corrected = program(*common, "--exact", transport, "--json").json
+    assert (corrected["options"]["rtol"], corrected["options"]["exact"]) == (1e-3, str(transport))
+    assert corrected["pictures"][0]["transport_error"] == 0.0
+    np.testing.assert_allclose(images.read(out / "direct.exr"), 0.6, rtol=2e-3)
+    assert f"all of this is of {transport}, by which" in program(*common, "--exact", transport).out
+
+
+def test_an_inverse_separates_as_well_as_it_can(
+    program: Program, transport: Path, photo: Path, tmp_path: Path
+) -> None:
+    inverse, out = tmp_path / "inverse.npz", tmp_path / "out"
+    kept = ltcl.invert(ltcl.load(transport), 0.05, basis="db2")
+    ltcl.save_inverse(inverse, kept)
+    told = program("separate", transport, photo, "--inverse", inverse, "--out", out, "--json")
+    assert told.code == 0, told.err
+    assert told.json["options"]["rtol"] == max(kept.error, 1e-3)

@@ -182,7 +182,7 @@ def test_a_tolerance_below_the_error_of_solutions_is_refused(device):
     b = np.ones((N, 2))
     text = (
         "rtol is 1e-05; S is compressed and its solutions may be off by 0.0043: "
-        "ask for no less, or give exact= the uncompressed S"
+        "ask for no less, or give exact=T.interreflection of the uncompressed T"
     )
     with pytest.raises(InputError) as caught:
         ltcl.solve(S, b, "jacobi", rtol=1e-5)

@@ -150,12 +150,24 @@ def test_the_callback_sees_true_residuals(device):
         (np.full((N, N), np.nan), "auto", InputError, "NaN"),
         (S_EXACT, "monte_carlo", InputTypeError, "'monte_carlo' samples; leave it out"),
         (S_EXACT, "hybrid", InputTypeError, "'hybrid' samples"),
-        ("T.npz", "auto", InputTypeError, "real numbers"),
+        ("T.npz", "auto", InputTypeError, "exact holds .*; it must hold real numbers"),
+        (
+            ltcl.Transport(S_EXACT, (1, N)),
+            "auto",
+            InputTypeError,
+            "exact is a Transport; it must be like S: give exact=T.interreflection of the uncompressed T",
+        ),
     ],
 )
 def test_unfit_exact_operators_are_refused(device, exact, method, kind, part):
     with pytest.raises(kind, match=part):
         ltcl.solve(_compressed(device), np.ones(N), method, exact=exact)
+
+
+def test_one_of_three_colours_is_to_be_chosen(device):
+    three = [Dense(device, S_EXACT)] * 3
+    with pytest.raises(InputTypeError, match="exact is 3 operators, S is one; give that of the same colour"):
+        ltcl.solve(_compressed(device), np.ones(N), exact=three)
 
 
 def test_exact_on_another_device_is_refused(device, small_device):

@@ -46,7 +46,7 @@ def test_the_same_bits_come_back(colour: ltcl.Inverse, path: Path) -> None:
 
 
 def test_an_inverse_is_no_transport(path: Path) -> None:
-    with pytest.raises(FileError, match=r"inverse\.npz: the layout of the archive is 'ltcl-inverse-1'"):
+    with pytest.raises(FileError, match=r"inverse\.npz: is a precomputed inverse, no transport; load it"):
         ltcl.load(path)
 
 
