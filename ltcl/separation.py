@@ -29,8 +29,8 @@ from ltcl.errors import InputTypeError
 from ltcl.exact import beside, itself
 from ltcl.single_view import negative_bounces
 from ltcl.solvers import Inverse, Solution, sampled, solve_each
+from ltcl.solvers.methods import SAMPLED
 from ltcl.solvers.precomputed import require_inverse
-from ltcl.solvers.solve import SAMPLED
 from ltcl.transport import Transport, require
 
 logger = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import aslinearoperator
 
 import ltcl
 from ltcl.errors import InputError
-from ltcl.solvers.solve import ITERATIVE
+from ltcl.solvers.methods import ITERATIVE
 from tests.problems import enclosure, lambertian
 
 GRID = (5, 8)

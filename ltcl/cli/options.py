@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from ltcl.errors import InputError
-from ltcl.solvers.solve import METHODS, SAMPLED
+from ltcl.solvers.methods import METHODS, SAMPLED
 
 
 def _grid(text: str) -> tuple[int, int]:

@@ -12,8 +12,7 @@ import numpy as np
 from ltcl import checks, layout
 from ltcl.errors import InputError, InputTypeError
 from ltcl.solvers import sampled
-from ltcl.solvers.direct import Direct
-from ltcl.solvers.solve import ITERATIVE, METHODS, SAMPLED
+from ltcl.solvers.methods import KINDS, METHODS, SAMPLED
 from ltcl.transport import Transport
 
 logger = logging.getLogger(__name__)
@@ -111,7 +110,7 @@ def rules(T: Transport, method: str, rtol: Any, options: dict[str, Any]) -> dict
     checks.one_of("method", method, METHODS)
     known = list(_OPTIONS)
     if T.is_square:
-        kind = {**ITERATIVE, **SAMPLED, Direct.name: Direct}.get(method)
+        kind = KINDS.get(method)
         known += ["x0", *(field.name for field in (dataclasses.fields(kind) if kind else ()))]
     sampled.check_method(method, options, SAMPLED)
     for name in options:

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
-from ltcl.solvers.solve import METHODS as ALL
-from ltcl.solvers.solve import SAMPLED as _SAMPLED
+from ltcl.solvers.methods import ITERATIVE as _ITERATIVE
+from ltcl.solvers.methods import METHODS as ALL
+from ltcl.solvers.methods import SAMPLED as _SAMPLED
 
 ITERATIVE = tuple(_ITERATIVE)
 METHODS = tuple(method for method in ALL if method not in _SAMPLED)  # those that keep a tolerance

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import re
 from typing import Any
 
@@ -16,7 +15,7 @@ from scipy.sparse.linalg import aslinearoperator
 import ltcl
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.operators import CSR, Dense, Host, IdentityPlus, as_operator
-from ltcl.solvers import Solution, Status
+from ltcl.solvers import Solution, Status, given, methods
 from tests.problems import lambertian, residual
 from tests.solvers.helpers import ALL, ITERATIVE, METHODS, READS_ROWS
 
@@ -212,7 +211,7 @@ def test_an_unknown_method_is_refused_with_those_there_are(method):
 
 def test_bad_input_is_refused_before_the_matrix_goes_to_a_device(monkeypatch):
     """`as_operator` is what uploads."""
-    monkeypatch.setattr(module_of_solve(), "as_operator", lambda S: pytest.fail("uploaded"))
+    monkeypatch.setattr(given, "as_operator", lambda S: pytest.fail("uploaded"))
     for change, error, says in BAD.values():
         if "matrix" in says:  # checked by the operator itself
             continue
@@ -239,10 +238,5 @@ def test_an_exact_end_reads_well(device):
 def test_help_tells_the_options_of_every_method(method):
     _, _, table = (ltcl.solve.__doc__ or "").partition("method                options")
     assert re.search(rf"\b{method}\b", table)
-    for option in dataclasses.fields((module_of_solve().ITERATIVE | module_of_solve().SAMPLED)[method]):
+    for option in dataclasses.fields(methods.KINDS[method]):
         assert re.search(rf"\b{option.name}[:,]", table), option.name
-
-
-def module_of_solve() -> Any:
-    """The package's attribute of this name is the function."""
-    return importlib.import_module("ltcl.solvers.solve")
