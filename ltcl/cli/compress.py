@@ -74,7 +74,7 @@ def run(
     text = {
         **transports.heading("compress", file, T, rtol=rtol, budget=budget, basis=basis),
         "out": out,
-        "bytes": T.nbytes,
+        "bytes": C.compression.uncompressed,
         "bytes_compressed": C.nbytes,
         "bytes_on_disk": out.stat().st_size,
         "solution_error": C.error,
@@ -116,8 +116,9 @@ def _show(text: dict[str, Any]) -> None:
         "  dropped, rounded: Frobenius norms; error: 2-norm of all that was; solution: error times norm"
     )
     before, after = (checks.size(text[name]) for name in ("bytes", "bytes_compressed"))
+    more = ", which is more" if text["bytes_compressed"] >= text["bytes"] else ""
     typer.echo(
-        f"\n{text['out']}: {before} to {after}, solutions within {text['solution_error']:.2g}, "
+        f"\n{text['out']}: {before} to {after}{more}, solutions within {text['solution_error']:.2g}, "
         f"{checks.size(text['bytes_on_disk'])} on disk, in {made['seconds']:.3g} s"
     )
 
