@@ -62,9 +62,10 @@ def test_smooth_light_is_written_in_wavelets_on_both_sides(make, rtol):
     assert R.two_sided
 
 
-def test_trials_are_of_the_size_that_is_handed_out():
-    C = ltcl.compress(ltcl.scenes.dihedral(16, albedo=0.8).transport(), 0.05, basis="db2")
-    (told,) = C.compression.channels
+def test_trials_are_of_the_coefficients_that_are_handed_out():
+    T = ltcl.scenes.dihedral(16, albedo=0.6).transport()
+    (told,) = ltcl.compress(T, 0.3, basis="db2").compression.channels
     (trial,) = told.trials
-    assert 2 * C.systems[0].R.core.shape[0] < C.shape[0]  # pyright: ignore[reportAttributeAccessIssue]
-    assert trial.nbytes == pytest.approx(told.nbytes, rel=0.2)
+    rows = T.shape[0]
+    assert trial.kept * rows < 100
+    assert trial.nbytes < 4 * rows  # what pointers of all rows would take
