@@ -101,7 +101,7 @@ def test_other_dimensions_are_refused():
 
 @pytest.mark.parametrize("shape", [(1, 1), (53, 7), (7, 53)])
 def test_the_difference_of_two_sources(shape):
-    A, B = gallery.signed(*shape), gallery.signed(*shape, 1)
+    A, B = gallery.signed(*shape), gallery.signed(*shape, seed=1)
     found = sources.difference(source("A", A), source("B", B), memory=32 * shape[1] * 16)
     wanted = np.linalg.norm(A.astype(np.float64) - B)
     assert found == pytest.approx(wanted, rel=1e-12)
