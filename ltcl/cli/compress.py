@@ -74,7 +74,7 @@ def run(
     text = {
         **transports.heading("compress", file, T, rtol=rtol, budget=budget, basis=basis),
         "out": out,
-        "bytes": T.nbytes,
+        "bytes": C.compression.uncompressed,
         "bytes_compressed": C.nbytes,
         "bytes_on_disk": out.stat().st_size,
         "solution_error": C.error,
@@ -117,8 +117,9 @@ def _show(text: dict[str, Any]) -> None:
     )
     within = checks.upwards(text["solution_error"])
     before, after = (checks.size(text[name]) for name in ("bytes", "bytes_compressed"))
+    more = ", which is more" if text["bytes_compressed"] >= text["bytes"] else ""
     typer.echo(
-        f"\n{text['out']}: {before} to {after}, solutions within {within}, "
+        f"\n{text['out']}: {before} to {after}{more}, solutions within {within}, "
         f"{checks.size(text['bytes_on_disk'])} on disk, in {made['seconds']:.3g} s"
     )
 

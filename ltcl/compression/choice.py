@@ -2,7 +2,7 @@
 """Which basis, threshold, tile and precision: by measurement on this operator and this device.
 
 Every basis is given the threshold at which the error just stays within the goal; of what then remains, the
-fastest product wins, and the fewest bytes of those alike. The goal is on the 2-norm of E = R~ - R:
+least product of time and bytes wins: `cores.choose`. The goal is on the 2-norm of E = R~ - R:
 
     ||x~ - x|| / ||x|| <= ||S~^-1|| ||E||    since    x~ - x = -S~^-1 E x
 """
@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NoReturn
 
 from ltcl import checks
 from ltcl.compression import cores, fit, kinds, parted
@@ -30,8 +29,8 @@ DROPPING, ROUNDING = 0.9, 0.05  # of the goal, for what is dropped and for the r
 GATHER = 0.7  # of the goal: Frobenius norm of what need not even be looked at
 _MOST = 512  # numbers a row, beyond which a basis is no use unless all are
 _ALIKE = 2.0  # of the goal: a Frobenius norm at which bases are compared before more is measured
-_SPARE = 0.95  # of the budget, where a tolerance is proposed for it
 _WORSE = 3  # times the numbers of the best then: left
+_LOOSER = 1.25  # times the tolerance, where float32 does not keep it
 Find = Callable[[str], Kind]  # a kind by its name, on the grid of the problem
 
 
@@ -75,16 +74,15 @@ def choose(
     budget: float = math.inf,
     find: Find | None = None,
     note: Callable[[str], object] = lambda text: None,
-    parts: float = 1.0,
 ) -> Choice:
     """The best of the kinds `names` for a solution within `rtol` and a core within `budget` bytes.
 
-    Of the whole budget this is one of so many `parts`.
+    Where no core is within the budget, it is the smallest.
 
     Raises
     ------
     InputError
-        None is within the budget; it says which tolerance and which budget would do.
+        Float32 does not keep the tolerance; it says which it does.
     """
     if all(name.endswith(kinds.SUM) for name in names):
         parted.require_room(problem.whole or problem.pixels)
@@ -97,15 +95,13 @@ def choose(
         if survey.candidates:
             break
     if not survey.candidates:
-        raise InputError(
-            f"rtol is {rtol:g}, which float32 does not allow for this T: its error is above {survey.goal:.2g}"
-        )
-    fits = [one for one in survey.candidates if one.core.nbytes <= budget]
-    if not fits:
-        refuse(problem, min(survey.candidates, key=lambda one: one.core.nbytes), rtol, budget, parts)
-    chosen = cores.choose([_timed(one) for one in fits])
-    best = next(one for one in fits if one.core.operator is chosen.operator)
-    return Choice(best, tuple(survey.trials), survey.goal)
+        least = survey.least()
+        kept = f"the least that it does is {checks.upwards(least)}" if least < 1.0 else "nor any below 1"
+        raise InputError(f"rtol is {rtol:g}, which float32 does not keep for this T; {kept}")
+    smallest = min(survey.candidates, key=lambda one: one.core.nbytes)
+    fits = [one for one in survey.candidates if one.core.nbytes <= budget] or [smallest]
+    costs = [(one.seconds, one.core.nbytes) for one in fits]
+    return Choice(fits[cores.choose(costs, cores.launch(problem.device))], tuple(survey.trials), survey.goal)
 
 
 class _Survey:
@@ -116,6 +112,7 @@ class _Survey:
         self.goal = 0.5 * rtol
         self._known = False
         self._least = math.inf  # numbers that the best basis keeps then
+        self._closest = ("", math.inf)  # the kind of the smallest error, where it is beyond the goal
         self.candidates: list[Candidate] = []
         self.trials: list[Trial] = []
 
@@ -143,12 +140,26 @@ class _Survey:
             start = fitted.coefficients.dropped * dropping / max(fitted.norm.upper, 1e-30)
             fitted = fit.fit(self.problem, kind, found, dropping, start)
         if fitted.norm.upper > dropping:
+            self._closest = min(self._closest, (name, fitted.norm.upper), key=lambda one: one[1])
             self._leave(name, found.core.nnz, "so many numbers are too few", fitted.norm.upper)
             return
-        core = fitted.best(self.problem.device, ROUNDING * self.goal, self.budget)
-        candidate = Candidate(fitted, core, seconds(fitted.operator(core.operator), core), found)
+        active = fitted.active()  # as it is handed out
+        core = active.best(self.problem.device, ROUNDING * self.goal, self.budget)
+        candidate = Candidate(fitted, core, seconds(active.operator(core.operator), core), found)
         self.candidates.append(candidate)
         self.trials.append(candidate.trial(self.problem.pixels))
+
+    def least(self) -> float:
+        """The least tolerance that is kept, to a quarter, where none of the kinds keeps this one."""
+        name, error = self._closest
+        rtol = error * self.rtol / self.goal / DROPPING
+        while rtol < 1.0:
+            looser = _Survey(self.problem, self.find, rtol, math.inf, None)
+            looser.add(name)
+            if looser.candidates:
+                break
+            rtol *= _LOOSER
+        return rtol
 
     def _leave(self, name: str, count: int, why: str, error: float | None = None) -> None:
         kept = count / self.problem.pixels
@@ -172,73 +183,7 @@ def inverse_bound(problem: Problem, fitted: Fit) -> float:
     return inverse_norm(IdentityPlus(problem.operator)).upper
 
 
-class TooLarge(InputError):
-    """No core of one channel is within its share of the budget.
-
-    Attributes
-    ----------
-    needed : float
-        The whole budget that this tolerance takes.
-    allows : float
-        A tolerance that the budget allows; 1 or more where it allows none.
-    """
-
-    def __init__(self, budget: float, rtol: float, needed: float, allows: float) -> None:
-        self.budget, self.rtol, self.needed, self.allows = budget, rtol, needed, allows
-        advice = f"it allows rtol {_up(allows)}" if allows < 1.0 else "no rtol below 1 fits into it"
-        super().__init__(
-            f"budget is {budget:.0f} bytes, but rtol {rtol:g} needs {math.ceil(needed)} "
-            f"({checks.size(needed)}); {advice}"
-        )
-
-
-def refuse(problem: Problem, candidate: Candidate, rtol: float, budget: float, parts: float) -> NoReturn:
-    """Say which budget this tolerance needs, and which tolerance the budget allows."""
-    needed = candidate.core.nbytes
-    raise TooLarge(parts * budget, rtol, parts * needed, _allowed(problem, candidate, rtol, budget))
-
-
-def _allowed(problem: Problem, candidate: Candidate, rtol: float, budget: float) -> float:
-    """A tolerance within the budget: guessed from as many numbers as fit, then raised until it holds."""
-    core, found, kind = candidate.core, candidate.found, candidate.fit.kind
-    count = int(budget * candidate.fit.coefficients.core.nnz / core.nbytes)
-    fitted = fit.measure(problem, kind, found.above(Magnitudes.of(found.core.data).at_most(count)))
-    inverse = inverse_bound(problem, fitted)
-    allowed = max(inverse * fitted.norm.upper / DROPPING, 1.1 * rtol)
-    while allowed < 1.0:
-        goal = allowed / inverse
-        fitted = fit.fit(problem, kind, found, DROPPING * goal, fitted.coefficients.dropped)
-        core = fitted.best(problem.device, ROUNDING * goal, budget)
-        if core.nbytes <= _SPARE * budget:
-            break
-        allowed *= 1.2
-    return allowed
-
-
-def _up(error: float) -> str:
-    """Two digits, rounded up.
-
-    >>> _up(0.0421)
-    '0.043'
-    """
-    unit = 10.0 ** (math.floor(math.log10(error)) - 1)
-    return f"{math.ceil(error / unit) * unit:.2g}"
-
-
 def seconds(R: Compressed | Sum, core: Core) -> float | None:
     """Of a product in a solve, which runs on the core alone where both bases are one."""
     alone = isinstance(R, Compressed) and R.two_sided
     return core.seconds if core.seconds is None or alone else cores.seconds(R)
-
-
-def _timed(candidate: Candidate) -> Core:
-    core = candidate.core
-    return Core(
-        core.operator,
-        core.format,
-        core.width,
-        core.precision,
-        core.nbytes,
-        core.quantisation,
-        candidate.seconds,
-    )

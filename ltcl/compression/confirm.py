@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ltcl import checks
 from ltcl.compression import choice, fit, sums
-from ltcl.compression.choice import Candidate, Choice
+from ltcl.compression.choice import Choice
 from ltcl.compression.coefficients import Coefficients
 from ltcl.compression.cores import Core
 from ltcl.compression.fit import Fit, Problem
@@ -23,6 +24,7 @@ from ltcl.compression.inverse_norm import inverse_norm
 from ltcl.compression.kinds import Kind
 from ltcl.compression.parted import Parted
 from ltcl.compression.result import ChannelCompression
+from ltcl.compression.sources import difference, source
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Compressed, IdentityPlus, Operator, Sum, Tiles
 from ltcl.theory import TwoNorm, two_norm
@@ -62,7 +64,7 @@ class Confirmed:
         only = kind.only(self.fit.places)
         return Compressed(_again(core, kept.core), only.out, only.into, error=error, diagonal=diagonal)
 
-    def report(self, made: Choice) -> ChannelCompression:
+    def report(self, problem: Problem, made: Choice) -> ChannelCompression:
         """What is told of this channel."""
         kept, core = self.fit.coefficients, self.core
         return ChannelCompression(
@@ -74,7 +76,7 @@ class Confirmed:
             nbytes=core.nbytes,
             seconds=core.seconds,
             threshold=kept.threshold,
-            dropped=kept.dropped,
+            dropped=_dropped(problem, self.fit),
             dropped_between=kept.first,
             quantisation=core.quantisation,
             error=self.norm.upper,
@@ -93,10 +95,9 @@ def confirm(
     same: bool,
     rtol: float,
     budget: float,
-    parts: int,
     progress: Callable[[float], object] | None = None,
 ) -> Confirmed:
-    """R~ of the whole R with a solution error of at most `rtol`.
+    """R~ of the whole R with a solution error of at most `rtol`; within the budget, or small.
 
     Parameters
     ----------
@@ -107,8 +108,6 @@ def confirm(
         On a window, or, where they are the `same`, on the problem.
     rtol, budget : float
         Of this channel.
-    parts : int
-        Channels, for what a refusal says of the budget.
     progress : callable, optional
         Called with the share of R that has been read.
     """
@@ -122,14 +121,12 @@ def confirm(
     for _ in range(_TRIES):
         active = fitted.active()
         core = active.best(problem.device, choice.ROUNDING * goal, budget)
-        if core.nbytes > budget:
-            choice.refuse(problem, Candidate(fitted, core, None, found), rtol, budget, parts)
         result = _measured(problem, active, core)
         reached = result.solution_error / rtol
         if reached <= 1.0 and (reached >= _LOOSE or not fitted.coefficients.core.nnz):
             return result
         if good is not None:  # the larger threshold was too large, or gained little
-            return result if reached <= 1.0 else good
+            return min(good, result, key=lambda one: one.core.nbytes) if reached <= 1.0 else good
         good = result if reached <= 1.0 else None
         change = _AIM / max(reached, _AIM / _MOST)
         # From what the fit came to, which may be well below the goal that it had.
@@ -139,8 +136,8 @@ def confirm(
             found = fit.gather(problem, kind, choice.GATHER * choice.DROPPING * goal, progress=progress)
         fitted = fit.fit(problem, kind, found, choice.DROPPING * goal, start)
     raise InputError(
-        f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by {reached * rtol:.2g}; "
-        "it must be larger"
+        f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by "
+        f"{checks.upwards(reached * rtol)}; it must be larger"
     )
 
 
@@ -173,3 +170,12 @@ def _measured(problem: Problem, fitted: Fit, core: Core) -> Confirmed:
     R.error = norm.upper
     core = dataclasses.replace(core, seconds=choice.seconds(R, core))
     return Confirmed(R, fitted, core, norm, inverse)
+
+
+def _dropped(problem: Problem, fitted: Fit) -> float:
+    """||R~ - R||_F before its core was rounded; of a sum from its rows, as its parts may lose the same."""
+    kept = fitted.coefficients
+    if not isinstance(kept, Parted):
+        return kept.dropped
+    R = fit.exact(problem.device, fitted.kind, kept)
+    return difference(problem.R, source("R", R), problem.memory)

@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ltcl.device import Device
+from ltcl.device import Device, vectors
 from ltcl.operators import CSR, Operator, Tiles
 from ltcl.operators.narrow import PRECISIONS
 from ltcl.operators.packing import Packed, pack
@@ -19,7 +20,7 @@ from ltcl.theory import two_norm
 
 _WIDTHS = (1, 8, 16)
 _MORE = 1.5  # times the fewest bytes: what takes more is not timed
-_ALIKE, _LAUNCH = 1.15, 2e-5  # times the least seconds, and seconds more: noise, and bytes decide
+_ALIKE = 1.25  # times the least seconds x bytes: alike
 _REPEATS = 7
 
 
@@ -52,32 +53,35 @@ class Core:
 
 
 def best(device: Device, matrix: Any, allowance: float, budget: float = float("inf")) -> Core:
-    """The fastest core whose rounding has a 2-norm of at most `allowance`; the smallest of those alike.
+    """The core that `choose` takes of those whose rounding has a 2-norm of at most `allowance`.
 
-    Under ``LTCL_TUNE=0`` nothing is timed and the smallest is taken. A core beyond the `budget` is taken only
-    where all are.
+    Under ``LTCL_TUNE=0`` nothing is timed and the smallest is taken. Of cores that are all beyond the
+    `budget`, it is the smallest as well.
     """
-    options = list(_within(device, matrix, allowance))
-    smallest = min(packed.nbytes for _, packed in options)
-    fits = [option for option in options if option[1].nbytes <= budget] or options
-    fits = [option for option in fits if option[1].nbytes <= _MORE * smallest]
-    if _untimed():
-        fits = sorted(fits, key=lambda option: option[1].nbytes)[:1]
-    cores = [_tiles(device, *option) for option in fits]
-    csr = 8 * matrix.nnz + 4 * (matrix.shape[0] + 1)
-    if csr <= min(_MORE * smallest, budget):
-        operator = CSR(device, matrix)
-        cores.append(Core(operator, "csr", 1, "float32", operator.nbytes, 0.0, seconds(operator)))
-    return choose(cores)
+    options = [
+        (packed.nbytes, functools.partial(_tiles, device, width, packed))
+        for width, packed in _within(device, matrix, allowance)
+    ]
+    options.append((8 * matrix.nnz + 4 * (matrix.shape[0] + 1), functools.partial(_csr, device, matrix)))
+    smallest = min(options, key=lambda option: option[0])
+    most = smallest[0] if _untimed() else min(budget, _MORE * smallest[0])
+    cores = [make() for nbytes, make in options if nbytes <= most] or [smallest[1]()]
+    return cores[choose([(core.seconds, core.nbytes) for core in cores], launch(device))]
 
 
-def choose(cores: list[Core]) -> Core:
-    """The fastest, of those alike the smallest; the smallest where one was not timed."""
-    times = [core.seconds for core in cores if core.seconds is not None]
-    if len(times) == len(cores):
-        most = max(_ALIKE * min(times), min(times) + _LAUNCH)
-        cores = [core for core in cores if (core.seconds or 0.0) <= most]
-    return min(cores, key=lambda core: core.nbytes)
+def choose(costs: Sequence[tuple[float | None, int]], least: float) -> int:
+    """Which of several (seconds, bytes) is best: that of the least product, of those alike the fewest bytes.
+
+    Seconds below the `least` count as these. Where one was not timed, bytes alone decide.
+
+    >>> choose([(1e-3, 900), (2e-3, 400), (2e-3, 390)], 1e-4), choose([(1e-3, 40), (2e-3, 50)], 4e-3)
+    (2, 0)
+    """
+    products = [max(spent, least) * nbytes for spent, nbytes in costs if spent is not None]
+    if len(products) < len(costs):
+        products = [0.0] * len(costs)
+    alike = [place for place, product in enumerate(products) if product <= _ALIKE * min(products)]
+    return min(alike, key=lambda place: costs[place][1])
 
 
 def seconds(operator: Operator) -> float | None:
@@ -86,12 +90,24 @@ def seconds(operator: Operator) -> float | None:
         return None
     x = operator.device.upload(np.ones(operator.shape[1], np.float32))
     out = operator.apply(x)
-    operator.device.finish()
+    return _least(operator.device, lambda: operator.apply(x, out))
+
+
+def launch(device: Device) -> float:
+    """Least seconds that anything takes there, one number long; 0 under ``LTCL_TUNE=0``."""
+    if _untimed():
+        return 0.0
+    x = vectors.fill(device.empty(1), 0.0)
+    return _least(device, lambda: vectors.fill(x, 0.0))
+
+
+def _least(device: Device, run: Callable[[], object]) -> float:
     times = []
+    device.finish()
     for _ in range(_REPEATS):
         start = time.perf_counter()
-        operator.apply(x, out)
-        operator.device.finish()
+        run()
+        device.finish()
         times.append(time.perf_counter() - start)
     return min(times)
 
@@ -118,3 +134,8 @@ def _within(device: Device, matrix: Any, allowance: float) -> Iterator[tuple[int
 def _tiles(device: Device, width: int, packed: Packed) -> Core:
     tiles = Tiles(device, packed)
     return Core(tiles, "tiles", width, tiles.precision, tiles.nbytes, tiles.quantisation, seconds(tiles))
+
+
+def _csr(device: Device, matrix: Any) -> Core:
+    operator = CSR(device, matrix)
+    return Core(operator, "csr", 1, "float32", operator.nbytes, 0.0, seconds(operator))

@@ -197,8 +197,8 @@ def _anew(W: Basis | None) -> Basis | None:
 
 
 def _names(basis: Any) -> list[str]:
-    names = [basis] if isinstance(basis, str) else list(basis)
+    names = kinds.names(basis)
     for name in names:
-        if isinstance(name, str) and name.endswith((kinds.ROWS, kinds.SUM)):
+        if name.endswith((kinds.ROWS, kinds.SUM)):
             raise InputError(f"basis is {name!r}; an inverse needs one basis on both sides, such as 'db2'")
     return names

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -53,6 +54,19 @@ def check(name: str) -> str:
                 "or db4, with ' rows' behind it for rows alone, or ' + pixels' for a sum of both"
             ) from error
     return name
+
+
+def names(basis: Any) -> list[str]:
+    """Those of one kind or of several, checked."""
+    try:
+        found = [basis] if isinstance(basis, str) else list(basis)
+    except TypeError as error:
+        raise InputTypeError(
+            f"basis is {basis!r}; it must be a name, such as {', '.join(KINDS)}, or a list of names"
+        ) from error
+    if not found:
+        raise InputError("basis is empty; it must name at least one")
+    return [check(name) for name in found]
 
 
 def kind(device: Device, grid: tuple[int, int], name: str) -> Kind:

@@ -7,6 +7,8 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+from ltcl import checks
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -53,7 +55,7 @@ class ChannelCompression:
     threshold : float
         Numbers below it were dropped.
     dropped : float
-        Frobenius norm of all that was dropped; where `dropped_between` is above 0 or R is a sum, a bound.
+        Frobenius norm of all that was dropped; a bound where `dropped_between` is above 0.
     dropped_between : float
         The part of it that was dropped between the passes over rows and columns.
     quantisation : float
@@ -98,6 +100,8 @@ class Compression:
         The error of the solution that was allowed.
     budget : int or None
         Bytes of all cores that were allowed.
+    uncompressed : int
+        Bytes of T as it was; of rows, in float32.
     window : (h, w)
         The pixels that bases were tried on.
     seconds : float
@@ -107,6 +111,7 @@ class Compression:
 
     rtol: float
     budget: int | None
+    uncompressed: int
     window: tuple[int, int]
     seconds: float
     channels: tuple[ChannelCompression, ...]
@@ -115,6 +120,14 @@ class Compression:
     def nbytes(self) -> int:
         """Bytes of all cores."""
         return sum(channel.nbytes for channel in self.channels)
+
+    def __str__(self) -> str:
+        """In a line."""
+        now, before = checks.size(self.nbytes), checks.size(self.uncompressed)
+        size = f"{now} of {before}" if self.nbytes < self.uncompressed else f"{now}, more than T's {before}"
+        bases = ", ".join(dict.fromkeys(channel.basis for channel in self.channels))
+        error = max(channel.solution_error for channel in self.channels)
+        return f"{size}, in {bases}, solutions within {checks.upwards(error)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON."""

@@ -7,6 +7,7 @@ without rows of their own (by transposed products), and anything that has `shape
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -49,18 +50,22 @@ def source(name: str, matrix: Any) -> RowSource:
     if scipy.sparse.issparse(matrix):
         return _Sliced(name, checks.csr(name, matrix))
     if isinstance(matrix, RowSource):
-        return matrix
+        return _Told(name, _of_two(name, matrix))
     if isinstance(matrix, Operator) or hasattr(matrix, "matvec"):
         return _Products(name, matrix)
     if hasattr(matrix, "shape") and hasattr(matrix, "__getitem__"):
-        if len(matrix.shape) != 2:
-            raise InputError(f"{name} has shape {tuple(matrix.shape)}; it must be (M, N)")
-        checks.real(name, np.zeros(0, matrix.dtype))
+        checks.real(name, np.zeros(0, _of_two(name, matrix).dtype))
         return _Sliced(name, matrix)
     raise InputTypeError(
         f"{name} is a {type(matrix).__name__}; it must be an array, sparse, an operator, or have "
         "shape and rows(start, stop)"
     )
+
+
+def _of_two(name: str, matrix: Any) -> Any:
+    if np.size(matrix.shape) != 2:
+        raise InputError(f"{name} has shape {matrix.shape}; it must be (M, N)")
+    return matrix
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,25 @@ class _Sliced:
     def rows(self, start: int, stop: int) -> np.ndarray:
         part = self.matrix[start:stop]
         return part.toarray() if scipy.sparse.issparse(part) else np.asarray(part)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """Somebody's own rows(start, stop), which may not give what it must."""
+
+    name: str
+    matrix: RowSource
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.matrix.shape
+
+    def rows(self, start: int, stop: int) -> np.ndarray:
+        call, wanted = f"{self.name}.rows({start}, {stop})", (stop - start, self.shape[1])
+        found = checks.real(call, self.matrix.rows(start, stop))
+        if found.shape != wanted:
+            raise InputError(f"{call} gave shape {found.shape}; it must be {wanted}")
+        return found
 
 
 @dataclass(frozen=True)
@@ -117,20 +141,21 @@ class Interreflection:
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1 of R, (stop - start, N) float32."""
-        lit = self.F > 0
-        block = checked(self.T, start, stop) / np.where(lit, self.F, np.inf)
+        lit, name = self.F > 0, f"rows {start} to {stop - 1} of T"
+        rows = checks.finite(name, checks.real(name, self.T.rows(start, stop)))
+        block = rows / np.where(lit, self.F, np.inf)
         here = np.arange(stop - start)
         block[here, start + here] -= lit[start:stop]
         return block.astype(np.float32)
 
 
-def checked(matrix: RowSource, start: int, stop: int) -> np.ndarray:
-    """Rows of `matrix`; refuses another shape, NaN and infinite values."""
-    name = f"rows {start} to {stop - 1} of T"
-    wanted = (stop - start, matrix.shape[1])
-    return checks.finite(
-        name, checks.shape(name, checks.real(name, np.asarray(matrix.rows(start, stop))), wanted)
-    )
+def difference(A: RowSource, B: RowSource, memory: int | None = None) -> float:
+    """||A - B||_F of what two sources give, summed in float64; `memory` as of `at_once`."""
+    squares = []
+    for start, stop in cut(A.shape[0], at_once(A.shape[1], memory)):
+        rows = np.subtract(A.rows(start, stop), B.rows(start, stop), dtype=np.float64)
+        squares.append(float(np.vdot(rows, rows)))
+    return math.sqrt(math.fsum(squares))
 
 
 def at_once(values: int, memory: int | None = None) -> int:

@@ -9,7 +9,6 @@ measured.
 from __future__ import annotations
 
 import functools
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.compression import choice, kinds
+from ltcl.compression import budgets, choice, kinds
+from ltcl.compression.budgets import Made
 from ltcl.compression.confirm import Confirmed, confirm
 from ltcl.compression.fit import Problem
-from ltcl.compression.result import ChannelCompression, Compression
+from ltcl.compression.result import Compression
 from ltcl.compression.sources import Interreflection, RowSource, source
 from ltcl.compression.streamed import Streamed
 from ltcl.compression.window import pixels, window
@@ -58,7 +58,7 @@ def compress(
     rtol : float
         The relative error that a solution x of S x = b may have: ``||x~ - x|| <= rtol ||x||``, any b.
     budget : int, optional
-        Bytes that the cores of all channels may take on the device.
+        Bytes that the cores of all channels may take together on the device.
     basis : str or sequence of str, optional
         "pixels", "hilbert" (pixels in that order), a wavelet ("haar", "db2", "db4", ... on both sides), one
         for rows alone ("db2 rows", the paper's), or a sum of sharp parts in pixels and the smooth rest in
@@ -85,15 +85,19 @@ def compress(
     Raises
     ------
     InputError
-        A T that is not square, compressed already, or does not fit the grid; rtol not between 0 and 1; a
-        basis that is not orthonormal; a budget that is too small: the message has the tolerance that fits
-        into it, and what this one needs.
+        A T that is not square, compressed already, or does not fit the grid; rtol not between 0 and 1, or
+        below what float32 keeps; a basis that is not orthonormal; a budget that is too small: the message has
+        what this tolerance needs, and the least one that fits, which takes a few compressions to find.
 
     Notes
     -----
-    Bases are compared on the middle 64 x 64 pixels, and the best takes the whole. A sum needs host memory for
-    the whole R a few times, and is left out where there is none. Norms are upper bounds but for a probability
-    of about two in a million over the random starts; see `ltcl.theory.two_norm`.
+    Bases are compared on the middle 64 x 64 pixels, and the best takes the whole: that of the least time x
+    bytes, with no time below that of a launch, and the fewest bytes of those within a quarter of it. Times
+    differ from run to run, and with them the choice between near equals; a named basis is not chosen. What
+    only just fits into a budget is taken for its bytes alone.
+
+    A sum needs host memory for the whole R a few times, and is left out where there is none. Norms are upper
+    bounds but for a probability of about two in a million over the random starts; see `ltcl.theory.two_norm`.
 
     Examples
     --------
@@ -106,7 +110,8 @@ def compress(
     started = time.perf_counter()
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
     limit = None if budget is None else checks.count("budget", budget)
-    names = _names(basis)
+    names = kinds.KINDS if basis is None else kinds.names(basis)
+    memory = None if memory is None else checks.count("memory", memory)
     if isinstance(T, Transport):
         given = _of_transport(T, memory, {"grid": grid, "first_bounce": first_bounce, "device": device})
     elif _are_operators(T):  # their products are at hand, their rows are made of those
@@ -114,40 +119,42 @@ def compress(
         given = _of_transport(Transport(T, _grid(grid), F, device=device), memory, {})
     else:
         given = _of_rows(T, grid, first_bounce, device, memory)
-    parts = len(given.problems)
-    wanted = _Wanted(names, rtol, math.inf if limit is None else limit / parts, parts)
     find = functools.cache(functools.partial(kinds.kind, given.problems[0].device))
-    made = _each(
-        [
-            functools.partial(_channel, problem, wanted, find, note)
-            for problem, note in zip(given.problems, _notes(progress, parts), strict=True)
-        ]
-    )
+    channels = list(zip(given.problems, _notes(progress, len(given.problems)), strict=True))
+
+    def make(allowed: float, share: float) -> list[Made]:
+        wanted = _Wanted(names, allowed, share, "" if allowed == rtol else f" at rtol {allowed:g}")
+        return [_channel(problem, wanted, find, note) for problem, note in channels]
+
+    made = budgets.within(make, rtol, limit)
+    channels[-1][1]("done", 1.0)
     C = _transport(given, [found for found, _ in made])
-    spent, reports = time.perf_counter() - started, tuple(report for _, report in made)
-    C.compression = Compression(rtol, limit, pixels(given.grid)[1], spent, reports)
+    told = tuple(one.report(R, chosen) for R, (one, chosen) in zip(given.problems, made, strict=True))
+    spent = time.perf_counter() - started
+    C.compression = Compression(rtol, limit, given.nbytes, pixels(given.grid)[1], spent, told)
     return C
 
 
 @dataclass(frozen=True)
 class _Given:
-    """R of every channel, and what else a transport is made of."""
+    """R of every channel, and what else a transport is made of; `nbytes` is what T takes."""
 
     problems: list[Problem]
     F: np.ndarray
     grid: tuple[int, int]
+    nbytes: int
     masked: bool = False
     mixing: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class _Wanted:
-    """Kinds to try, tolerance, and the share that each of so many `parts` has of the budget."""
+    """Kinds to try, tolerance, bytes that a channel may take, and what progress adds to say so."""
 
     names: Sequence[str]
     rtol: float
     budget: float
-    parts: int
+    told: str
 
 
 def _transport(given: _Given, found: Sequence[Confirmed]) -> Transport:
@@ -161,33 +168,19 @@ def _transport(given: _Given, found: Sequence[Confirmed]) -> Transport:
     return Transport(matrices, given.grid, first_bounce=given.F, on_dark=on_dark, mixing=given.mixing)
 
 
-def _each(tasks: Sequence[Callable[[], Any]]) -> list[Any]:
-    """What the tasks of all channels give; refused by the one that needs the largest budget."""
-    made, refused = [], []
-    for task in tasks:
-        try:
-            made.append(task())
-        except choice.TooLarge as error:
-            refused.append(error)
-    if refused:
-        needed, allows = (max(getattr(error, name) for error in refused) for name in ("needed", "allows"))
-        raise choice.TooLarge(refused[0].budget, refused[0].rtol, needed, allows)
-    return made
-
-
 def _channel(
     problem: Problem, wanted: _Wanted, find: Callable[[tuple[int, int], str], kinds.Kind], note: Note
-) -> tuple[Confirmed, ChannelCompression]:
+) -> Made:
     part = window(problem)
     share, tried = part.pixels / problem.pixels, iter(range(len(wanted.names)))
+    told = wanted.told
     made = choice.choose(
         part,
         wanted.names,
         wanted.rtol,
         wanted.budget * share,
         functools.partial(find, part.grid),
-        lambda name: note(f"trying {name}", 0.5 * next(tried, len(wanted.names)) / len(wanted.names)),
-        wanted.parts / share,
+        lambda name: note(f"trying {name}{told}", 0.5 * next(tried, len(wanted.names)) / len(wanted.names)),
     )
     name = made.best.fit.kind.name
     found = confirm(
@@ -197,11 +190,9 @@ def _channel(
         part is problem,
         wanted.rtol,
         wanted.budget,
-        wanted.parts,
-        lambda done: note(f"all of it in {name}", 0.5 + 0.5 * done),
+        lambda done: note(f"all of it in {name}{told}", 0.5 + 0.49 * done),
     )
-    note("done", 1.0)
-    return found, found.report(made)
+    return found, made
 
 
 def _diagonal(problem: Problem) -> np.ndarray | None:
@@ -209,15 +200,6 @@ def _diagonal(problem: Problem) -> np.ndarray | None:
         return problem.operator.diagonal()
     except InputError:  # somebody's own operator, which does not tell it
         return None
-
-
-def _names(basis: str | Sequence[str] | None) -> Sequence[str]:
-    if basis is None:
-        return kinds.KINDS
-    names = [basis] if isinstance(basis, str) else list(basis)
-    if not names:
-        raise InputError("basis is empty; it must name at least one")
-    return [kinds.check(name) for name in names]
 
 
 def _of_transport(T: Transport, memory: int | None, others: dict[str, Any]) -> _Given:
@@ -232,11 +214,11 @@ def _of_transport(T: Transport, memory: int | None, others: dict[str, Any]) -> _
     F = np.atleast_2d(T.first_bounce)
     rows = [Interreflection(source("T", matrix), f) for matrix, f in zip(T.matrices, F, strict=True)]
     try:
-        operators = [S.R for S in T.systems]
+        operators, nbytes = [S.R for S in T.systems], T.nbytes or _dense(F)
     except MemoryLimitError:
-        operators = [_streamed(T.device, R, memory) for R in rows]
+        operators, nbytes = [_streamed(T.device, R, memory) for R in rows], _dense(F)
     problems = [Problem(R, A, T.grid, memory) for R, A in zip(rows, operators, strict=True)]
-    return _Given(problems, F, T.grid, bool(T.masked.any()), T.mixing)
+    return _Given(problems, F, T.grid, nbytes, bool(T.masked.any()), T.mixing)
 
 
 def _of_rows(T: Any, grid: Any, first_bounce: Any, device: Device | str | None, memory: int | None) -> _Given:
@@ -251,7 +233,13 @@ def _of_rows(T: Any, grid: Any, first_bounce: Any, device: Device | str | None, 
     chosen = device if isinstance(device, Device) else open_device(device)
     F = _first_bounce(parts, first_bounce, chosen, memory)
     rows = [Interreflection(part, f) for part, f in zip(parts, F, strict=True)]
-    return _Given([Problem(R, _streamed(chosen, R, memory), shape, memory) for R in rows], F, shape)
+    problems = [Problem(R, _streamed(chosen, R, memory), shape, memory) for R in rows]
+    return _Given(problems, F, shape, _dense(F))
+
+
+def _dense(F: np.ndarray) -> int:
+    """Bytes of T in float32, of its first bounces (channels, N)."""
+    return 4 * F.size * F.shape[1]
 
 
 def _streamed(device: Device, R: Interreflection, memory: int | None) -> Operator:

@@ -6,7 +6,7 @@ import pytest
 import scipy.sparse
 
 from ltcl.compression import cores
-from ltcl.operators import CSR, Tiles
+from ltcl.operators import Tiles
 from tests import gallery
 
 MATRIX = scipy.sparse.csr_array(gallery.sparse(129, 129, 0.1))
@@ -35,19 +35,37 @@ def test_more_error_never_takes_more_bytes(device):
     assert sizes[-1] < sizes[0]
 
 
-def test_a_budget_is_kept_where_something_fits(device):
+def test_a_budget_is_kept_where_something_fits(device, monkeypatch):
     smallest = cores.best(device, MATRIX, 0.1).nbytes
     assert cores.best(device, MATRIX, 0.1, smallest).nbytes == smallest
-    assert cores.best(device, MATRIX, 0.1, smallest - 1).nbytes >= smallest
+    monkeypatch.setenv("LTCL_TUNE", "1")  # the fastest would be larger
+    assert cores.best(device, MATRIX, 0.1, smallest - 1).nbytes == smallest
+    assert cores.best(device, MATRIX, 0.1, 0.0).nbytes == smallest
 
 
-def test_the_fastest_wins_and_of_those_alike_the_smallest(device):
-    def core(nbytes: int, seconds: float | None) -> cores.Core:
-        return cores.Core(CSR(device, MATRIX), "csr", 1, "float32", nbytes, 0.0, seconds)
+@pytest.mark.parametrize(
+    ("costs", "best"),
+    [
+        ([(1.0, 90), (3.0, 10)], 1),  # three times as long, in a ninth of the bytes
+        ([(1.0, 90), (12.0, 10)], 0),
+        ([(1.0, 90), (10.0, 11)], 1),  # within a quarter
+        ([(1.0, 100), (1.26, 99)], 1),
+        ([(1.0, 100), (1.27, 99)], 0),
+        ([(0.01, 90), (0.04, 50)], 1),  # both as short as a launch
+        ([(0.01, 90), (0.4, 50)], 0),
+        ([(1.0, 90), (None, 80)], 1),
+    ],
+)
+def test_the_least_time_times_bytes_wins_and_of_those_alike_the_smallest(costs, best):
+    launch = 0.1
+    assert cores.choose(costs, launch) == best
+    assert cores.choose(costs[::-1], launch) == 1 - best
 
-    assert cores.choose([core(9, 1.0), core(1, 2.0)]).nbytes == 9
-    assert cores.choose([core(9, 1.0), core(1, 1.1)]).nbytes == 1
-    assert cores.choose([core(9, 1.0), core(1, None)]).nbytes == 1
+
+def test_a_launch_takes_time_that_is_looked_at_where_that_is_allowed(device, monkeypatch):
+    assert cores.launch(device) == 0.0
+    monkeypatch.setenv("LTCL_TUNE", "1")
+    assert cores.launch(device) > 0.0
 
 
 def test_products_are_timed_where_that_is_allowed(device, monkeypatch):

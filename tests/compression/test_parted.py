@@ -103,7 +103,8 @@ def test_the_bounds_hold_and_solutions_are_within_them(spill):
     T, C = spilled(12, spill), compressed(spill, SUM)
     S, found, (told,) = dense(T), C.systems[0].to_dense(), C.compression.channels
     assert np.linalg.norm(found - S, 2) <= told.error == C.systems[0].R.error
-    assert np.linalg.norm(found - S) <= told.dropped + told.quantisation + 1e-5
+    # Exact but for the rounding of cores, though both parts may drop the same light.
+    assert np.linalg.norm(found - S) == pytest.approx(told.dropped, rel=1e-5, abs=told.quantisation)
     assert np.linalg.norm(np.linalg.solve(found, found - S), 2) <= C.error <= RTOL
     b = np.random.default_rng(5).random(len(S))
     x = np.linalg.solve(S, b)
