@@ -54,7 +54,7 @@ def test_a_budget_is_refused_with_what_fits(program: Program, transport: Path, t
     outcome = program("compress", transport, "--out", out, "--budget", "10B", "--basis", "db2")
     assert (outcome.code, outcome.out) == (1, "")
     last = outcome.err.splitlines()[-1]  # a search that takes more than two seconds tells of it before
-    assert last.startswith("ltcl: error: budget is 10 bytes, but rtol 0.01 needs ")
+    assert last.startswith("ltcl: error: --budget is 10 bytes, but rtol 0.01 needs ")
     assert "; it allows rtol " in last
     assert not list(tmp_path.iterdir())
 
