@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Hierarchical scanning with cells lit in parallel, after Sen et al. 2005 (dual photography).
+
+The projector is one cell, then four, and so on (`Cells`). A camera pixel that sees much of a cell asks for its
+four children; what it sees little of stays where it is, spread evenly over the cell: it is kept, never
+dropped, so that row sums are those of white. T = C W with W the sums over cells (`ltcl.operators.Pyramid`).
+
+Cells at which no camera pixel is active twice are lit together (`colouring`), a child of each at a time. The
+picture also holds what camera pixels see a little of in the other lit cells. That is known, and subtracted:
+C as far as it is found, times W times the pattern. Then the four children e_k must add up to the parent e:
+
+    e_k - v_k r / V,    r = sum_k e_k - e,    V = sum_k v_k + v
+
+of variances v, into which goes a part of what was subtracted.
+
+Known limit: light that stays at a cell is smooth there. `threshold` is how much of what a camera pixel sees
+under white may be; details below it are lost, sums are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse
+
+from ltcl.acquisition.scanning.cells import Cells
+from ltcl.acquisition.scanning.colouring import colour
+from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Pictures
+
+AT_ONCE = 16  # patterns of a batch
+_TRUST = 0.1  # relative error of what is subtracted for cells that are lit beside
+
+Take = Callable[[list[np.ndarray]], list[Picture]]
+
+
+class Entries(NamedTuple):
+    """Light of cells at camera pixels: sorted by cell, (entries,); energy and variance (channels, entries).
+
+    Energy is that of all pixels of the cell together.
+    """
+
+    cell: np.ndarray
+    pixel: np.ndarray
+    energy: np.ndarray
+    variance: np.ndarray
+
+    def where(self, chosen: np.ndarray) -> Entries:
+        """Some of them."""
+        return Entries(
+            self.cell[chosen], self.pixel[chosen], self.energy[:, chosen], self.variance[:, chosen]
+        )
+
+
+class Level(NamedTuple):
+    """What there is to tell of a level: cells with active pixels, their entries, colours, photographs."""
+
+    level: int
+    cells: int
+    entries: int
+    colours: int
+    patterns: int
+
+
+@dataclass(eq=False)
+class Core:
+    """C as it is found: values for one pixel of a cell, by camera pixel and cell."""
+
+    cells: Cells
+    channels: int
+    parts: list[Entries] = field(default_factory=list)
+
+    def add(self, level: int, entries: Entries) -> None:
+        """Entries that stay at a level."""
+        area = self.cells.areas(level)[entries.cell]
+        self.parts.append(
+            Entries(
+                self.cells.offsets[level] + entries.cell,
+                entries.pixel,
+                entries.energy / area,
+                entries.variance / area**2,
+            )
+        )
+
+    def complete(self) -> None:
+        """Add an entry of 0 to every pixel that has none at its own, so that the diagonal is in the pattern."""
+        there = [part.pixel[part.cell == part.pixel] for part in self.parts]
+        missing = np.setdiff1d(np.arange(self.cells.grid[0] * self.cells.grid[1]), np.concatenate(there))
+        none = np.zeros((self.channels, len(missing)))
+        self.parts.append(Entries(missing, missing, none, none))
+
+    def matrices(self, what: str = "energy") -> list[scipy.sparse.csr_array]:
+        """C of each channel, or its variance: (M, cells), all of one pattern."""
+        row, column = (np.concatenate([getattr(p, k) for p in self.parts]) for k in ("pixel", "cell"))
+        values = np.concatenate([getattr(part, what) for part in self.parts], axis=1)
+        shape = (self.cells.grid[0] * self.cells.grid[1], self.cells.offsets[-1])
+        order = np.lexsort((column, row))
+        starts = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=shape[0]))])
+        return [scipy.sparse.csr_array((part[order], column[order], starts), shape=shape) for part in values]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What came of it: the core, and each level."""
+
+    core: Core
+    levels: list[Level]
+
+
+def most_patterns(cells: Cells) -> int:
+    """Patterns that no scan goes beyond, in whole batches: every cell on its own."""
+    whole = [-(-rows * columns // AT_ONCE) * AT_ONCE for rows, columns in cells.sizes[:-1]]
+    return max(sum(whole), AT_ONCE)
+
+
+def scan(pictures: Pictures, take: Take, threshold: float, sigmas: float) -> Scan:
+    """Find the core of T, the white picture of the calibration being its root.
+
+    Parameters
+    ----------
+    take : function
+        Of some patterns to their pictures, in order; it may have them from an earlier run.
+    threshold : float
+        Part of what a camera pixel sees under white, that a cell is divided for.
+    sigmas : float
+        Standard deviations that it has to be above 0 as well.
+    """
+    cells, white = Cells(pictures.grid), pictures.white
+    seen = np.flatnonzero(pictures.seen)
+    root = Entries(
+        np.zeros(len(seen), np.int64),
+        seen,
+        white.value[:, seen].astype(np.float64),
+        white.variance[:, seen].astype(np.float64),
+    )
+    found, levels = Core(cells, pictures.channels), []
+    least = threshold * np.maximum(white.value, 0.0)
+    active = root
+    for level in range(cells.top, 0, -1):
+        divided = level == cells.top or _much(active, least, sigmas)
+        stays = np.zeros(len(active.cell), bool) if level == cells.top else ~divided
+        found.add(level, active.where(stays))
+        active = active.where(~stays)
+        told, active = _divide(found, level, active, pictures, take)
+        levels.append(told)
+    found.add(0, active)
+    return Scan(found, levels)
+
+
+def _much(entries: Entries, least: np.ndarray, sigmas: float) -> np.ndarray:
+    """Entries, in any channel, above the threshold and above the noise."""
+    enough = entries.energy > least[:, entries.pixel]
+    return np.any(enough & (entries.energy**2 > sigmas**2 * entries.variance), axis=0)
+
+
+def _divide(
+    found: Core, level: int, parents: Entries, pictures: Pictures, take: Take
+) -> tuple[Level, Entries]:
+    """The entries of the children of all parents, by cell."""
+    numbers, starts = np.unique(parents.cell, return_index=True)
+    starts = np.append(starts, len(parents.cell))
+    colours = colour(starts, parents.pixel, len(pictures.seen))
+    kids = found.cells.children(level, numbers)
+    place = np.repeat(np.arange(len(numbers)), np.diff(starts))  # of each entry among the parents
+    single = np.count_nonzero(kids >= 0, axis=0) == 1  # lit already, as the parent
+    energy = np.zeros((4, *parents.energy.shape))
+    variance = np.zeros_like(energy)
+    energy[:, :, single[place]] = np.where((kids[:, place] >= 0)[:, None], parents.energy, 0.0)[
+        :, :, single[place]
+    ]
+    groups = list(_groups(kids, colours, single))
+    stored = found.matrices() if found.parts else []
+    for first in range(0, len(groups), AT_ONCE):
+        batch = groups[first : first + AT_ONCE]
+        patterns = [found.cells.pattern(level - 1, kids[k, members]) for k, members in batch]
+        for (k, members), pattern, picture in zip(batch, patterns, take(patterns), strict=True):
+            lit = np.zeros(len(numbers), bool)
+            lit[members] = True
+            here = np.flatnonzero(lit[place])
+            e, v = _own_light(picture, pattern, stored, parents.pixel[here], found, pictures)
+            energy[k][:, here], variance[k][:, here] = e, v
+    exact = single[place]
+    balanced, spread = _balanced(energy, variance, parents, exact)
+    children = _children(kids[:, place], parents.pixel, balanced, spread)
+    top = int(colours.max(initial=-1)) + 1
+    return Level(level, len(numbers), len(place), top, len(groups)), children
+
+
+def _groups(kids: np.ndarray, colours: np.ndarray, single: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """(which child, of which parents) to be lit at once."""
+    for number in range(int(colours.max(initial=-1)) + 1):
+        for k in range(4):
+            members = np.flatnonzero((colours == number) & (kids[k] >= 0) & ~single)
+            if len(members):
+                yield k, members
+
+
+def _own_light(
+    picture: Picture,
+    pattern: np.ndarray,
+    stored: list[scipy.sparse.csr_array],
+    pixels: np.ndarray,
+    found: Core,
+    pictures: Pictures,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of a picture, at the pixels that are active, the light of the cell that each is active in."""
+    beside = np.zeros((found.channels, len(pixels)))
+    if stored:
+        sums = found.cells.sums(pattern)
+        beside = np.stack([(C @ sums)[pixels] for C in stored])
+    variance = picture.variance[:, pixels] + pictures.ambient[:, pixels] + (_TRUST * beside) ** 2
+    return picture.value[:, pixels] - beside, variance
+
+
+def _balanced(
+    energy: np.ndarray, variance: np.ndarray, parents: Entries, exact: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Children that add up to their parent, as far as the noise of either says."""
+    rest = energy.sum(axis=0) - parents.energy
+    total = np.maximum(variance.sum(axis=0) + parents.variance, 1e-300)
+    gain = np.where(exact, 0.0, variance / total)
+    spread = np.where(exact, parents.variance, variance * (1.0 - gain))
+    return energy - gain * rest, spread
+
+
+def _children(kids: np.ndarray, pixel: np.ndarray, energy: np.ndarray, variance: np.ndarray) -> Entries:
+    """(4, entries) children as entries, sorted by cell."""
+    k, entry = np.nonzero(kids >= 0)
+    cell = kids[k, entry]
+    order = np.argsort(cell, kind="stable")
+    k, entry, cell = k[order], entry[order], cell[order]
+    variance = np.minimum(variance[k, :, entry].T, UNKNOWN)
+    return Entries(cell, pixel[entry], energy[k, :, entry].T, variance)

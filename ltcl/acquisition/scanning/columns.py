@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Columns of T, batch by batch, into a store: what is committed is never photographed again.
+
+A batch is a block of columns of the store: pixels that follow each other. Its photographs depend on nothing
+but the calibration, so that a scan which was stopped goes on with the next block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse
+
+from ltcl.acquisition.scanning import thresholds
+from ltcl.acquisition.scanning.pictures import UNKNOWN, Pictures
+from ltcl.store import BlockStore
+
+
+class Code(Protocol):
+    """How the pixels of a batch are lit, and its columns found: `Pixels`, `Hadamard`."""
+
+    @property
+    def size(self) -> int:
+        """Pixels of a batch."""
+        ...
+
+    def count(self, pixels: int) -> int:
+        """Patterns for a batch of so many pixels."""
+        ...
+
+    def patterns(self, pixels: int) -> np.ndarray:
+        """(patterns, pixels) bool."""
+        ...
+
+    def decode(
+        self, value: np.ndarray, variance: np.ndarray, ambient: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Columns (pixels or more, M) and their variance."""
+        ...
+
+
+def patterns(code: Code, n: int) -> int:
+    """Patterns for n pixels.
+
+    >>> from ltcl.acquisition.scanning.pixel import Pixels
+    >>> patterns(Pixels(4), 10)
+    13
+    """
+    whole, rest = divmod(n, code.size)
+    return whole * code.count(code.size) + (code.count(rest) if rest else 0)
+
+
+def scan(
+    pictures: Pictures, code: Code, store: BlockStore, sigmas: float, tell: Callable[[int], None]
+) -> None:
+    """Photograph, decode and commit every block of columns that is not in the store.
+
+    Parameters
+    ----------
+    sigmas : float
+        Of `thresholds.keep`; 0 keeps every entry.
+    tell : function of an int
+        Told the patterns that were photographed, block by block; those of an earlier run as well.
+    """
+    for block in range(store.layout.blocks("columns")):
+        start, stop = store.layout.span(block, "columns")
+        if not all((c, block) in store.written for c in range(pictures.channels)):
+            _batch(pictures, code, store, block, sigmas)
+        tell(code.count(stop - start))
+
+
+def _batch(pictures: Pictures, code: Code, store: BlockStore, block: int, sigmas: float) -> None:
+    start, stop = store.layout.span(block, "columns")
+    taken = pictures.take(_lit(pictures.grid, start, on) for on in code.patterns(stop - start))
+    for c in range(pictures.channels):
+        value, variance = (np.stack([part[k][c] for part in taken]) for k in (0, 1))
+        x, v = (part[: stop - start] for part in code.decode(value, variance, pictures.ambient[c]))
+        store.write(c, block, *_sparse(x, v, pictures, sigmas))
+
+
+def _lit(grid: tuple[int, int], start: int, on: np.ndarray) -> np.ndarray:
+    """The pattern (h, w) with pixels `start` + n on."""
+    pattern = np.zeros(grid, np.float32)
+    pattern.flat[start + np.flatnonzero(on)] = 1.0
+    return pattern
+
+
+def _sparse(
+    x: np.ndarray, v: np.ndarray, pictures: Pictures, sigmas: float
+) -> tuple[scipy.sparse.csr_array, np.ndarray]:
+    """What of columns (k, M) is kept, and its variance, NaN where only others told it."""
+    kept = thresholds.keep(x, v, pictures.grid, sigmas) & pictures.seen
+    ends = np.concatenate([[0], np.cumsum(np.count_nonzero(kept, axis=1))])
+    values = x[kept].astype(np.float32)
+    matrix = scipy.sparse.csr_array((values, np.nonzero(kept)[1].astype(np.int32), ends), shape=x.shape)
+    variance = v[kept]
+    return matrix, np.where(variance < 1e-3 * UNKNOWN, variance, np.nan)
