@@ -5,7 +5,7 @@
     rigs/       set-ups: virtual (over a known T), folder (photographs taken by a person)
     radiometry/ light from codes: response, noise, exposures, black, merging, colours
     geometry/   which projector pixel a camera pixel sees: Gray code, phase shift, resampling
-    calibration, exposing       all that is measured once of a set-up, and for how many seconds
+    calibration, measuring, exposing    all that is measured once of a set-up, and for how many seconds
     scanning/   which pixels are lit when, and T from the pictures; plan before, report after
     task        acquire: all of it, into a store, stopped and resumed
 

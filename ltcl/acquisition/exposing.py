@@ -19,7 +19,7 @@ from ltcl.acquisition.rig import LONGEST, SHORTEST, Shots
 DEEPEST = 64.0  # times the exposure of white: further in one photograph costs more than it tells
 _AMBIENT = 0.3  # of full scale that light without the projector may take
 _SNR = 10.0  # of the weak light, wanted in one picture; the sum over a picture has far more
-_FINE = 1 << 10  # levels from which two exposures span the range
+_FINE = 1 << 10  # levels from which two exposures span the range; fewer take three
 
 
 def offered(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
@@ -48,7 +48,9 @@ def deepest(shots: Shots, white: float, response: Response) -> float:
 def for_scan(
     shots: Shots, pixel: np.ndarray, white: float, deep: float, response: Response, noise: NoiseModel
 ) -> tuple[float, ...]:
-    """Two exposures, three of a camera of few levels, for patterns of a few pixels (`choose`).
+    """The longest exposure, and one or, of a camera of few levels, two shorter ones (`choose`).
+
+    The longest is there for light that is too weak to stand out of one picture, but not out of many.
 
     Parameters
     ----------
@@ -65,7 +67,7 @@ def for_scan(
         return seconds
     have: Sequence[float] = shots.exposures or offered(shots, deep * 2.0 ** (-np.arange(0, 24) / 2))
     usable = [t for t in have if t <= deep * 1.001]
-    most = 3 if 0 < noise.levels < _FINE else 2
+    most = 2 if 0 < noise.levels < _FINE else 1
     levels = noise.levels or None
     found = choose(probes, seconds, response, noise, snr=_SNR, most=most, exposures=usable, levels=levels)
-    return offered(shots, found)
+    return offered(shots, [*found, deep])

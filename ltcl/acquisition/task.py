@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`acquire`: from a rig to a transport, with photographs alone; it can be stopped at any time and goes on.
 
-First the set-up is measured (`calibration`), which is committed as a whole, then T is scanned
-(`scanning`), of which every batch of photographs is committed before the next is taken. What is in the store is
-read back and never photographed again.
+First the set-up is measured (`measuring`), which is committed as a whole, then T is scanned
+(`scanning`), of which every batch of photographs is committed before the next is taken. What is in the store
+is read back and never photographed again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ltcl import checks
-from ltcl.acquisition import calibration
+from ltcl.acquisition import measuring
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
@@ -198,7 +198,7 @@ def _begin(
 ) -> _Scan:
     if found is not None:
         return _resumed(found, shots, wanted)
-    told = calibration.measure(
+    told = measuring.measure(
         shots,
         geometry=geometry,
         response=response,
@@ -228,8 +228,8 @@ def _resumed(found: BlockStore, shots: Shots, wanted: Settings) -> _Scan:
     if other:
         name = other[0]
         raise InputError(
-            f"{name} is {asked[name]!r}, but {found.path} was begun with {made.get(name)!r}; it must be that, "
-            "or another store"
+            f"{name} is {asked[name]!r}, but {found.path} was begun with {made.get(name)!r}; it must be "
+            "that, or another store"
         )
     arrays = {
         name.removeprefix(_EXTRA): found.extra(name) for name in found.extras if name.startswith(_EXTRA)
@@ -237,7 +237,8 @@ def _resumed(found: BlockStore, shots: Shots, wanted: Settings) -> _Scan:
     told = Calibration.from_arrays(arrays)
     if (told.resampling.grid, told.projector.channels in (1, shots.channels)) != (shots.grid, True):
         raise InputError(
-            f"rig has {shots.grid} pixels and {shots.channels} channel(s); {found.path} was begun with another"
+            f"rig has {shots.grid} pixels and {shots.channels} channel(s); {found.path} was begun with "
+            "another"
         )
     strategy = found.attributes["strategy"]
     pictures = Pictures(shots, told, wanted.block if strategy == "block" else 1)

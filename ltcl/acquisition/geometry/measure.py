@@ -137,6 +137,7 @@ def exposure(shots: Shots, grid: tuple[int, int], seconds: float = 1 / 60) -> fl
 
 
 def nearest(seconds: float, allowed: Any) -> float:
+    """The exposure that a camera has, of `allowed` or of any, nearest to some seconds."""
     if not allowed:
         return min(max(seconds, 1e-4), 30.0)
     return min(allowed, key=lambda given: abs(math.log(given / seconds)))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Hierarchical scanning with cells lit in parallel, after Sen et al. 2005 (dual photography).
 
-The projector is one cell, then four, and so on (`Cells`). A camera pixel that sees much of a cell asks for its
-four children; what it sees little of stays where it is, spread evenly over the cell: it is kept, never
+The projector is one cell, then four, and so on (`Cells`). A camera pixel that sees much of a cell asks for
+its four children; what it sees little of stays where it is, spread evenly over the cell: it is kept, never
 dropped, so that row sums are those of white. T = C W with W the sums over cells (`ltcl.operators.Pyramid`).
 
 Cells at which no camera pixel is active twice are lit together (`colouring`), a child of each at a time. The
@@ -85,7 +85,7 @@ class Core:
         )
 
     def complete(self) -> None:
-        """Add an entry of 0 to every pixel that has none at its own, so that the diagonal is in the pattern."""
+        """Add an entry of 0 where a pixel has none of its own: the diagonal is in the pattern."""
         there = [part.pixel[part.cell == part.pixel] for part in self.parts]
         missing = np.setdiff1d(np.arange(self.cells.grid[0] * self.cells.grid[1]), np.concatenate(there))
         none = np.zeros((self.channels, len(missing)))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A quad-tree over the pixels, on the host: cells, their children, sums over them.
 
-Numbered as by `ltcl.operators.Pyramid`: level 0 is the pixels, a cell of each further level covers 2 x 2 of the
-one before, fewer at the right and lower rim, until one is left; row-major within a level, the finest first.
+Numbered as by `ltcl.operators.Pyramid`: level 0 is the pixels, a cell of each further level covers 2 x 2 of
+the one before, fewer at the right and lower rim, until one is left; row-major, the finest level first.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Cells:
         return np.concatenate([part.ravel() for part in parts])
 
     def children(self, level: int, cells: np.ndarray) -> np.ndarray:
-        """(4, n) cells of `level` - 1: upper left, upper right, lower left, lower right; -1 beyond the rim."""
+        """(4, n) cells of `level` - 1: upper left, upper right, lower left, lower right; or -1."""
         (_, columns), (h, w) = self.sizes[level], self.sizes[level - 1]
         row, column = np.divmod(cells, columns)
         found = []

@@ -7,7 +7,7 @@ but the calibration, so that a scan which was stopped goes on with the next bloc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import numpy as np
@@ -64,27 +64,31 @@ def scan(
     tell : function of an int
         Told the patterns that were photographed, block by block; those of an earlier run as well.
     """
+    missing = sorted({block for _, block in store.missing("columns")})
+    pictures.announce(p for block in missing for p in _lit(pictures.grid, code, store, block))
     for block in range(store.layout.blocks("columns")):
         start, stop = store.layout.span(block, "columns")
-        if not all((c, block) in store.written for c in range(pictures.channels)):
+        if block in missing:
             _batch(pictures, code, store, block, sigmas)
         tell(code.count(stop - start))
 
 
 def _batch(pictures: Pictures, code: Code, store: BlockStore, block: int, sigmas: float) -> None:
     start, stop = store.layout.span(block, "columns")
-    taken = pictures.take(_lit(pictures.grid, start, on) for on in code.patterns(stop - start))
+    taken = pictures.take(_lit(pictures.grid, code, store, block))
     for c in range(pictures.channels):
         value, variance = (np.stack([part[k][c] for part in taken]) for k in (0, 1))
         x, v = (part[: stop - start] for part in code.decode(value, variance, pictures.ambient[c]))
         store.write(c, block, *_sparse(x, v, pictures, sigmas))
 
 
-def _lit(grid: tuple[int, int], start: int, on: np.ndarray) -> np.ndarray:
-    """The pattern (h, w) with pixels `start` + n on."""
-    pattern = np.zeros(grid, np.float32)
-    pattern.flat[start + np.flatnonzero(on)] = 1.0
-    return pattern
+def _lit(grid: tuple[int, int], code: Code, store: BlockStore, block: int) -> Iterator[np.ndarray]:
+    """The patterns (h, w) of a block."""
+    start, stop = store.layout.span(block, "columns")
+    for on in code.patterns(stop - start):
+        pattern = np.zeros(grid, np.float32)
+        pattern.flat[start + np.flatnonzero(on)] = 1.0
+        yield pattern
 
 
 def _sparse(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What an adaptive scan found as the arrays of a compressed transport (`ltcl.parts`): T = C W.
 
-It is kept as S diag(1) with S = T = I + R: R = C W - I takes 1 from C at every pixel's own cell, and the first
-bounce stands beside it. Loaded, `Transport` divides the columns by F when it makes its own S = T F^-1.
+It is kept as S diag(1) with S = T = I + R: R = C W - I takes 1 from C at every pixel's own cell, and the
+first bounce stands beside it. Loaded, `Transport` divides the columns by F when it makes its own S = T F^-1.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pictures in the order in which a scan asked for them, kept in a store.
 
-What an adaptive scan asks for next depends on nothing but the pictures before. So a scan that was stopped is run
-again from its start with the pictures of the log, to the bit the same, until it asks for one that is new.
+What an adaptive scan asks for next depends on nothing but the pictures before. So a scan that was stopped is
+run again from its start with the pictures of the log, to the bit the same, until it asks for a new one.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class Log:
         variance = np.stack([np.reshape(block.variance, (-1, pixels)) for block in blocks], axis=1)
         if len(value) != count or count > rows:
             raise AcquisitionError(
-                f"{self._store.path} holds {len(value)} pictures in batch {number}, but {count} are asked for; "
-                "it is that of another scan"
+                f"{self._store.path} holds {len(value)} pictures in batch {number}, but {count} are asked "
+                "for; it is that of another scan"
             )
         return [Picture(*part) for part in zip(value, variance, strict=True)]
 

@@ -38,10 +38,10 @@ class Pictures:
         Of the scan: M = N = h w.
     ambient : (channels, M)
         Variance of what is subtracted from each picture, the same in all.
+    white : Picture
+        Under all of the projector: row sums of T.
     seen : (M,) bool
         Pixels that the camera sees.
-    clipped : list of float
-        Of each picture the part of the camera's pixels that no exposure tells.
     """
 
     def __init__(self, shots: Shots, calibration: Calibration, side: int = 1) -> None:
@@ -55,25 +55,31 @@ class Pictures:
         self.ambient = np.where(self._dark.variance < UNKNOWN, self._dark.variance, 0.0) / self._scale**2
         white = self._on_grid(calibration.white)
         self.white = Picture(white.value / self._scale, white.variance / self._scale**2)
-        self.clipped: list[float] = []
 
     @property
     def exposures(self) -> int:
         """Photographs of each pattern."""
         return len(self.calibration.exposures)
 
+    def announce(self, patterns: Iterable[np.ndarray]) -> None:
+        """Tell the rig of patterns that will be asked for, so that a person can photograph all in one go."""
+        times = self.calibration.exposures
+        self.shots.prepare((self._codes(part), t) for part in patterns for t in times)
+
     def take(self, patterns: Iterable[np.ndarray]) -> list[Picture]:
         """A picture under each pattern (h, w) of the scan, on where it is not 0."""
-        codes = [self.blocks.enlarged(np.asarray(pattern, np.float32)) for pattern in patterns]
+        codes = [self._codes(pattern) for pattern in patterns]
         times = self.calibration.exposures
         self.shots.prepare([(part, t) for part in codes for t in times])
         return [self._picture([self.shots.photograph(part, t) for t in times]) for part in codes]
+
+    def _codes(self, pattern: np.ndarray) -> np.ndarray:
+        return self.blocks.enlarged(np.asarray(pattern, np.float32))
 
     def _picture(self, images: list[np.ndarray]) -> Picture:
         told = self.calibration
         levels = told.noise.levels or None
         merged = merge(images, told.exposures, told.response, told.noise, levels=levels, black=told.offset)
-        self.clipped.append(1.0 - float(merged.valid.mean()))
         lit = self._on_grid(merged)
         variance = np.where(lit.variance < UNKNOWN, lit.variance / self._scale**2, UNKNOWN)
         known = (variance < UNKNOWN) & (self._dark.variance < UNKNOWN)

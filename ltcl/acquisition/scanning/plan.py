@@ -96,9 +96,9 @@ class Plan:
     def __str__(self) -> str:
         h, w = self.grid
         return (
-            f"{self.strategy}: {self.photographs} photographs of {self.patterns} patterns for {h} x {w} pixels, "
-            f"{duration(self.seconds)}, {checks.size(self.disk)} at most; signal over noise {self.snr_direct:.3g} "
-            f"(direct), {self.snr_indirect:.2g} (a weak entry); {self.why}"
+            f"{self.strategy}: {self.photographs} photographs of {self.patterns} patterns for {h} x {w} "
+            f"pixels, {duration(self.seconds)}, {checks.size(self.disk)} at most; signal over noise "
+            f"{self.snr_direct:.3g} (direct), {self.snr_indirect:.2g} (a weak entry); {self.why}"
         )
 
 
@@ -163,16 +163,17 @@ def measured(told: Calibration) -> Light:
 def choose(given: dict[str, Plan]) -> tuple[str, str]:
     """The strategy that "auto" takes, and why.
 
-    >>> bright, dark = NoiseModel(2000.0, 0.0), NoiseModel(1e6, 0.01)
-    >>> [choose(plans((16, 16), (1.0, 8.0), noise))[0] for noise in (bright, dark)]
+    >>> light, photons, reading = Light(ambient=0.0), NoiseModel(2000.0, 0.0), NoiseModel(1e6, 0.01)
+    >>> [choose(plans((16, 16), (1.0, 8.0), noise, light))[0] for noise in (photons, reading)]
     ['pixel', 'hadamard']
     """
     pixel, hadamard = given["pixel"], given["hadamard"]
     h, w = pixel.grid
     if h * w > MANY:
         return "adaptive", f"{h * w} pixels are more than {MANY}"
-    told = f"signal over noise of a weak entry: hadamard {hadamard.snr_indirect:.2g}, pixel {pixel.snr_indirect:.2g}"
-    return ("hadamard" if hadamard.snr_indirect > pixel.snr_indirect else "pixel"), told
+    ours, theirs = pixel.snr_indirect, hadamard.snr_indirect
+    told = f"signal over noise of a weak entry: hadamard {theirs:.2g}, pixel {ours:.2g}"
+    return ("hadamard" if theirs > ours else "pixel"), told
 
 
 def duration(seconds: float) -> str:
