@@ -134,6 +134,8 @@ def acquire(
     shots = Shots(rig)
     with _place(store) as path:
         found = _found(path, resume)
+        if found is not None:
+            _refuse_other(found, shots, wanted)
         if found is None or not found.final:
             run = _begin(path, shots, wanted, geometry, response, found)
             _scan(run, progress or (lambda done, total: None))
@@ -185,7 +187,9 @@ def _found(path: Path, resume: bool) -> BlockStore | None:
     if not resume:
         raise InputError(f"resume is False, but {path} is there already; give another store")
     found = BlockStore.open(path, "a")
-    return found if found.final or "strategy" in found.attributes else None
+    if "acquisition" not in found.provenance:
+        raise InputError(f"store is {path}, which ltcl.acquire did not make; give another one")
+    return found if "strategy" in found.attributes else None
 
 
 def _begin(
@@ -222,7 +226,8 @@ def _begin(
     return _Scan(store, pictures, wanted, strategy)
 
 
-def _resumed(found: BlockStore, shots: Shots, wanted: Settings) -> _Scan:
+def _refuse_other(found: BlockStore, shots: Shots, wanted: Settings) -> None:
+    """Refuse to go on with what was begun with another rig, or with other settings."""
     made, asked = found.attributes["settings"], _plain(wanted)
     other = [name for name in asked if made.get(name) != asked[name]]
     if other:
@@ -231,15 +236,19 @@ def _resumed(found: BlockStore, shots: Shots, wanted: Settings) -> _Scan:
             f"{name} is {asked[name]!r}, but {found.path} was begun with {made.get(name)!r}; it must be "
             "that, or another store"
         )
+    grid, channels = found.extra(_EXTRA + "resampling.coverage").shape, found.layout.channels
+    if (grid, channels) != (shots.grid, shots.channels):
+        raise InputError(
+            f"rig has {shots.grid} pixels and {shots.channels} channel(s), but {found.path} was begun with "
+            f"{grid} and {channels}; it must be that rig, or another store"
+        )
+
+
+def _resumed(found: BlockStore, shots: Shots, wanted: Settings) -> _Scan:
     arrays = {
         name.removeprefix(_EXTRA): found.extra(name) for name in found.extras if name.startswith(_EXTRA)
     }
     told = Calibration.from_arrays(arrays)
-    if (told.resampling.grid, told.projector.channels in (1, shots.channels)) != (shots.grid, True):
-        raise InputError(
-            f"rig has {shots.grid} pixels and {shots.channels} channel(s); {found.path} was begun with "
-            "another"
-        )
     strategy = found.attributes["strategy"]
     pictures = Pictures(shots, told, wanted.block if strategy == "block" else 1)
     return _Scan(found, pictures, wanted, strategy)
@@ -305,7 +314,7 @@ def _scan_cells(run: _Scan, progress: Progress) -> None:
     """Scan with the store as a log of pictures, which the transport then takes the place of."""
     total = int(run.store.attributes["plan"]["patterns"])
     log = Log(run.store, run.pictures, lambda done: progress(done, max(done, total)))
-    found = adaptive.scan(run.pictures, log.take, run.wanted.threshold, run.wanted.sigmas)
+    found = adaptive.scan(run.pictures, log, run.wanted.threshold, run.wanted.sigmas)
     mixing = run.pictures.calibration.mixing
     arrays = core.arrays(found.core, mixing)
     beside = {name: run.store.extra(name) for name in run.store.extras if name.startswith(_EXTRA)}

@@ -19,9 +19,9 @@ under white may be; details below it are lost, sums are not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import scipy.sparse
@@ -33,7 +33,17 @@ from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Pictures
 AT_ONCE = 16  # patterns of a batch
 _TRUST = 0.1  # relative error of what is subtracted for cells that are lit beside
 
-Take = Callable[[list[np.ndarray]], list[Picture]]
+
+class Source(Protocol):
+    """Where pictures come from, in the order in which they are asked for: `Log`."""
+
+    def announce(self, patterns: Iterable[np.ndarray]) -> None:
+        """All patterns (h, w) of a level, before the first is asked for."""
+        ...
+
+    def take(self, patterns: list[np.ndarray]) -> list[Picture]:
+        """The pictures of the next patterns, `AT_ONCE` at most."""
+        ...
 
 
 class Entries(NamedTuple):
@@ -115,13 +125,13 @@ def most_patterns(cells: Cells) -> int:
     return max(sum(whole), AT_ONCE)
 
 
-def scan(pictures: Pictures, take: Take, threshold: float, sigmas: float) -> Scan:
+def scan(pictures: Pictures, source: Source, threshold: float, sigmas: float) -> Scan:
     """Find the core of T, the white picture of the calibration being its root.
 
     Parameters
     ----------
-    take : function
-        Of some patterns to their pictures, in order; it may have them from an earlier run.
+    source : Source
+        May have pictures from an earlier run.
     threshold : float
         Part of what a camera pixel sees under white, that a cell is divided for.
     sigmas : float
@@ -135,15 +145,12 @@ def scan(pictures: Pictures, take: Take, threshold: float, sigmas: float) -> Sca
         white.value[:, seen].astype(np.float64),
         white.variance[:, seen].astype(np.float64),
     )
-    found, levels = Core(cells, pictures.channels), []
+    found, levels, active = Core(cells, pictures.channels), [], root
     least = threshold * np.maximum(white.value, 0.0)
-    active = root
     for level in range(cells.top, 0, -1):
-        divided = level == cells.top or _much(active, least, sigmas)
-        stays = np.zeros(len(active.cell), bool) if level == cells.top else ~divided
-        found.add(level, active.where(stays))
-        active = active.where(~stays)
-        told, active = _divide(found, level, active, pictures, take)
+        divided = _much(active, least, sigmas) if level < cells.top else np.ones(len(seen), bool)
+        found.add(level, active.where(~divided))
+        told, active = _divide(found, level, active.where(divided), pictures, source)
         levels.append(told)
     found.add(0, active)
     return Scan(found, levels)
@@ -156,48 +163,60 @@ def _much(entries: Entries, least: np.ndarray, sigmas: float) -> np.ndarray:
 
 
 def _divide(
-    found: Core, level: int, parents: Entries, pictures: Pictures, take: Take
+    found: Core, level: int, parents: Entries, pictures: Pictures, source: Source
 ) -> tuple[Level, Entries]:
     """The entries of the children of all parents, by cell."""
-    numbers, starts = np.unique(parents.cell, return_index=True)
-    starts = np.append(starts, len(parents.cell))
-    colours = colour(starts, parents.pixel, len(pictures.seen))
+    numbers, starts, place = np.unique(parents.cell, return_index=True, return_inverse=True)
+    colours = colour(np.append(starts, len(place)), parents.pixel, len(pictures.seen))
     kids = found.cells.children(level, numbers)
-    place = np.repeat(np.arange(len(numbers)), np.diff(starts))  # of each entry among the parents
-    single = np.count_nonzero(kids >= 0, axis=0) == 1  # lit already, as the parent
+    # The only child of a cell at the rim is the cell: it was photographed as that.
+    only = np.count_nonzero(kids >= 0, axis=0) == 1
+    groups = list(_groups(kids, np.where(only, -1, colours)))
+    energy, variance = _measured(found, level, parents, place, kids, groups, pictures, source)
+    own = kids[:, place]
+    copied = only[place]
+    energy, variance = _balanced(energy, variance, parents)
+    energy[:, :, copied] = np.where(own >= 0, 1.0, 0.0)[:, None, copied] * parents.energy[:, copied]
+    variance[:, :, copied] = parents.variance[:, copied]
+    told = Level(level, len(numbers), len(place), int(colours.max(initial=-1)) + 1, len(groups))
+    return told, _children(own, parents.pixel, energy, variance)
+
+
+def _measured(
+    found: Core,
+    level: int,
+    parents: Entries,
+    place: np.ndarray,
+    kids: np.ndarray,
+    groups: list[tuple[int, np.ndarray]],
+    pictures: Pictures,
+    source: Source,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Energy and variance (4, channels, entries) of children; `place`: the parent of each entry."""
     energy = np.zeros((4, *parents.energy.shape))
     variance = np.zeros_like(energy)
-    energy[:, :, single[place]] = np.where((kids[:, place] >= 0)[:, None], parents.energy, 0.0)[
-        :, :, single[place]
-    ]
-    groups = list(_groups(kids, colours, single))
     stored = found.matrices() if found.parts else []
+    source.announce(found.cells.pattern(level - 1, kids[k, members]) for k, members in groups)
     for first in range(0, len(groups), AT_ONCE):
         batch = groups[first : first + AT_ONCE]
         patterns = [found.cells.pattern(level - 1, kids[k, members]) for k, members in batch]
-        for (k, members), pattern, picture in zip(batch, patterns, take(patterns), strict=True):
-            lit = np.zeros(len(numbers), bool)
-            lit[members] = True
-            here = np.flatnonzero(lit[place])
-            e, v = _own_light(picture, pattern, stored, parents.pixel[here], found, pictures)
-            energy[k][:, here], variance[k][:, here] = e, v
-    exact = single[place]
-    balanced, spread = _balanced(energy, variance, parents, exact)
-    children = _children(kids[:, place], parents.pixel, balanced, spread)
-    top = int(colours.max(initial=-1)) + 1
-    return Level(level, len(numbers), len(place), top, len(groups)), children
+        for (k, members), pattern, picture in zip(batch, patterns, source.take(patterns), strict=True):
+            here = np.flatnonzero(np.isin(place, members))
+            pixels = parents.pixel[here]
+            energy[k][:, here], variance[k][:, here] = _own(picture, pattern, stored, pixels, found, pictures)
+    return energy, variance
 
 
-def _groups(kids: np.ndarray, colours: np.ndarray, single: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """(which child, of which parents) to be lit at once."""
+def _groups(kids: np.ndarray, colours: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """(which child, of which parents) to be lit at once; none of the colour -1."""
     for number in range(int(colours.max(initial=-1)) + 1):
         for k in range(4):
-            members = np.flatnonzero((colours == number) & (kids[k] >= 0) & ~single)
+            members = np.flatnonzero((colours == number) & (kids[k] >= 0))
             if len(members):
                 yield k, members
 
 
-def _own_light(
+def _own(
     picture: Picture,
     pattern: np.ndarray,
     stored: list[scipy.sparse.csr_array],
@@ -214,15 +233,11 @@ def _own_light(
     return picture.value[:, pixels] - beside, variance
 
 
-def _balanced(
-    energy: np.ndarray, variance: np.ndarray, parents: Entries, exact: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _balanced(energy: np.ndarray, variance: np.ndarray, parents: Entries) -> tuple[np.ndarray, np.ndarray]:
     """Children that add up to their parent, as far as the noise of either says."""
     rest = energy.sum(axis=0) - parents.energy
-    total = np.maximum(variance.sum(axis=0) + parents.variance, 1e-300)
-    gain = np.where(exact, 0.0, variance / total)
-    spread = np.where(exact, parents.variance, variance * (1.0 - gain))
-    return energy - gain * rest, spread
+    gain = variance / np.maximum(variance.sum(axis=0) + parents.variance, 1e-300)
+    return energy - gain * rest, variance * (1.0 - gain)
 
 
 def _children(kids: np.ndarray, pixel: np.ndarray, energy: np.ndarray, variance: np.ndarray) -> Entries:

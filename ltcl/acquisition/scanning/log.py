@@ -7,7 +7,8 @@ run again from its start with the pictures of the log, to the bit the same, unti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from itertools import islice
 
 import numpy as np
 import scipy.sparse
@@ -31,17 +32,28 @@ class Log:
         self._batches = 0
         self.done = 0
 
+    def announce(self, patterns: Iterable[np.ndarray]) -> None:
+        """Tell the rig of the patterns of the next batches that are not in the store."""
+        number = self._batches
+        while self._written(number):
+            number += 1
+        self._pictures.announce(
+            islice(patterns, (number - self._batches) * self._store.layout.block_rows, None)
+        )
+
+    def _written(self, number: int) -> bool:
+        return all((c, number) in self._store.written for c in range(self._pictures.channels))
+
     def take(self, patterns: list[np.ndarray]) -> list[Picture]:
         """The pictures of the next batch of patterns, as many as a block has at most."""
         number, self._batches = self._batches, self._batches + 1
         if number >= self._store.layout.blocks("columns"):
             raise AcquisitionError(f"the scan asks for more than {number} batches; that is a fault of ltcl")
-        channels = range(self._pictures.channels)
-        if all((c, number) in self._store.written for c in channels):
+        if self._written(number):
             found = self._read(number, len(patterns))
         else:
             found = self._pictures.take(patterns)
-            for c in channels:
+            for c in range(self._pictures.channels):
                 self._write(number, c, found)
         self.done += len(patterns)
         self._tell(self.done)
