@@ -7,7 +7,7 @@
     geometry/   which projector pixel a camera pixel sees: Gray code, phase shift, resampling
     calibration, measuring, exposing    all that is measured once of a set-up, and for how many seconds
     scanning/   which pixels are lit when, and T from the pictures; plan before, report after
-    task        acquire: all of it, into a store, stopped and resumed
+    task, run   acquire: all of it, into a store, stopped and resumed
 
 Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
 """

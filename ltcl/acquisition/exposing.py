@@ -48,7 +48,7 @@ def deepest(shots: Shots, white: float, response: Response) -> float:
 def for_scan(
     shots: Shots, pixel: np.ndarray, white: float, deep: float, response: Response, noise: NoiseModel
 ) -> tuple[float, ...]:
-    """The longest exposure, and one or, of a camera of few levels, two shorter ones (`choose`).
+    """The longest exposure, and one or, of a camera of few levels, two shorter ones, as `choose` has them.
 
     The longest is there for light that is too weak to stand out of one picture, but not out of many.
 
@@ -67,7 +67,7 @@ def for_scan(
         return seconds
     have: Sequence[float] = shots.exposures or offered(shots, deep * 2.0 ** (-np.arange(0, 24) / 2))
     usable = [t for t in have if t <= deep * 1.001]
-    most = 2 if 0 < noise.levels < _FINE else 1
+    most = 3 if 0 < noise.levels < _FINE else 2
     levels = noise.levels or None
     found = choose(probes, seconds, response, noise, snr=_SNR, most=most, exposures=usable, levels=levels)
-    return offered(shots, [*found, deep])
+    return offered(shots, [*(found[:-1] or found), deep])

@@ -40,7 +40,7 @@ from ltcl.acquisition.radiometry import (
     projector,
 )
 from ltcl.acquisition.rig import Shots
-from ltcl.errors import AcquisitionError, InputError, InputTypeError
+from ltcl.errors import AcquisitionError, InputError
 
 Tell = Callable[[str], None]
 _WHITE = 0.7  # of the range, for the brightest pixels under white
@@ -80,7 +80,7 @@ def measure(
 
     Raises
     ------
-    InputError, InputTypeError
+    InputError
         A geometry of other pixels; one exposure only and no response.
     AcquisitionError
         The rig fails; nothing can be decoded; the projector does not shine.
@@ -154,19 +154,15 @@ class _Run:
 
 def _resampling(run: _Run, geometry: str | Correspondence, seconds: float) -> Resampling:
     grid = run.shots.grid
-    if isinstance(geometry, str):
-        if checks.one_of("geometry", geometry, ("graycode", "aligned")) == "graycode":
-            return Resampling.of(measure_geometry(run.shots, grid, seconds=seconds))
+    if geometry == "graycode":
+        return Resampling.of(measure_geometry(run.shots, grid, seconds=seconds))
+    if not isinstance(geometry, Correspondence):
         if run.shots.camera_grid != grid:
             raise InputError(
                 f"geometry is 'aligned', but photographs are {run.shots.camera_grid}; they must be {grid}, "
                 "the projector's pixels"
             )
         return Resampling.aligned(grid)
-    if not isinstance(geometry, Correspondence):
-        raise InputTypeError(
-            f"geometry is a {type(geometry).__name__}; it must be 'graycode', 'aligned' or a Correspondence"
-        )
     if (geometry.grid, geometry.camera_grid) != (grid, run.shots.camera_grid):
         raise InputError(
             f"geometry is from {geometry.camera_grid} to {geometry.grid}; the rig is from "
