@@ -8,18 +8,35 @@ pattern lights and for the weak light everywhere else at once.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from ltcl.acquisition.radiometry import NoiseModel, Response, choose
 from ltcl.acquisition.rig import LONGEST, SHORTEST, Shots
+from ltcl.errors import AcquisitionError, InputError
 
 DEEPEST = 64.0  # times the exposure of white: further in one photograph costs more than it tells
 _AMBIENT = 0.3  # of full scale that light without the projector may take
 _SNR = 10.0  # of the weak light, wanted in one picture; the sum over a picture has far more
 _FINE = 1 << 10  # levels from which two exposures span the range; fewer take three
+
+
+@contextlib.contextmanager
+def telling(what: str) -> Iterator[None]:
+    """What photographs do not tell is a failed acquisition, not a bad argument.
+
+    >>> with telling("the response"):
+    ...     raise InputError("images are black")
+    Traceback (most recent call last):
+    ltcl.errors.AcquisitionError: the response: images are black
+    """
+    try:
+        yield
+    except InputError as error:
+        raise AcquisitionError(f"{what}: {error}") from error
 
 
 def offered(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
@@ -69,5 +86,6 @@ def for_scan(
     usable = [t for t in have if t <= deep * 1.001]
     most = 3 if 0 < noise.levels < _FINE else 2
     levels = noise.levels or None
-    found = choose(probes, seconds, response, noise, snr=_SNR, most=most, exposures=usable, levels=levels)
+    with telling("the exposures"):
+        found = choose(probes, seconds, response, noise, snr=_SNR, most=most, exposures=usable, levels=levels)
     return offered(shots, [*(found[:-1] or found), deep])

@@ -40,7 +40,7 @@ from ltcl.acquisition.radiometry import (
     projector,
 )
 from ltcl.acquisition.rig import Shots
-from ltcl.errors import AcquisitionError, InputError
+from ltcl.errors import InputError
 
 Tell = Callable[[str], None]
 _WHITE = 0.7  # of the range, for the brightest pixels under white
@@ -51,7 +51,7 @@ _QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so th
 _BURST = 6  # photographs that tell the noise
 _CODES = 17  # of the projector's response
 _NEARLY = 254 / 255  # a scan feeds 0 and 1 only, so no photograph of it was taken before
-_AGAIN = 4  # photographs of white
+_AGAIN = 16  # photographs of white
 
 
 def measure(
@@ -113,7 +113,7 @@ def measure(
     offset, ambient = _black(run, response, noise, chosen, frames)
     sensor = (response, noise, offset)
     run.tell("white")
-    white = run.merged(run.white, exposing.offered(shots, [seconds / 2, 2 * seconds]), *sensor, _AGAIN)
+    white = run.merged(run.white, exposing.offered(shots, [seconds / 2, seconds]), *sensor, _AGAIN)
     white = white - ambient
     run.tell("projector")
     light, M = _projector(run, seconds, *sensor)
@@ -187,7 +187,8 @@ def _response(run: _Run, seconds: float) -> Response:
     lit = [*ramps[: 1 if grid[0] * grid[1] >= _MANY else _RAMPS], run.black]
     images = run.take([(codes, t) for t in times for codes in lit])
     beside = [np.hstack(images[k : k + len(lit)]) for k in range(0, len(images), len(lit))]
-    return calibrate(beside, times, levels=run.levels, saturation=_TOP)
+    with exposing.telling("the response of the camera"):
+        return calibrate(beside, times, levels=run.levels, saturation=_TOP)
 
 
 def _bright(run: _Run, response: Response, seconds: float) -> float:
@@ -200,7 +201,8 @@ def _bright(run: _Run, response: Response, seconds: float) -> float:
 def _noise(run: _Run, response: Response, seconds: float, deep: float) -> NoiseModel:
     ramp = _ramp(run.shots.grid)
     bursts = [run.take([(codes, t)] * _BURST) for codes, t in ((ramp, seconds), (run.black, deep))]
-    found = estimate(bursts, response=response, levels=run.levels)
+    with exposing.telling("the noise of the camera"):
+        found = estimate(bursts, response=response, levels=run.levels)
     return replace(found, read=max(found.read, _QUIETEST))
 
 
@@ -221,7 +223,8 @@ def _black(
     times = [t for t in exposures for _ in range(frames)]
     images = run.take([(run.black, t) for t in times])
     if len(exposures) > 1:
-        found = black.measure(images, times, response, noise, levels=run.levels)
+        with exposing.telling("black"):
+            found = black.measure(images, times, response, noise, levels=run.levels)
         return found.offset, found.ambient
     offset = np.zeros(run.shots.channels)  # one exposure does not tell it from ambient light, nor need it
     return offset, merge(images, times, response, noise, levels=run.levels, black=offset)
@@ -239,10 +242,7 @@ def _projector(
         fed = [np.float32(c) * run.white[..., None] * unit for c in codes]
         shown = [part[..., 0] if colours == 1 else part for part in fed]
         pictures.append([run.merged(part, times, response, noise, offset) for part in shown])
-    try:
+    with exposing.telling("the projector"):
         if colours == 1:
             return projector.measure(codes, pictures[0]), None
-        dark = pictures[0][0]
-        return projector.measure(codes, pictures), mixing([part[-1] for part in pictures], dark)
-    except InputError as error:
-        raise AcquisitionError(f"the projector: {error}") from error
+        return projector.measure(codes, pictures), mixing([part[-1] for part in pictures], pictures[0][0])

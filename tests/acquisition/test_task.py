@@ -134,15 +134,15 @@ def test_a_rig_that_fails_again_and_again(tmp_path: Path, strategy: str) -> None
     """Each run gets a little further; the result is that of a run that was never stopped, to the bit."""
     options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy}
     whole = acquire(rig(), store=tmp_path / "whole.zarr", **options)
-    path, failures, at, told = tmp_path / "T.zarr", 0, 300, ""
-    while True:
+    path, failures = tmp_path / "T.zarr", []
+    for at in (100, 280, 200, 10000):  # in the calibration, in the scan, further on, not at all
         try:
             T = acquire(Dying(at), store=path, **options)
             break
         except AcquisitionError as error:
-            failures, at, told = failures + 1, max(60, at - 7), str(error)
-    assert failures >= 2
-    assert "unplugged" in told
+            failures.append(str(error))
+    assert len(failures) >= 2
+    assert all("unplugged" in text for text in failures)
     np.testing.assert_array_equal(dense(T), dense(whole))
     BlockStore.open(path).verify()
 
