@@ -148,8 +148,9 @@ class _Run:
     ) -> Radiance:
         """What the camera sees under `codes`, the ambient light still in it."""
         times = [t for t in seconds for _ in range(again)]
-        images = self.take([(codes, t) for t in times])
-        return merge(images, times, response, noise, levels=self.levels, black=offset)
+        images, last = self.take([(codes, t) for t in times]), self.shots.count
+        with exposing.telling(f"photographs {last + 1 - len(images)} to {last}"):
+            return merge(images, times, response, noise, levels=self.levels, black=offset)
 
 
 def _resampling(run: _Run, geometry: str | Correspondence, seconds: float) -> Resampling:

@@ -289,6 +289,23 @@ def _photograph_all(scene: VirtualRig, folder: Path, cv2: Any) -> None:
         cv2.imwrite(str(target), (image.astype(np.uint16) * 16))
 
 
+class Swapping(VirtualRig):
+    """Gives the long exposures for the short ones, from some photograph on."""
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        if codes.sum() in (1.0, 2.0) and codes.max() == 1.0:
+            seconds = 1.0 / seconds
+        return super().photograph(codes, seconds)
+
+
+def test_exposures_in_the_wrong_order_are_named() -> None:
+    made = Swapping(corner(4), (4, 8), bits=12, ambient=0.05)
+    with pytest.raises(
+        AcquisitionError, match=r"photographs \d+ to \d+: images\[\d\] has .* is not brighter"
+    ):
+        acquire(made, geometry="aligned", strategy="pixel")
+
+
 def test_progress_is_told() -> None:
     told: list[tuple[int, int]] = []
     acquire(rig(4), geometry="aligned", strategy="hadamard", progress=lambda *n: told.append(n))

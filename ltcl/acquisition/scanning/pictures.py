@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.exposing import telling
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.scanning.block import Blocks
@@ -79,7 +80,11 @@ class Pictures:
     def _picture(self, images: list[np.ndarray]) -> Picture:
         told = self.calibration
         levels = told.noise.levels or None
-        merged = merge(images, told.exposures, told.response, told.noise, levels=levels, black=told.offset)
+        last = self.shots.count
+        with telling(f"photographs {last + 1 - len(images)} to {last}"):
+            merged = merge(
+                images, told.exposures, told.response, told.noise, levels=levels, black=told.offset
+            )
         lit = self._on_grid(merged)
         variance = np.where(lit.variance < UNKNOWN, lit.variance / self._scale**2, UNKNOWN)
         known = (variance < UNKNOWN) & (self._dark.variance < UNKNOWN)
