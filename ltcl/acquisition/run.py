@@ -21,10 +21,8 @@ from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.scanning import adaptive, columns, core, plan
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.columns import Code
-from ltcl.acquisition.scanning.hadamard import Hadamard
 from ltcl.acquisition.scanning.log import Log
 from ltcl.acquisition.scanning.pictures import Pictures
-from ltcl.acquisition.scanning.pixel import Pixels
 from ltcl.errors import InputError
 from ltcl.store import BlockStore, zarr_folder
 from ltcl.store.compressed import Parts
@@ -61,7 +59,7 @@ class Run:
     @property
     def code(self) -> Code:
         """How batches are lit, where columns are scanned."""
-        return _code(self.strategy, self.wanted, self.pictures.grid)
+        return columns.code_of(self.strategy, self.pictures.grid, self.wanted.order)
 
 
 def begin(
@@ -135,14 +133,6 @@ def _plans(shots: Shots, told: Calibration, wanted: Settings) -> dict[str, plan.
     )
 
 
-def _code(strategy: str, wanted: Settings, grid: tuple[int, int]) -> Code:
-    """Two batches at least, so that no pattern is white, which the calibration has photographed already."""
-    half = max(1, grid[0] * grid[1] // 2)
-    if strategy == "hadamard":
-        return Hadamard(min(wanted.order, (1 << half.bit_length() - 1) - 1 or 1))
-    return Pixels(min(Pixels().size, half))
-
-
 def _create(path: Path, pictures: Pictures, strategy: str, wanted: Settings) -> BlockStore:
     h, w = pictures.grid
     told = {"acquisition": {**pictures.shots.describe(), **_plain(wanted)}}
@@ -156,7 +146,7 @@ def _create(path: Path, pictures: Pictures, strategy: str, wanted: Settings) -> 
         most = adaptive.most_patterns(Cells((h, w)))
         sizes = {"shape": (h * w, most), "grid": (1, most), "camera_grid": (h, w)}
         return BlockStore.create(path, **sizes, block_rows=adaptive.AT_ONCE, **common)
-    rows = _code(strategy, wanted, (h, w)).size
+    rows = columns.code_of(strategy, (h, w), wanted.order).size
     return BlockStore.create(path, shape=(h * w, h * w), grid=(h, w), block_rows=rows, **common)
 
 

@@ -14,7 +14,9 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.scanning import thresholds
+from ltcl.acquisition.scanning.hadamard import Hadamard
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Pictures
+from ltcl.acquisition.scanning.pixel import Pixels
 from ltcl.store import BlockStore
 
 
@@ -41,10 +43,23 @@ class Code(Protocol):
         ...
 
 
+def code_of(strategy: str, grid: tuple[int, int], order: int) -> Code:
+    """The code of a strategy: `Hadamard` of "hadamard", else `Pixels`.
+
+    Two batches at least, so that no pattern is white, which the calibration has photographed already.
+
+    >>> code_of("hadamard", (64, 64), 63), code_of("pixel", (4, 4), 63)
+    (Hadamard(size=63), Pixels(size=8))
+    """
+    half = max(1, grid[0] * grid[1] // 2)
+    if strategy == "hadamard":
+        return Hadamard(min(order, max(1, (1 << (half.bit_length() - 1)) - 1)))
+    return Pixels(min(Pixels().size, half))
+
+
 def patterns(code: Code, n: int) -> int:
     """Patterns for n pixels.
 
-    >>> from ltcl.acquisition.scanning.pixel import Pixels
     >>> patterns(Pixels(4), 10)
     13
     """

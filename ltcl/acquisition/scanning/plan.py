@@ -28,8 +28,6 @@ from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.scanning import adaptive, columns
 from ltcl.acquisition.scanning.block import Blocks
 from ltcl.acquisition.scanning.cells import Cells
-from ltcl.acquisition.scanning.hadamard import Hadamard
-from ltcl.acquisition.scanning.pixel import Pixels
 
 STRATEGIES = ("adaptive", "pixel", "block", "hadamard")
 MANY = 2048  # pixels from which one at a time, or as many patterns, take too long
@@ -131,22 +129,14 @@ def plans(
     """
     noise, light = noise or NoiseModel(), light or Light()
     run = _Run(grid, tuple(exposures), noise, light, channels, overhead)
-    coarse = Blocks(grid, min(block, max(grid))).grid
-    one = f"{Pixels().size} pixels and their sum a batch"
-    return {
-        "adaptive": run.plan(
-            "adaptive", grid, _cells(grid, light, threshold), "cells divided where it tells"
-        ),
-        "pixel": run.plan("pixel", grid, columns.patterns(Pixels(), grid[0] * grid[1]), one),
-        "block": run.plan("block", coarse, columns.patterns(Pixels(), coarse[0] * coarse[1]), one),
-        "hadamard": run.plan(
-            "hadamard",
-            grid,
-            columns.patterns(Hadamard(order), grid[0] * grid[1]),
-            f"{order} pixels a batch",
-            order,
-        ),
-    }
+    coarse, whys = Blocks(grid, min(block, max(grid))).grid, {"adaptive": "cells divided where it tells"}
+    sizes = {"adaptive": (grid, _cells(grid, light, threshold), 1)}
+    for name, pixels in (("pixel", grid), ("block", coarse), ("hadamard", grid)):
+        code = columns.code_of(name, pixels, order)
+        lit = code.size if name == "hadamard" else 1
+        sizes[name] = (pixels, columns.patterns(code, pixels[0] * pixels[1]), lit)
+        whys[name] = f"{code.size} pixels a batch" + (", and their sum" if lit == 1 else "")
+    return {name: run.plan(name, *sizes[name], whys[name]) for name in STRATEGIES}
 
 
 def measured(told: Calibration) -> Light:
@@ -197,7 +187,7 @@ class _Run:
     channels: int
     overhead: float
 
-    def plan(self, name: str, grid: tuple[int, int], patterns: int, why: str, order: int = 1) -> Plan:
+    def plan(self, name: str, grid: tuple[int, int], patterns: int, order: int, why: str) -> Plan:
         n, most = grid[0] * grid[1], len(self.exposures)
         # A block is as bright on its own pixels as one pixel, and sends that much more to the others.
         indirect, direct = self.light.indirect / n, self.light.direct

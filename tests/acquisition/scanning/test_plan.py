@@ -52,7 +52,7 @@ def test_photographs_time_and_disk() -> None:
     found = plans(GRID, (0.5, 8.0), block=4, overhead=0.25)
     assert {name: one.patterns for name, one in found.items() if name != "adaptive"} == {
         "pixel": 256 + 4,
-        "block": 16 + 1,
+        "block": 16 + 2,
         "hadamard": 4 * 63 + 7,
     }
     for one in found.values():
