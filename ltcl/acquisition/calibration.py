@@ -22,7 +22,7 @@ class Calibration:
     Attributes
     ----------
     exposures : tuple of float
-        Seconds of each photograph of the scan, ascending.
+        Seconds of the photographs of each pattern, ascending.
     response : Response
         Of the camera.
     noise : NoiseModel

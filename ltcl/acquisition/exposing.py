@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ltcl.acquisition.radiometry import NoiseModel, Response, choose
+from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import LONGEST, SHORTEST, Shots
 from ltcl.errors import AcquisitionError, InputError
 
 DEEPEST = 64.0  # times the exposure of white: further in one photograph costs more than it tells
 _AMBIENT = 0.3  # of full scale that light without the projector may take
-_SNR = 10.0  # of the weak light, wanted in one picture; the sum over a picture has far more
-_FINE = 1 << 10  # levels from which two exposures span the range; fewer take three
+WHITE = 0.7  # of the range, for the brightest pixels under white
+_SNR, _MOST = 100.0, 3  # of these, and photographs at most to reach it
+_FINE = 1 << 10  # levels from which two exposures span the range; fewer take one in between
 
 
 @contextlib.contextmanager
@@ -62,30 +63,25 @@ def deepest(shots: Shots, white: float, response: Response) -> float:
     return offered(shots, [min(most, _AMBIENT / light) if light * most > _AMBIENT else most])[0]
 
 
-def for_scan(
-    shots: Shots, pixel: np.ndarray, white: float, deep: float, response: Response, noise: NoiseModel
-) -> tuple[float, ...]:
-    """The longest exposure, and one or, of a camera of few levels, two shorter ones, as `choose` has them.
+def for_scan(shots: Shots, white: float, deep: float, noise: NoiseModel) -> tuple[float, ...]:
+    """The exposures of every pattern: that of white, again where one has too much noise; the longest.
 
-    The longest is there for light that is too weak to stand out of one picture, but not out of many.
+    A camera of few levels takes one in between. The longest is there for light that is too weak to stand out
+    of one picture, but not out of many.
 
     Parameters
     ----------
-    pixel : (h, w)
-        Codes that light one pixel: of its picture the dark is told, of a white one the bright.
     white, deep : float
-        Seconds for white; the longest.
+        Seconds at which white fills `WHITE` of the range; the longest.
+
+    Examples
+    --------
+    >>> from ltcl.acquisition import VirtualRig
+    >>> rig = VirtualRig(np.eye(1), (1, 1))
+    >>> for_scan(Shots(rig), 0.5, 8.0, NoiseModel(electrons=10000.0, levels=256))
+    (0.5, 0.5, 2.0, 8.0)
     """
-    seconds = offered(shots, [white, deep])
-    lit = [np.ones(shots.grid, np.float32), pixel]
-    shots.prepare([(codes, t) for t in seconds for codes in lit])
-    probes = [np.hstack([shots.photograph(codes, t) for codes in lit]) for t in seconds]
-    if len(seconds) == 1:
-        return seconds
-    have: Sequence[float] = shots.exposures or offered(shots, deep * 2.0 ** (-np.arange(0, 24) / 2))
-    usable = [t for t in have if t <= deep * 1.001]
-    most = 3 if 0 < noise.levels < _FINE else 2
-    levels = noise.levels or None
-    with telling("the exposures"):
-        found = choose(probes, seconds, response, noise, snr=_SNR, most=most, exposures=usable, levels=levels)
-    return offered(shots, [*(found[:-1] or found), deep])
+    again = math.ceil(_SNR**2 * float(noise.variance(WHITE)) / WHITE**2)
+    between = [math.sqrt(white * deep)] if 0 < noise.levels < _FINE else []
+    short, *longer = offered(shots, [white, *between, deep])
+    return (*[short] * min(again, _MOST), *longer)

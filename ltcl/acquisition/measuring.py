@@ -43,14 +43,12 @@ from ltcl.acquisition.rig import Shots
 from ltcl.errors import InputError
 
 Tell = Callable[[str], None]
-_WHITE = 0.7  # of the range, for the brightest pixels under white
 _BRACKET, _SPAN = 8, 16.0  # exposures to find the response from, and how far from that of white
 _RAMPS, _MANY = 4, 4096  # scenes of them where there are fewer pixels
 _TOP = 0.995  # of the codes: the unit of a curve is what it reaches at the last one
 _QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so that weights are finite
 _BURST = 6  # photographs that tell the noise
 _CODES = 17  # of the projector's response
-_NEARLY = 254 / 255  # a scan feeds 0 and 1 only, so no photograph of it was taken before
 _AGAIN = 16  # photographs of white
 
 
@@ -107,8 +105,9 @@ def measure(
     noise = _noise(run, response, seconds, deep)
     run.tell("exposures")
     if exposures is None:
-        exposures = exposing.for_scan(shots, _pixel(run, R, seconds), seconds, deep, response, noise)
-    chosen = exposing.offered(shots, [float(t) for t in exposures])
+        chosen = exposing.for_scan(shots, seconds, deep, noise)
+    else:
+        chosen = tuple(exposing.offered(shots, [float(t)])[0] for t in sorted(exposures))
     run.tell("black")
     offset, ambient = _black(run, response, noise, chosen, frames)
     sensor = (response, noise, offset)
@@ -196,34 +195,24 @@ def _bright(run: _Run, response: Response, seconds: float) -> float:
     """The exposure at which white fills most of the range."""
     (image,) = run.take([(run.white, seconds)])
     level = float(np.quantile(response.linear(image), 0.999))
-    return exposing.offered(run.shots, [seconds * _WHITE / max(level, 0.01)])[-1]
+    return exposing.offered(run.shots, [seconds * exposing.WHITE / max(level, 0.01)])[-1]
 
 
 def _noise(run: _Run, response: Response, seconds: float, deep: float) -> NoiseModel:
     ramp = _ramp(run.shots.grid)
-    bursts = [run.take([(codes, t)] * _BURST) for codes, t in ((ramp, seconds), (run.black, deep))]
+    scenes = ((ramp, seconds), (run.black, seconds), (run.black, deep))
+    bursts = [run.take([(codes, t)] * _BURST) for codes, t in scenes]
     with exposing.telling("the noise of the camera"):
         found = estimate(bursts, response=response, levels=run.levels)
     return replace(found, read=max(found.read, _QUIETEST))
 
 
-def _pixel(run: _Run, R: Resampling, seconds: float) -> np.ndarray:
-    """Codes that light one pixel of middling brightness."""
-    images = run.take([(run.white, seconds), (run.black, seconds)])
-    lit = R.apply(images[0] - images[1]).reshape(*run.shots.grid, -1).mean(axis=2)
-    seen = np.flatnonzero(R.seen)
-    order = seen[np.argsort(lit.ravel()[seen], kind="stable")]
-    codes = np.zeros(run.shots.grid, np.float32)
-    codes.flat[order[len(order) // 2]] = _NEARLY
-    return codes
-
-
 def _black(
     run: _Run, response: Response, noise: NoiseModel, exposures: tuple[float, ...], frames: int
 ) -> tuple[np.ndarray, Radiance]:
-    times = [t for t in exposures for _ in range(frames)]
+    times = [t for t in sorted(set(exposures)) for _ in range(frames)]
     images = run.take([(run.black, t) for t in times])
-    if len(exposures) > 1:
+    if times[0] < times[-1]:
         with exposing.telling("black"):
             found = black.measure(images, times, response, noise, levels=run.levels)
         return found.offset, found.ambient

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,7 @@ from ltcl.store import BlockStore
 from .scanning.helpers import CLEAN, corner, dense, off, rig, unit
 
 GRID = (8, 16)
+ROOT = Path(__file__).resolve().parents[2]
 STRATEGIES = ("pixel", "hadamard", "adaptive")
 
 
@@ -147,20 +151,19 @@ def test_a_rig_that_fails_again_and_again(tmp_path: Path, strategy: str) -> None
     BlockStore.open(path).verify()
 
 
+def dying(at: int, path: str, strategy: str) -> None:
+    """An acquisition in a process of its own, ended without a chance to clean up."""
+    acquire(Dying(at, kill=True), geometry="aligned", strategy=strategy, store=path)
+
+
 @pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
 def test_killed_at_random_photographs(tmp_path: Path, strategy: str) -> None:
     options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy}
     whole = dense(acquire(rig(), store=tmp_path / "whole.zarr", **options))
     rng, path = np.random.default_rng(2), tmp_path / "T.zarr"
-    for _ in range(5):
-        child = os.fork()
-        if child == 0:
-            try:
-                acquire(Dying(int(rng.integers(20, 500)), kill=True), store=path, **options)
-            finally:
-                os._exit(1)
-        os.waitpid(child, 0)
-        rng.integers(20, 500)  # as the child did
+    for at in rng.integers(20, 450, 3):
+        code = f"from tests.acquisition.test_task import dying; dying({at}, {str(path)!r}, {strategy!r})"
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False)
         if path.exists():
             BlockStore.open(path).verify()
     T = acquire(rig(), store=path, **options)
@@ -324,3 +327,27 @@ def test_auto_says_why(tmp_path: Path) -> None:
     assert told.defect < 0.3
     for line in (told.to_json(), str(told)):
         assert told.strategy in line
+
+
+def test_a_pixel_that_every_exposure_saturates(tmp_path: Path) -> None:
+    """It is not told: masked, its entry of unknown variance; the others are as they are."""
+    T = 0.02 * np.eye(32)
+    T[5, 5] = 5.0
+    made, path = VirtualRig(T, (4, 8), bits=12), tmp_path / "T.zarr"
+    found = acquire(made, geometry="aligned", strategy="pixel", exposures=[4.0, 8.0], store=path)
+    assert np.flatnonzero(found.masked).tolist() == [5]
+    told = Report.of(path)
+    assert told.masked == 1 / 32
+    assert told.unknown > 0
+    np.testing.assert_allclose(np.delete(found.first_bounce, 5), 0.02, rtol=0.1)
+
+
+def test_what_a_report_does_not_know_is_null() -> None:
+    part: dict[str, Any] = {"coverage": 1.0, "masked": 0.0, "saturated": 0.0, "entries": 9, "unknown": 0.0}
+    told = Report(
+        "pixel", "as asked for", (4, 8), 1, 36, 72, [0.1, 2.0], **part, noise_direct=0.01, noise_sum=0.02,
+        defect=float("nan"), levels=[{"level": 1, "cells": 2, "entries": 8, "colours": 2, "patterns": 8}],
+    )  # fmt: skip
+    assert json.loads(told.to_json())["defect"] is None
+    assert "reciprocity not told" in str(told)
+    assert "in 2 group(s) without conflict" in str(told)
