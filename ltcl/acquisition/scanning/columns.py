@@ -109,10 +109,11 @@ def _lit(grid: tuple[int, int], code: Code, store: BlockStore, block: int) -> It
 def _sparse(
     x: np.ndarray, v: np.ndarray, pictures: Pictures, sigmas: float
 ) -> tuple[scipy.sparse.csr_array, np.ndarray]:
-    """What of columns (k, M) is kept, and its variance, NaN where only others told it."""
+    """What of columns (k, M) is kept, and its variance; 0, and NaN, where nothing told it."""
     kept = thresholds.keep(x, v, pictures.grid, sigmas) & pictures.seen
     ends = np.concatenate([[0], np.cumsum(np.count_nonzero(kept, axis=1))])
-    values = x[kept].astype(np.float32)
-    matrix = scipy.sparse.csr_array((values, np.nonzero(kept)[1].astype(np.int32), ends), shape=x.shape)
     variance = v[kept]
-    return matrix, np.where(variance < 1e-3 * UNKNOWN, variance, np.nan)
+    known = variance < 1e-3 * UNKNOWN
+    values = np.where(known, x[kept], 0.0).astype(np.float32)
+    matrix = scipy.sparse.csr_array((values, np.nonzero(kept)[1].astype(np.int32), ends), shape=x.shape)
+    return matrix, np.where(known, variance, np.nan)

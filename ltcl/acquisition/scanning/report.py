@@ -43,7 +43,7 @@ class Report:
     entries : int
         Kept, of all channels.
     unknown : float
-        Part of them that no photograph tells: others of their batch do.
+        Part of them that no photograph tells, such as pixels that all exposures saturate; they are 0.
     noise_direct, noise_sum : float
         Median relative standard deviation of the first bounce, and of what white shows.
     defect : float
@@ -114,7 +114,7 @@ class Report:
             f"{self.photographs} photographs: {self.patterns} patterns at "
             + ", ".join(f"{t:.3g} s" for t in self.exposures),
             f"seen {self.coverage:.1%}, masked {self.masked:.2%}, saturated {self.saturated:.2%}",
-            f"{self.entries} entries kept, {self.unknown:.2%} of them told by others only",
+            f"{self.entries} entries kept, {self.unknown:.2%} of them not told by any photograph",
             f"noise of the first bounce {self.noise_direct:.2%}, of what white shows {self.noise_sum:.2%}",
             "reciprocity not told" if np.isnan(self.defect) else f"reciprocity defect {self.defect:.2g}",
         ]
