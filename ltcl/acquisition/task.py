@@ -98,12 +98,12 @@ def acquire(
 
     Examples
     --------
-    >>> import ltcl
+    >>> import ltcl, numpy
     >>> from ltcl.acquisition import VirtualRig
     >>> truth = ltcl.scenes.dihedral(4, albedo=0.6).transport()
     >>> rig = VirtualRig(truth, truth.grid, bits=12, ambient=0.01)
     >>> T = acquire(rig, geometry="aligned", strategy="pixel")
-    >>> p = np.full(truth.grid, 0.5)
+    >>> p = numpy.full(truth.grid, 0.5)
     >>> bool(abs(T @ p - truth @ p).max() < 0.02)
     True
     """

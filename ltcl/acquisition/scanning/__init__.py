@@ -7,6 +7,7 @@ pixel, hadamard    how the pixels of a batch are lit, and its columns found
 columns            batches of columns into a store
 thresholds         which entries are light, which noise; sums are tested
 adaptive           cells of a quad-tree (cells), those lit together that do not conflict (colouring)
+log                pictures in the order in which a scan asked for them, in a store
 core               what an adaptive scan found, as a compressed transport
 plan, report       what a scan takes, before; what came of it, after
 """

@@ -29,6 +29,7 @@ import scipy.sparse
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.colouring import colour
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Pictures
+from ltcl.acquisition.scanning.pixel import all_but_one
 
 AT_ONCE = 16  # patterns of a batch
 _TRUST = 0.1  # relative error of what is subtracted for cells that are lit beside
@@ -236,8 +237,9 @@ def _own(
 def _balanced(energy: np.ndarray, variance: np.ndarray, parents: Entries) -> tuple[np.ndarray, np.ndarray]:
     """Children that add up to their parent, as far as the noise of either says."""
     rest = energy.sum(axis=0) - parents.energy
-    gain = variance / np.maximum(variance.sum(axis=0) + parents.variance, 1e-300)
-    return energy - gain * rest, variance * (1.0 - gain)
+    others = all_but_one(variance) + parents.variance
+    total = np.maximum(variance + others, 1e-300)
+    return energy - variance / total * rest, variance / total * others
 
 
 def _children(kids: np.ndarray, pixel: np.ndarray, energy: np.ndarray, variance: np.ndarray) -> Entries:

@@ -64,7 +64,7 @@ def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray
 
 def diagonal(cells: Cells, C: scipy.sparse.csr_array) -> np.ndarray:
     """diag(C W), (N,): of each pixel the cells that it is in, on all levels."""
-    pixels = np.arange(C.shape[0])
+    pixels = np.arange(cells.grid[0] * cells.grid[1])
     parts = [C[pixels, cells.of_pixels(level)] for level in range(cells.top + 1)]
     return np.sum([part.toarray() if scipy.sparse.issparse(part) else part for part in parts], axis=0)
 
@@ -74,5 +74,7 @@ def between(cells: Cells, C: scipy.sparse.csr_array, pixels: np.ndarray) -> np.n
     levels = range(cells.top + 1)
     of = np.stack([cells.of_pixels(level)[pixels] for level in levels])
     one = np.broadcast_to(np.arange(len(pixels)), of.shape)
-    W = scipy.sparse.csr_array((np.ones(of.size), (of.ravel(), one.ravel())), shape=(C.shape[1], len(pixels)))
+    W = scipy.sparse.csr_array(
+        (np.ones(of.size), (of.ravel(), one.ravel())), shape=(cells.offsets[-1], len(pixels))
+    )
     return (C[pixels] @ W).toarray()

@@ -76,4 +76,4 @@ class Hadamard:
 
 
 def _matrix(n: int) -> np.ndarray:
-    return scipy.linalg.hadamard(n + 1, dtype=np.int8)[1:, 1:] < 0
+    return scipy.linalg.hadamard(n + 1)[1:, 1:] < 0

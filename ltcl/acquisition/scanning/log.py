@@ -63,7 +63,8 @@ class Log:
         blocks = [self._store.block(c, number, "columns") for c in range(self._pictures.channels)]
         rows, pixels = self._store.layout.block_shape(number, "columns")
         value = np.stack([block.matrix.data.reshape(-1, pixels) for block in blocks], axis=1)
-        variance = np.stack([np.reshape(block.variance, (-1, pixels)) for block in blocks], axis=1)
+        known = [block.variance for block in blocks if block.variance is not None]
+        variance = np.stack([part.reshape(-1, pixels) for part in known], axis=1)
         if len(value) != count or count > rows:
             raise AcquisitionError(
                 f"{self._store.path} holds {len(value)} pictures in batch {number}, but {count} are asked "

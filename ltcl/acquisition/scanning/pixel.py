@@ -63,6 +63,19 @@ class Pixels:
         x, v, B = value[:-1].astype(np.float64), variance[:-1].astype(np.float64), len(value) - 1
         shared = (B - 1) * ambient
         rest = x.sum(axis=0) - value[-1]
-        R = np.maximum(v.sum(axis=0) + variance[-1] + (B - 1) * shared, 1e-300)
-        gain = (v + shared) / R
-        return x - gain * rest, np.maximum(v + ambient - gain * (v + shared), 0.0)
+        others = all_but_one(v) + variance[-1] + (B - 1) * shared  # R = v_j + others
+        R = np.maximum(v + others, 1e-300)
+        spread = v / R * (others + ambient - 2 * shared) + (ambient * others - shared**2) / R
+        return x - (v + shared) / R * rest, np.maximum(spread, 0.0)
+
+
+def all_but_one(v: np.ndarray) -> np.ndarray:
+    """Sums over the first axis without the entry itself, exact where that is larger than all others.
+
+    >>> all_but_one(np.array([1.0, 1e12, 2.0])).tolist()
+    [1000000000002.0, 3.0, 1000000000001.0]
+    """
+    none = np.zeros_like(v[:1])
+    before = np.cumsum(np.concatenate([none, v[:-1]]), axis=0)
+    behind = np.cumsum(np.concatenate([none, v[:0:-1]]), axis=0)[::-1]
+    return before + behind

@@ -51,6 +51,16 @@ class Report:
     levels : list of dict
         Of an adaptive scan: cells that were divided on each level, their entries, colours (cells of one
         colour do not conflict), patterns.
+
+    Examples
+    --------
+    >>> import tempfile, ltcl
+    >>> from ltcl.acquisition import VirtualRig
+    >>> rig, store = VirtualRig(np.eye(64) / 2, (8, 8), bits=12), f"{tempfile.mkdtemp()}/T.zarr"
+    >>> T = ltcl.acquire(rig, geometry="aligned", strategy="adaptive", store=store)
+    >>> told = Report.of(store)
+    >>> told.patterns, told.coverage, [level["colours"] for level in told.levels]
+    (12, 1.0, [1, 1, 1])
     """
 
     strategy: str

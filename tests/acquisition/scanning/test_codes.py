@@ -8,6 +8,7 @@ import pytest
 
 from ltcl.acquisition.scanning import Hadamard, Pixels
 from ltcl.acquisition.scanning.columns import patterns
+from ltcl.acquisition.scanning.pictures import UNKNOWN
 from ltcl.errors import InputError
 
 
@@ -33,6 +34,13 @@ def test_one_at_a_time_is_generalised_least_squares():
     found, variance = Pixels(B).decode(y[:, None], v[:, None], np.array([a]))
     np.testing.assert_allclose(found[:, 0], C @ A.T @ K @ y, rtol=1e-9)
     np.testing.assert_allclose(variance[:, 0], np.diag(C), rtol=1e-9)
+
+
+def test_a_column_that_no_photograph_tells_is_told_by_the_sum():
+    x, v = np.array([0.3, 0.0, 0.1]), np.array([1e-6, UNKNOWN, 1e-6, 4e-6])
+    found, variance = Pixels(3).decode(np.append(x, 0.9)[:, None], v[:, None], np.zeros(1))
+    assert found[1, 0] == pytest.approx(0.9 - 0.3 - 0.1, rel=1e-6)
+    assert variance[1, 0] == pytest.approx(6e-6, rel=1e-6)
 
 
 @pytest.mark.parametrize("pixels", [3, 7, 31])

@@ -32,7 +32,7 @@ def test_signal_over_noise_is_that_of_columns(camera: str, ambient: float) -> No
     for code, name in ((Pixels(), "pixel"), (Hadamard(), "hadamard")):
         S = code.patterns(code.size).astype(float)
         L = S @ np.full((code.size, 2000), weak)
-        precision = sum(t**2 / noise.variance((L + ambient) * t) for t in exposures)
+        precision = np.sum([t**2 / noise.variance((L + ambient) * t) for t in exposures], axis=0)
         y = L + rng.standard_normal(L.shape) / np.sqrt(precision)
         x, _ = code.decode(y, 1.0 / precision, np.zeros(2000))
         assert found[name].snr_indirect == pytest.approx(weak / np.std(x - weak), rel=0.06)
