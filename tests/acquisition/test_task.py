@@ -285,7 +285,7 @@ def _photograph_all(scene: VirtualRig, folder: Path) -> None:
         target = folder / f"{save}.png"
         if target.exists():
             continue
-        codes = cv2.imread(str(folder / pattern), cv2.IMREAD_UNCHANGED).astype(np.float32)
+        codes = np.asarray(cv2.imread(str(folder / pattern), cv2.IMREAD_UNCHANGED), np.float32)
         codes /= 65535 if codes.max() > 255 else 255
         image = scene.photograph(codes, float(seconds))
         cv2.imwrite(str(target), (image.astype(np.uint16) * 16))
