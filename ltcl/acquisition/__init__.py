@@ -14,10 +14,11 @@ Codes in [0, 1] are what a projector is fed and what a camera gives; they are no
 
 from __future__ import annotations
 
+from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.rigs import FolderRig, VirtualRig
 from ltcl.acquisition.scanning.report import Report
 from ltcl.acquisition.task import acquire
 
-__all__ = ["Correspondence", "FolderRig", "Report", "Rig", "Shots", "VirtualRig", "acquire"]
+__all__ = ["Calibration", "Correspondence", "FolderRig", "Report", "Rig", "Shots", "VirtualRig", "acquire"]

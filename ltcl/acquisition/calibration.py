@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,7 +12,11 @@ import scipy.sparse
 
 from ltcl.acquisition.geometry import Resampling
 from ltcl.acquisition.radiometry import NoiseModel, ProjectorResponse, Radiance, Response
+from ltcl.errors import FileError
+from ltcl.store import BlockStore
 
+PREFIX = "calibration."
+"""Of the names of the extra arrays that a calibration is kept in."""
 _SENSOR = ("electrons", "read", "black", "saturation", "levels")
 
 
@@ -74,6 +79,29 @@ class Calibration:
             found[f"{name}.value"], found[f"{name}.valid"] = picture.value, picture.valid
             found[f"{name}.variance"] = np.where(picture.valid, picture.variance, np.float32(0.0))
         return found
+
+    @classmethod
+    def of(cls, store: str | os.PathLike[str] | BlockStore) -> Calibration:
+        """That of a store which `ltcl.acquire` made, or of the folder of one.
+
+        `Calibration.of(path).projector.codes(pattern)` is what the projector is fed for a pattern of linear
+        light, such as `ltcl.compensate` finds.
+
+        Raises
+        ------
+        FileError
+            There is none, or it is damaged.
+        """
+        found = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        names = [name for name in found.extras if name.startswith(PREFIX)]
+        if not names:
+            raise FileError(f"{found.path}: holds no calibration; ltcl.acquire writes one")
+        return cls.from_arrays({name.removeprefix(PREFIX): found.extra(name) for name in names})
+
+    def write(self, store: BlockStore) -> None:
+        """Commit it to a store, as extra arrays."""
+        for name, array in self.to_arrays().items():
+            store.extra(PREFIX + name, array)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Calibration:

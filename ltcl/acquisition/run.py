@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ltcl.acquisition import measuring
-from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.calibration import PREFIX, Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Shots
@@ -30,7 +30,6 @@ from ltcl.store.compressed import Parts
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
-_EXTRA = "calibration."
 
 
 @dataclass(frozen=True)
@@ -81,8 +80,7 @@ def begin(
     logger.info("%s (%s)", plans[strategy], why)
     pictures = Pictures(shots, told, wanted.block if strategy == "block" else 1)
     store = _create(path, pictures, strategy, wanted)
-    for name, array in told.to_arrays().items():
-        store.extra(_EXTRA + name, array)
+    told.write(store)
     if told.mixing is not None:
         store.extra("mixing", told.mixing)
     facts = {"settings": _plain(wanted), "why": why, "plan": asdict(plans[strategy])}
@@ -100,7 +98,7 @@ def refuse_other(found: BlockStore, shots: Shots, wanted: Settings) -> None:
             f"{name} is {asked[name]!r}, but {found.path} was begun with {made.get(name)!r}; it must be "
             "that, or another store"
         )
-    grid, channels = found.extra(_EXTRA + "resampling.coverage").shape, found.layout.channels
+    grid, channels = found.extra(PREFIX + "resampling.coverage").shape, found.layout.channels
     if (grid, channels) != (shots.grid, shots.channels):
         raise InputError(
             f"rig has {shots.grid} pixels and {shots.channels} channel(s), but {found.path} was begun with "
@@ -110,10 +108,7 @@ def refuse_other(found: BlockStore, shots: Shots, wanted: Settings) -> None:
 
 def resumed(found: BlockStore, shots: Shots, wanted: Settings) -> Run:
     """Go on with the calibration that is in the store."""
-    arrays = {
-        name.removeprefix(_EXTRA): found.extra(name) for name in found.extras if name.startswith(_EXTRA)
-    }
-    told = Calibration.from_arrays(arrays)
+    told = Calibration.of(found)
     strategy = found.attributes["strategy"]
     pictures = Pictures(shots, told, wanted.block if strategy == "block" else 1)
     return Run(found, pictures, wanted, strategy)
@@ -175,7 +170,7 @@ def _scan_cells(run: Run, progress: Progress) -> None:
     found = adaptive.scan(run.pictures, log, run.wanted.threshold, run.wanted.sigmas)
     mixing = run.pictures.calibration.mixing
     arrays = core.arrays(found.core, mixing)
-    beside = {name: run.store.extra(name) for name in run.store.extras if name.startswith(_EXTRA)}
+    beside = {name: run.store.extra(name) for name in run.store.extras if name.startswith(PREFIX)}
     facts = run.store.attributes | {
         "patterns": log.done,
         "levels": [told._asdict() for told in found.levels],

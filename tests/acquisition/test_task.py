@@ -17,9 +17,10 @@ import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl.acquisition import FolderRig, Report, VirtualRig, acquire
+from ltcl.acquisition import Calibration, FolderRig, Report, VirtualRig, acquire
 from ltcl.acquisition.radiometry import Response
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, PhotographMissing
+from ltcl.images import from_srgb
 from ltcl.store import BlockStore
 
 from .scanning.helpers import CLEAN, corner, dense, off, rig, unit
@@ -195,6 +196,14 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
         acquire(rig(4), geometry="aligned", strategy="pixel", store=path)
     with pytest.raises(FileError, match="is still being scanned"):
         Report.of(path)
+    other = tmp_path / "other.zarr"
+    ltcl.save(other, ltcl.Transport(np.eye(128), GRID))
+    with pytest.raises(InputError, match=r"which ltcl\.acquire did not make"):
+        acquire(rig(), geometry="aligned", store=other)
+    with pytest.raises(FileError, match="holds no calibration"):
+        Calibration.of(other)
+    with pytest.raises(FileError, match=r"was not made by ltcl\.acquire"):
+        Report.of(other)
 
 
 @pytest.mark.parametrize(
@@ -224,11 +233,12 @@ def test_one_exposure_tells_no_response() -> None:
     assert off(dense(T), corner(), GRID) < 0.02
 
 
-def test_colours_that_mix() -> None:
+@pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
+def test_colours_that_mix(strategy: str) -> None:
     M = np.array([[0.9, 0.15, 0.0], [0.05, 0.8, 0.1], [0.0, 0.2, 0.9]])
     colours = [corner(4, albedo) for albedo in (0.7, 0.5, 0.3)]
     made = VirtualRig(colours, (4, 8), mixing=M, bits=12, ambient=0.01)
-    T = acquire(made, geometry="aligned", strategy="pixel")
+    T = acquire(made, geometry="aligned", strategy=strategy)
     rng = np.random.default_rng(0)
     p = rng.random((4, 8, 3))
     seen, wanted = np.asarray(T @ p, np.float64), np.zeros((4, 8, 3))
@@ -322,6 +332,8 @@ def test_auto_says_why(tmp_path: Path) -> None:
     assert told.strategy in ("pixel", "hadamard")
     assert "signal over noise of a weak entry" in told.why
     assert told.coverage == 1.0
+    light = np.linspace(0.0, 1.0, 9)
+    np.testing.assert_allclose(from_srgb(Calibration.of(path).projector.codes(light)), light, atol=0.01)
     assert 0 < told.noise_sum < told.noise_direct < 0.1
     assert told.defect < 0.3
     for line in (told.to_json(), str(told)):
