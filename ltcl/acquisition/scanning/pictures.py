@@ -50,17 +50,11 @@ class Pictures:
         self.blocks = Blocks(shots.grid, side)
         self.grid, self.channels = self.blocks.grid, shots.channels
         self._scale = calibration.light.astype(np.float32)[:, None]
-        self._coverage = self.blocks.sum(calibration.resampling.seen.astype(np.float32))
-        self.seen = self._coverage.ravel() > 0
+        self.seen = self.blocks.sum(calibration.resampling.seen.astype(np.float32)).ravel() > 0
         self._dark = self._on_grid(calibration.ambient)
         self.ambient = np.where(self._dark.variance < UNKNOWN, self._dark.variance, 0.0) / self._scale**2
         white = self._on_grid(calibration.white)
         self.white = Picture(white.value / self._scale, white.variance / self._scale**2)
-
-    @property
-    def exposures(self) -> int:
-        """Photographs of each pattern."""
-        return len(self.calibration.exposures)
 
     def announce(self, patterns: Iterable[np.ndarray]) -> None:
         """Tell the rig of patterns that will be asked for, so that a person can photograph all in one go."""
