@@ -136,11 +136,11 @@ def draw() -> Figure:
     )
     axes = figures.graph(figure, (80, 130, 860, 230), "", "pixels", "photographs")
     sides = [16, 32, 64, 128, 256]
-    for strategy in STRATEGIES:
+    for strategy, name in (("adaptive", "adaptive, at most"), ("pixel", "one at a time, or S-matrices")):
         counts = [plans((n, n), (0.5, 8.0))[strategy].photographs for n in sides]
-        axes.plot([n * n for n in sides], counts, marker="o", label=strategy)
+        axes.plot([n * n for n in sides], counts, marker="o", label=name)
     axes.set_xscale("log")
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, labelcolor=figures.FAINT)
     return figure
 
 
