@@ -5,6 +5,7 @@ A projector lights a concave, coloured scene; light bounces before the camera se
 ltcl undoes the bounces with matrix-vector products only.
 
     T = ltcl.load("transport.npz")             # measured, or ltcl.scenes.box(40, sides=3).transport()
+    T = ltcl.acquire(rig, store="scan.zarr")   # any projector and camera; stopped and resumed at will
     T = ltcl.compress(T, rtol=1e-2)            # few numbers instead of N^2, solutions within 1 %
     c = ltcl.compensate(T, desired)            # c.pattern makes the wall look like `desired`
     b = ltcl.separate(T, image)                # b.direct, b.bounces: each bounce as its own picture
@@ -16,6 +17,7 @@ The house, from the ground up; imports point down only:
     transport, theory, solvers      T = S F; what can be forecast; one algorithm per file
     exact, parts                    a compressed T beside the one it stands for; as the arrays of a file
     compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
+    acquisition                     from photographs to T: rigs, radiometry, geometry, scanning
     compression                     T in few numbers, with a bound on what solutions lose
     images, layout, report          pictures, pictures as right-hand sides, JSON
     plots, batch, demo, cli         what people look at; many frames
@@ -41,7 +43,8 @@ from ltcl.store import load, load_inverse, save, save_inverse
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
-    from ltcl import batch, images, operators, plots, scenes, solvers, theory
+    from ltcl import acquisition, batch, images, operators, plots, scenes, solvers, theory
+    from ltcl.acquisition import acquire
 
 __version__ = "0.1.0"
 __all__ = [
@@ -54,6 +57,8 @@ __all__ = [
     "Solution",
     "Status",
     "Transport",
+    "acquire",
+    "acquisition",
     "analyze",
     "batch",
     "compensate",
@@ -77,10 +82,13 @@ __all__ = [
     "theory",
 ]
 
-_LAZY = ("batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib, which not everybody needs
+# They bring OpenCV or matplotlib, which not everybody needs.
+_LAZY = ("acquisition", "batch", "images", "plots", "scenes")
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return importlib.import_module(f"ltcl.{name}")
+    if name == "acquire":
+        return importlib.import_module("ltcl.acquisition").acquire
     raise AttributeError(f"module 'ltcl' has no attribute {name!r}")

@@ -24,7 +24,7 @@ def test_the_examples_of(name, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["Transport", "analyze", "compensate", "invert", "relight", "separate", "solve"]
+    "name", ["Transport", "acquire", "analyze", "compensate", "invert", "relight", "separate", "solve"]
 )
 def test_the_public_tasks_have_an_example(name):
     examples = doctest.DocTestFinder(recurse=False).find(getattr(ltcl, name))

@@ -56,6 +56,7 @@ SIDEWAYS = {
     ("analysis", "energy"),
     ("separation", "single_view"),
     ("analysis", "single_view"),
+    ("acquisition", "store"),
 }  # the imports allowed within one layer
 NEVER = {(a, b) for a in ("acquisition", "images", "store") for b in ("device", "operators")}
 OPENCL = ("device", "pyopencl")  # the one unit that imports it

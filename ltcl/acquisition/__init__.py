@@ -5,14 +5,20 @@
     rigs/       set-ups: virtual (over a known T), folder (photographs taken by a person)
     radiometry/ light from codes: response, noise, exposures, black, merging, colours
     geometry/   which projector pixel a camera pixel sees: Gray code, phase shift, resampling
+    calibration, measuring, exposing    all that is measured once of a set-up, and for how many seconds
+    scanning/   which pixels are lit when, and T from the pictures; plan before, report after
+    task, run   acquire: all of it, into a store, stopped and resumed
 
 Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
 """
 
 from __future__ import annotations
 
+from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.rigs import FolderRig, VirtualRig
+from ltcl.acquisition.scanning.report import Report
+from ltcl.acquisition.task import acquire
 
-__all__ = ["Correspondence", "FolderRig", "Rig", "Shots", "VirtualRig"]
+__all__ = ["Calibration", "Correspondence", "FolderRig", "Report", "Rig", "Shots", "VirtualRig", "acquire"]

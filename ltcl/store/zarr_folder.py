@@ -6,6 +6,7 @@ A compressed transport is kept in extra arrays under the names of `ltcl.parts`, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,19 +39,35 @@ def read(path: Path) -> Record | Parts:
     return Record(matrices, store.layout.grid, store.layout.camera_grid, F, mixing)
 
 
-def write(path: Path, record: Record | Parts) -> None:
-    """Write a store beside `path` and put it there when it is whole."""
+def write(
+    path: Path,
+    record: Record | Parts,
+    *,
+    extras: Mapping[str, np.ndarray] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a store beside `path` and put it there when it is whole.
+
+    `extras` join the extra arrays, `attributes` and `provenance` are those of a `BlockStore`.
+    """
     with creating.beside(path, overwrite=True) as folder:
         try:
-            _fill(folder, record)
+            store = _filled(folder, record, provenance)
+            for name, array in (extras or {}).items():
+                store.extra(name, array)
+            if attributes:
+                store.update(**attributes)
+            store.finalize()
         except FileError as error:
             raise FileError(str(error).replace(str(folder), str(path))) from error
 
 
-def _fill(folder: Path, record: Record | Parts) -> None:
+def _filled(folder: Path, record: Record | Parts, provenance: Mapping[str, Any] | None) -> BlockStore:
     if record.grid is None:
         raise FileError("a store keeps the grid, and this transport does not tell it; give grid=(h, w)")
     sizes: dict[str, Any] = {"shape": record.shape, "grid": record.grid, "camera_grid": record.camera_grid}
+    sizes["provenance"] = provenance
     if isinstance(record, Parts):
         store = BlockStore.create(folder, **sizes, channels=len(record.first_bounce), kind="compressed")
         texts = {name: str(array) for name, array in record.arrays.items() if array.dtype.kind in "SU"}
@@ -66,7 +83,7 @@ def _fill(folder: Path, record: Record | Parts) -> None:
             store.extra("first_bounce", np.atleast_2d(record.first_bounce))
         if record.mixing is not None:
             store.extra("mixing", record.mixing)
-    store.finalize()
+    return store
 
 
 def _rows(matrix: Any, start: int, stop: int) -> scipy.sparse.csr_array:

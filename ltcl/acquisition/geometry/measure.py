@@ -91,7 +91,7 @@ def measure(
     use_phase = checks.flag("phase", phase) and max(grid) > 1
     shift = PhaseShift(grid, (period or (8.0 if small else 16.0),), steps) if use_phase else None
     if seconds is None:
-        seconds = _exposure(shots, grid)
+        seconds = exposure(shots, grid)
     checks.number("seconds", seconds, above=0.0)
     patterns = [*code.patterns(), *(shift.patterns() if shift else [])]
     images = _take(shots, patterns, seconds)
@@ -115,28 +115,29 @@ def _take(shots: Shots, patterns: list[np.ndarray], seconds: float) -> list[np.n
     return [np.asarray(shots.photograph(pattern, seconds)) for pattern in patterns]
 
 
-def _exposure(shots: Shots, grid: tuple[int, int], seconds: float = 1 / 60) -> float:
+def exposure(shots: Shots, grid: tuple[int, int], seconds: float = 1 / 60) -> float:
     """Seconds at which white is bright but not saturated, but for a thousandth of the pixels.
 
     >>> class Lamp:
     ...     def photograph(self, codes, seconds):
     ...         return np.minimum(codes * 4.0 * seconds, 1.0)
-    >>> round(4 * _exposure(Lamp(), (4, 4)), 3)
+    >>> round(4 * exposure(Lamp(), (4, 4)), 3)
     0.7
     """
     white, allowed = np.ones(grid, np.float32), getattr(shots, "exposures", None)
     for _ in range(PROBES):
-        seconds = _nearest(seconds, allowed)
+        seconds = nearest(seconds, allowed)
         (image,) = photographs("photographs", [shots.photograph(white, seconds)], 1)
         level = float(np.quantile(image, 0.999))
         change = 1 / 2 if level > BRIGHT else 0.7 / max(level, 0.7 / 16) if level < DIM else 1.0
-        if change == 1.0 or _nearest(seconds * change, allowed) == seconds:
+        if change == 1.0 or nearest(seconds * change, allowed) == seconds:
             break
         seconds *= change
     return seconds
 
 
-def _nearest(seconds: float, allowed: Any) -> float:
+def nearest(seconds: float, allowed: Any) -> float:
+    """The exposure that a camera has, of `allowed` or of any, nearest to some seconds."""
     if not allowed:
         return min(max(seconds, 1e-4), 30.0)
     return min(allowed, key=lambda given: abs(math.log(given / seconds)))

@@ -133,6 +133,9 @@ def merge(
             whole[part, c] = found
 
     blocks = [(start, c) for start in range(0, bracket.pixels, _BLOCK) for c in range(bracket.channels)]
+    if len(blocks) == 1:  # a thread takes longer to start than a small picture to merge
+        run(blocks[0])
+        return out
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(run, blocks))
     return out

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is known of a set-up once it has been measured (`measuring`): plain arrays in a store, and back."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+
+from ltcl.acquisition.geometry import Resampling
+from ltcl.acquisition.radiometry import NoiseModel, ProjectorResponse, Radiance, Response
+from ltcl.errors import FileError
+from ltcl.store import BlockStore
+
+PREFIX = "calibration."
+"""Of the names of the extra arrays that a calibration is kept in."""
+_SENSOR = ("electrons", "read", "black", "saturation", "levels")
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Calibration:
+    """Found by `measuring.measure`.
+
+    Attributes
+    ----------
+    exposures : tuple of float
+        Seconds of the photographs of each pattern, ascending.
+    response : Response
+        Of the camera.
+    noise : NoiseModel
+        Of the camera.
+    offset : (channels,)
+        Linear value without light.
+    ambient, white : Radiance, (H, W[, 3])
+        Under a black projector, and what a white one adds to that.
+    projector : ProjectorResponse
+    mixing : (3, 3) or None
+        Of the projector's colours, where there are three channels.
+    resampling : Resampling
+        From the camera's pixels to the projector's.
+    """
+
+    exposures: tuple[float, ...]
+    response: Response
+    noise: NoiseModel
+    offset: np.ndarray
+    ambient: Radiance
+    white: Radiance
+    projector: ProjectorResponse
+    mixing: np.ndarray | None
+    resampling: Resampling
+
+    @property
+    def light(self) -> np.ndarray:
+        """What each channel of T answers to when all of the projector's are at full code, (channels,)."""
+        return np.ones(1) if self.mixing is None else self.mixing.sum(axis=1)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Plain arrays by name, all finite, of which `from_arrays` makes the same again."""
+        R = self.resampling
+        found = {
+            "exposures": np.array(self.exposures),
+            "response": self.response.values,
+            "noise": np.array([getattr(self.noise, name) for name in _SENSOR], np.float64),
+            "offset": self.offset,
+            "projector": self.projector.values,
+            "resampling.data": R.weights.data,
+            "resampling.indices": R.weights.indices,
+            "resampling.indptr": R.weights.indptr,
+            "resampling.coverage": R.coverage,
+            "resampling.camera_grid": np.array(R.camera_grid),
+        }
+        if self.mixing is not None:
+            found["mixing"] = self.mixing
+        for name, picture in (("ambient", self.ambient), ("white", self.white)):
+            found[f"{name}.value"], found[f"{name}.valid"] = picture.value, picture.valid
+            found[f"{name}.variance"] = np.where(picture.valid, picture.variance, np.float32(0.0))
+        return found
+
+    @classmethod
+    def of(cls, store: str | os.PathLike[str] | BlockStore) -> Calibration:
+        """That of a store which `ltcl.acquire` made, or of the folder of one.
+
+        `Calibration.of(path).projector.codes(pattern)` is what the projector is fed for a pattern of linear
+        light, such as `ltcl.compensate` finds.
+
+        Raises
+        ------
+        FileError
+            There is none, or it is damaged.
+        """
+        found = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        names = [name for name in found.extras if name.startswith(PREFIX)]
+        if not names:
+            raise FileError(f"{found.path}: holds no calibration; ltcl.acquire writes one")
+        return cls.from_arrays({name.removeprefix(PREFIX): found.extra(name) for name in names})
+
+    def write(self, store: BlockStore) -> None:
+        """Commit it to a store, as extra arrays."""
+        for name, array in self.to_arrays().items():
+            store.extra(PREFIX + name, array)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Calibration:
+        """The calibration that `to_arrays` was called of."""
+        *sensor, levels = np.asarray(arrays["noise"]).tolist()
+        grid, camera = arrays["resampling.coverage"].shape, arrays["resampling.camera_grid"].tolist()
+        parts = tuple(np.array(arrays[f"resampling.{name}"]) for name in ("data", "indices", "indptr"))
+        weights = scipy.sparse.csr_array(parts, shape=(grid[0] * grid[1], camera[0] * camera[1]))
+        coverage = np.array(arrays["resampling.coverage"])
+        return cls(
+            tuple(np.asarray(arrays["exposures"]).tolist()),
+            Response(np.array(arrays["response"])),
+            NoiseModel(*sensor, levels=int(levels)),
+            np.array(arrays["offset"]),
+            _radiance(arrays, "ambient"),
+            _radiance(arrays, "white"),
+            ProjectorResponse(np.array(arrays["projector"])),
+            np.array(arrays["mixing"]) if "mixing" in arrays else None,
+            Resampling(weights, coverage, (grid[0], grid[1]), (camera[0], camera[1])),
+        )
+
+
+def _radiance(arrays: Mapping[str, np.ndarray], name: str) -> Radiance:
+    value, valid = np.array(arrays[f"{name}.value"]), np.array(arrays[f"{name}.valid"])
+    variance = np.where(valid, np.asarray(arrays[f"{name}.variance"]), np.float32(np.inf))
+    return Radiance(value, variance, valid)

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""All that is measured once of a set-up, before its transport is scanned.
+
+    exposure        white is bright at; then `exposing`
+    geometry        which projector pixel a camera pixel sees, by patterns, unless it is given
+    response        of the camera, from ramps beside black at a bracket of exposures
+    noise           of the camera, from the same photograph taken again and again
+    black           offset of the camera, and light without the projector, at the exposures of the scan
+    white           all that the projector can light, of which row sums of T are known
+    projector       codes to light of each channel, and from these pictures how its colours mix
+
+Known limit: the unit of light is what the response reaches at the last code, for which nothing else stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.acquisition import exposing
+from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.geometry import Correspondence, Resampling
+from ltcl.acquisition.geometry import measure as measure_geometry
+from ltcl.acquisition.geometry.measure import exposure
+from ltcl.acquisition.radiometry import (
+    NoiseModel,
+    ProjectorResponse,
+    Radiance,
+    Response,
+    black,
+    bracket,
+    calibrate,
+    estimate,
+    merge,
+    mixing,
+    projector,
+)
+from ltcl.acquisition.rig import Shots
+from ltcl.errors import InputError
+
+Tell = Callable[[str], None]
+_BRACKET, _SPAN = 8, 16.0  # exposures to find the response from, and how far from that of white
+_RAMPS, _MANY = 4, 4096  # scenes of them where there are fewer pixels
+_TOP = 0.995  # of the codes: the unit of a curve is what it reaches at the last one
+_QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so that weights are finite
+_BURST = 6  # photographs that tell the noise
+_CODES = 17  # of the projector's response
+_AGAIN = 16  # photographs of white
+
+
+def measure(
+    shots: Shots,
+    *,
+    geometry: str | Correspondence = "graycode",
+    response: Response | None = None,
+    exposures: Any = None,
+    frames: int = 16,
+    tell: Tell | None = None,
+) -> Calibration:
+    """Measure a set-up, with about 100 photographs, 200 in colour, beside those of the geometry.
+
+    Parameters
+    ----------
+    shots : Shots
+    geometry : "graycode", "aligned" (the camera is on the projector's grid) or Correspondence
+    response : Response, optional
+        Of the camera, where it is known; else it is found, which takes two exposures at least.
+    exposures : sequence of float, optional
+        Seconds of each photograph of the scan; left out, they are chosen.
+    frames : int
+        Photographs to average for black, at each of these.
+    tell : function of a str, optional
+        Told what is measured next.
+
+    Raises
+    ------
+    InputError
+        A geometry of other pixels; one exposure only and no response.
+    AcquisitionError
+        The rig fails; nothing can be decoded; the projector does not shine.
+
+    Examples
+    --------
+    >>> from ltcl.acquisition import VirtualRig
+    >>> rig = VirtualRig(np.eye(64) * 0.5, (8, 8), response="srgb", bits=12)
+    >>> found = measure(Shots(rig), geometry="aligned")
+    >>> bool(abs(found.white.value - 0.5).max() < 0.02), found.resampling.seen.all()
+    (True, np.True_)
+    """
+    checks.count("frames", frames)
+    run = _Run(shots, tell or (lambda _: None))
+    run.tell("exposure")
+    seconds = exposure(shots, shots.grid)
+    run.tell("geometry")
+    R = _resampling(run, geometry, seconds)
+    run.tell("response")
+    response = response or _response(run, seconds)
+    seconds = _bright(run, response, seconds)
+    deep = exposing.deepest(shots, seconds, response)
+    run.tell("noise")
+    noise = _noise(run, response, seconds, deep)
+    run.tell("exposures")
+    if exposures is None:
+        chosen = exposing.for_scan(shots, seconds, deep, noise)
+    else:
+        chosen = tuple(exposing.offered(shots, [float(t)])[0] for t in sorted(exposures))
+    run.tell("black")
+    offset, ambient = _black(run, response, noise, chosen, frames)
+    sensor = (response, noise, offset)
+    run.tell("white")
+    white = run.merged(run.white, exposing.offered(shots, [seconds / 2, seconds]), *sensor, _AGAIN)
+    white = white - ambient
+    run.tell("projector")
+    light, M = _projector(run, seconds, *sensor)
+    return Calibration(chosen, response, noise, offset, ambient, white, light, M, R)
+
+
+class _Run:
+    """A rig, and photographs of it merged."""
+
+    def __init__(self, shots: Shots, tell: Tell) -> None:
+        self.shots, self.tell = shots, tell
+        self.black = np.zeros(shots.grid, np.float32)
+        self.white = np.ones(shots.grid, np.float32)
+
+    def take(self, wanted: list[tuple[np.ndarray, float]]) -> list[np.ndarray]:
+        """A photograph of each (codes, seconds), all of them told of before."""
+        self.shots.prepare(wanted)
+        return [self.shots.photograph(codes, t) for codes, t in wanted]
+
+    @property
+    def levels(self) -> int | None:
+        return None if self.shots.levels is None else self.shots.levels + 1
+
+    def merged(
+        self,
+        codes: np.ndarray,
+        seconds: tuple[float, ...],
+        response: Response,
+        noise: NoiseModel,
+        offset: np.ndarray,
+        again: int = 1,
+    ) -> Radiance:
+        """What the camera sees under `codes`, the ambient light still in it."""
+        times = [t for t in seconds for _ in range(again)]
+        images, last = self.take([(codes, t) for t in times]), self.shots.count
+        with exposing.telling(f"photographs {last + 1 - len(images)} to {last}"):
+            return merge(images, times, response, noise, levels=self.levels, black=offset)
+
+
+def _resampling(run: _Run, geometry: str | Correspondence, seconds: float) -> Resampling:
+    grid = run.shots.grid
+    if geometry == "graycode":
+        return Resampling.of(measure_geometry(run.shots, grid, seconds=seconds))
+    if not isinstance(geometry, Correspondence):
+        if run.shots.camera_grid != grid:
+            raise InputError(
+                f"geometry is 'aligned', but photographs are {run.shots.camera_grid}; they must be {grid}, "
+                "the projector's pixels"
+            )
+        return Resampling.aligned(grid)
+    if (geometry.grid, geometry.camera_grid) != (grid, run.shots.camera_grid):
+        raise InputError(
+            f"geometry is from {geometry.camera_grid} to {geometry.grid}; the rig is from "
+            f"{run.shots.camera_grid} to {grid}"
+        )
+    return Resampling.of(geometry)
+
+
+def _ramp(grid: tuple[int, int], shift: int = 0) -> np.ndarray:
+    """Codes from 0 to 1 along the longer side, some pixels further: all brightnesses in one picture."""
+    h, w = grid
+    long = np.roll(np.linspace(0.0, 1.0, max(h, w), dtype=np.float32), shift)
+    return np.ascontiguousarray(np.broadcast_to(long if w >= h else long[:, None], grid))
+
+
+def _response(run: _Run, seconds: float) -> Response:
+    span = bracket(seconds / _SPAN, seconds * _SPAN, _BRACKET)
+    times, grid = exposing.offered(run.shots, span), run.shots.grid
+    if len(times) == 1:
+        raise InputError("rig.exposures has one exposure, which tells no response; give response=")
+    ramps = [_ramp(grid, k * max(grid) // _RAMPS) for k in range(_RAMPS)]
+    lit = [*ramps[: 1 if grid[0] * grid[1] >= _MANY else _RAMPS], run.black]
+    images = run.take([(codes, t) for t in times for codes in lit])
+    beside = [np.hstack(images[k : k + len(lit)]) for k in range(0, len(images), len(lit))]
+    with exposing.telling("the response of the camera"):
+        return calibrate(beside, times, levels=run.levels, saturation=_TOP)
+
+
+def _bright(run: _Run, response: Response, seconds: float) -> float:
+    """The exposure at which white fills most of the range."""
+    (image,) = run.take([(run.white, seconds)])
+    level = float(np.quantile(response.linear(image), 0.999))
+    return exposing.offered(run.shots, [seconds * exposing.WHITE / max(level, 0.01)])[-1]
+
+
+def _noise(run: _Run, response: Response, seconds: float, deep: float) -> NoiseModel:
+    ramp = _ramp(run.shots.grid)
+    scenes = ((ramp, seconds), (run.black, seconds), (run.black, deep))
+    bursts = [run.take([(codes, t)] * _BURST) for codes, t in scenes]
+    with exposing.telling("the noise of the camera"):
+        found = estimate(bursts, response=response, levels=run.levels)
+    return replace(found, read=max(found.read, _QUIETEST))
+
+
+def _black(
+    run: _Run, response: Response, noise: NoiseModel, exposures: tuple[float, ...], frames: int
+) -> tuple[np.ndarray, Radiance]:
+    times = [t for t in sorted(set(exposures)) for _ in range(frames)]
+    images = run.take([(run.black, t) for t in times])
+    if times[0] < times[-1]:
+        with exposing.telling("black"):
+            found = black.measure(images, times, response, noise, levels=run.levels)
+        return found.offset, found.ambient
+    offset = np.zeros(run.shots.channels)  # one exposure does not tell it from ambient light, nor need it
+    return offset, merge(images, times, response, noise, levels=run.levels, black=offset)
+
+
+def _projector(
+    run: _Run, seconds: float, response: Response, noise: NoiseModel, offset: np.ndarray
+) -> tuple[ProjectorResponse, np.ndarray | None]:
+    """Response of each channel of the projector, and the mixing of colours."""
+    times = exposing.offered(run.shots, [seconds, 4.0 * seconds])
+    codes, colours = np.linspace(0.0, 1.0, _CODES), run.shots.channels
+    pictures = []
+    for d in range(colours):
+        unit = np.ones(1, np.float32) if colours == 1 else np.eye(3, dtype=np.float32)[d]
+        fed = [np.float32(c) * run.white[..., None] * unit for c in codes]
+        shown = [part[..., 0] if colours == 1 else part for part in fed]
+        pictures.append([run.merged(part, times, response, noise, offset) for part in shown])
+    with exposing.telling("the projector"):
+        if colours == 1:
+            return projector.measure(codes, pictures[0]), None
+        return projector.measure(codes, pictures), mixing([part[-1] for part in pictures], pictures[0][0])

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What an adaptive scan found as the arrays of a compressed transport (`ltcl.parts`): T = C W.
+
+It is kept as S diag(1) with S = T = I + R: R = C W - I takes 1 from C at every pixel's own cell, and the
+first bounce stands beside it. Loaded, `Transport` divides the columns by F when it makes its own S = T F^-1.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from ltcl.acquisition.scanning.adaptive import Core
+from ltcl.acquisition.scanning.cells import Cells
+
+
+def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """The arrays of the transport of a core, and the variance of its entries in `core_variance_0`, ...
+
+    Examples
+    --------
+    >>> from ltcl.acquisition.scanning.adaptive import Entries
+    >>> core = Core(Cells((1, 2)), 1)
+    >>> one = np.ones((1, 2))
+    >>> core.add(0, Entries(np.array([0, 1]), np.array([0, 1]), 0.5 * one, 0.01 * one))
+    >>> core.add(1, Entries(np.array([0, 0]), np.array([0, 1]), 0.2 * one, 0.01 * one))
+    >>> from ltcl.parts import assemble
+    >>> print(assemble(arrays(core)) @ np.array([[1.0, 0.0]]))
+    [[0.6 0.1]]
+    """
+    core.complete()
+    cells, matrices = core.cells, core.matrices()
+    n = cells.grid[0] * cells.grid[1]
+    F = np.stack([diagonal(cells, C) for C in matrices])
+    found: dict[str, Any] = {"grid": np.array(cells.grid), "first_bounce": F}
+    if mixing is not None:
+        found["mixing"] = mixing
+    found |= {"basis_0.name": np.array("pyramid"), "basis_0.grid": np.array(cells.grid)}
+    for c, (C, variance) in enumerate(zip(matrices, core.matrices("variance"), strict=True)):
+        R = C.copy()
+        R.data[R.indices == np.repeat(np.arange(n), np.diff(R.indptr))] -= 1.0
+        found[f"columns_{c}"], found[f"core_variance_{c}"] = np.ones(n), variance.data
+        found |= {f"system_{c}.sign": np.array(1.0), f"system_{c}.solution_error": np.array(0.0)}
+        found |= {
+            f"system_{c}.R.{name}": np.asarray(part)
+            for name, part in {
+                "kind": "compressed",
+                "error": 0.0,
+                "out": -1,
+                "into": 0,
+                "diagonal": F[c] - 1.0,
+                "core.kind": "csr",
+                "core.error": 0.0,
+                "core.shape": np.array(R.shape, np.int64),
+                "core.data": R.data.astype(np.float32),
+                "core.indices": R.indices.astype(np.int32),
+                "core.indptr": R.indptr.astype(np.int64),
+            }.items()
+        }
+    return found
+
+
+def diagonal(cells: Cells, C: scipy.sparse.csr_array) -> np.ndarray:
+    """diag(C W), (N,): of each pixel the cells that it is in, on all levels."""
+    pixels = np.arange(cells.grid[0] * cells.grid[1])
+    parts = [C[pixels, cells.of_pixels(level)] for level in range(cells.top + 1)]
+    return np.sum([part.toarray() if scipy.sparse.issparse(part) else part for part in parts], axis=0)
+
+
+def between(cells: Cells, C: scipy.sparse.csr_array, pixels: np.ndarray) -> np.ndarray:
+    """C W where rows and columns of some pixels meet, dense."""
+    levels = range(cells.top + 1)
+    of = np.stack([cells.of_pixels(level)[pixels] for level in levels])
+    one = np.broadcast_to(np.arange(len(pixels)), of.shape)
+    W = scipy.sparse.csr_array(
+        (np.ones(of.size), (of.ravel(), one.ravel())), shape=(cells.offsets[-1], len(pixels))
+    )
+    return (C[pixels] @ W).toarray()

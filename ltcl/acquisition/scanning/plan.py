@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a scan takes and gives, said before the first photograph: photographs, time, disk, signal over noise.
+
+Of N pixels, direct light d, indirect light g of all pixels together, ambient light a, all in radiance, an
+entry of T off its diagonal is about l = g / N. One photograph of radiance L and t seconds has the variance
+V(L) = variance(L t) / t^2 of the noise model, several are merged as 1 / V = sum_k 1 / V_k. So an entry has
+
+    pixel      V(l + a)
+    hadamard   4 / (n + 1) V((n + 1) / 2 l + a),  n pixels a batch
+
+and where photons of l make the noise the second is twice the first; where reading, rounding or ambient light
+do, it is 4 / (n + 1) of it. `choose` takes the better one, unless there are so many pixels that only an
+adaptive scan ends in time.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.radiometry import NoiseModel
+from ltcl.acquisition.scanning import adaptive, columns
+from ltcl.acquisition.scanning.block import Blocks
+from ltcl.acquisition.scanning.cells import Cells
+
+STRATEGIES = ("adaptive", "pixel", "block", "hadamard")
+MANY = 2048  # pixels from which one at a time, or as many patterns, take too long
+THRESHOLD = 0.004  # of what a camera pixel sees, that a cell is divided for
+_INDIRECT = 0.25  # of what a camera pixel sees under white, unless more is known
+_BYTES = 12  # of an entry: value, place, variance
+
+
+@dataclass(frozen=True)
+class Light:
+    """What a scene is taken to send to the camera: radiance, in linear sensor values a second.
+
+    Attributes
+    ----------
+    direct, indirect, ambient : float
+        Of a pixel of its own light; of that of all other pixels together; without the projector.
+    """
+
+    direct: float = 0.5
+    indirect: float = 0.2
+    ambient: float = 0.01
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Of one strategy.
+
+    Attributes
+    ----------
+    strategy : str
+    grid : (h, w)
+        Of the transport.
+    patterns, photographs : int
+        Without those of the calibration; of an adaptive scan what a scene like `Light` needs at most.
+    seconds : float
+        Of exposure, and of what the set-up takes for each photograph besides.
+    disk : int
+        Bytes at most.
+    snr_direct, snr_indirect : float
+        Signal over noise of an entry on the diagonal and of one beside it.
+    why : str
+
+    Examples
+    --------
+    >>> found = plans((64, 64), (0.5, 8.0))
+    >>> found["pixel"].patterns, found["adaptive"].photographs < found["pixel"].photographs / 4
+    (4160, True)
+    """
+
+    strategy: str
+    grid: tuple[int, int]
+    patterns: int
+    photographs: int
+    seconds: float
+    disk: int
+    snr_direct: float
+    snr_indirect: float
+    why: str
+
+    def to_json(self) -> str:
+        """One line of JSON."""
+        return json.dumps(asdict(self))
+
+    def __str__(self) -> str:
+        h, w = self.grid
+        return (
+            f"{self.strategy}: {self.photographs} photographs of {self.patterns} patterns for {h} x {w} "
+            f"pixels, {duration(self.seconds)}, {checks.size(self.disk)} at most; signal over noise "
+            f"{self.snr_direct:.3g} (direct), {self.snr_indirect:.2g} (a weak entry); {self.why}"
+        )
+
+
+def plans(
+    grid: tuple[int, int],
+    exposures: Sequence[float],
+    noise: NoiseModel | None = None,
+    light: Light | None = None,
+    *,
+    channels: int = 1,
+    block: int = 2,
+    order: int = 63,
+    threshold: float = THRESHOLD,
+    overhead: float = 0.0,
+) -> dict[str, Plan]:
+    """A plan for every strategy.
+
+    Parameters
+    ----------
+    grid : (h, w)
+        Of the projector.
+    exposures : sequence of float
+        Seconds of the photographs of each pattern.
+    noise, light
+        Of camera and scene: guesses before there is a photograph, `measured` after the calibration.
+    channels, block, order, threshold
+        As in `ltcl.acquire`.
+    overhead : float
+        Seconds that each photograph takes beside its exposure.
+    """
+    noise, light = noise or NoiseModel(), light or Light()
+    run = _Run(grid, tuple(exposures), noise, light, channels, overhead)
+    coarse, whys = Blocks(grid, min(block, max(grid))).grid, {"adaptive": "cells divided where it tells"}
+    sizes = {"adaptive": (grid, _cells(grid, light, threshold), 1)}
+    for name, pixels in (("pixel", grid), ("block", coarse), ("hadamard", grid)):
+        code = columns.code_of(name, pixels, order)
+        lit = code.size if name == "hadamard" else 1
+        sizes[name] = (pixels, columns.patterns(code, pixels[0] * pixels[1]), lit)
+        whys[name] = f"{code.size} pixels a batch" + (", and their sum" if lit == 1 else "")
+    return {name: run.plan(name, *sizes[name], whys[name]) for name in STRATEGIES}
+
+
+def measured(told: Calibration) -> Light:
+    """What the calibration tells of the scene; how much of it is indirect it does not tell.
+
+    An indirect part of a quarter is taken: of a white corner with an albedo of one half.
+    """
+    white, dark = (part.value[part.valid] for part in (told.white, told.ambient))
+    lit = float(np.median(white[white > 0.1 * white.max(initial=0.0)])) if white.size else Light().direct
+    ambient = max(float(np.median(dark)), 0.0) if dark.size else 0.0
+    return Light((1.0 - _INDIRECT) * lit, _INDIRECT * lit, ambient)
+
+
+def choose(given: dict[str, Plan]) -> tuple[str, str]:
+    """The strategy that "auto" takes, and why.
+
+    >>> light, photons, reading = Light(ambient=0.0), NoiseModel(2000.0, 0.0), NoiseModel(1e6, 0.01)
+    >>> [choose(plans((16, 16), (1.0, 8.0), noise, light))[0] for noise in (photons, reading)]
+    ['pixel', 'hadamard']
+    """
+    pixel, hadamard = given["pixel"], given["hadamard"]
+    h, w = pixel.grid
+    if h * w > MANY:
+        return "adaptive", f"{h * w} pixels are more than {MANY}"
+    ours, theirs = pixel.snr_indirect, hadamard.snr_indirect
+    told = f"signal over noise of a weak entry: hadamard {theirs:.2g}, pixel {ours:.2g}"
+    return ("hadamard" if theirs > ours else "pixel"), told
+
+
+def duration(seconds: float) -> str:
+    """Time as people read it.
+
+    >>> duration(42.0), duration(5000.0)
+    ('42 s', '1 h 23 min')
+    """
+    minutes = round(seconds / 60.0)
+    if minutes < 2:
+        return f"{seconds:.0f} s"
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
+
+
+@dataclass(frozen=True)
+class _Run:
+    grid: tuple[int, int]
+    exposures: tuple[float, ...]
+    noise: NoiseModel
+    light: Light
+    channels: int
+    overhead: float
+
+    def plan(self, name: str, grid: tuple[int, int], patterns: int, order: int, why: str) -> Plan:
+        n, most = grid[0] * grid[1], len(self.exposures)
+        # A block is as bright on its own pixels as one pixel, and sends that much more to the others.
+        indirect, direct = self.light.indirect / n, self.light.direct
+        if order > 1:
+            on = (order + 1) / 2
+            errors = [2.0 / on * self.variance(part) for part in (direct / 2 + on * indirect, on * indirect)]
+        else:
+            errors = [self.variance(part) for part in (direct, indirect)]
+        size = self._disk(name, n, patterns)
+        return Plan(
+            name,
+            grid,
+            patterns,
+            most * patterns,
+            patterns * (sum(self.exposures) + most * self.overhead),
+            size,
+            direct / math.sqrt(errors[0]),
+            indirect / math.sqrt(errors[1]),
+            why,
+        )
+
+    def variance(self, radiance: float) -> float:
+        """Of one merged picture, at this radiance and the ambient one."""
+        t = np.array(self.exposures)
+        x = (radiance + self.light.ambient) * t
+        usable = x < self.noise.saturation
+        if not usable.any():
+            return math.inf
+        return float(1.0 / np.sum(t[usable] ** 2 / self.noise.variance(x[usable])))
+
+    def _disk(self, name: str, n: int, patterns: int) -> int:
+        # Columns are there twice while they are turned; an adaptive scan keeps its pictures until it ends.
+        entries = n * patterns if name == "adaptive" else 2 * n * n
+        return self.channels * _BYTES * entries
+
+
+def _cells(grid: tuple[int, int], light: Light, threshold: float) -> int:
+    """Patterns of an adaptive scan: no pixel asks for more cells than have its threshold each."""
+    cells = Cells(grid)
+    share = light.indirect / (light.direct + light.indirect)
+    active = 1.0 + share / max(threshold, 1e-9)
+    found = sum(4 * min(math.prod(size), active) for size in cells.sizes[1:])
+    return min(math.ceil(found), adaptive.most_patterns(cells))

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Corners whose transport is known, rigs that photograph them, and what scans of them are measured by."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+import ltcl
+from ltcl.acquisition import VirtualRig
+
+CLEAN: dict[str, Any] = {"gain": None, "read": 0.0, "bits": "float", "response": "linear", "black": 0.0}
+
+
+@cache
+def corner(n: int = 8, albedo: float = 0.6) -> np.ndarray:
+    """T of a dihedral, grid (n, 2n), float64."""
+    return np.asarray(ltcl.scenes.dihedral(n, albedo=albedo).transport().matrices[0], np.float64)
+
+
+def rig(n: int = 8, **options: Any) -> VirtualRig:
+    """A camera on the projector's pixels, with 12 bits unless told."""
+    return VirtualRig(corner(n), (n, 2 * n), **{"bits": 12, "ambient": 0.01, **options})
+
+
+def dense(T: ltcl.Transport) -> np.ndarray:
+    """All of T, by products with every pixel."""
+    n = T.grid[0] * T.grid[1]
+    return (T @ np.eye(n).reshape(n, *T.grid)).reshape(n, n).T.astype(np.float64)
+
+
+def held(grid: tuple[int, int], count: int = 6) -> np.ndarray:
+    """Patterns that no scan has seen: noise, stripes, smooth ones; (N, count)."""
+    rng = np.random.default_rng(11)
+    y, x = np.mgrid[: grid[0], : grid[1]] / max(grid)
+    smooth = [0.5 + 0.5 * np.sin(9 * x + k + 5 * y) for k in range(count // 2)]
+    return np.stack([*smooth, *rng.random((count - count // 2, *grid))]).reshape(count, -1).T
+
+
+def unit(found: np.ndarray, truth: np.ndarray) -> float:
+    """The camera's unit of light, which nothing but its last code fixes: least squares of row sums."""
+    ours, theirs = found.sum(axis=1), truth.sum(axis=1)
+    return float(ours @ theirs / (ours @ ours))
+
+
+def off(found: np.ndarray, truth: np.ndarray, grid: tuple[int, int]) -> float:
+    """Largest relative error of T p over held patterns, in the camera's unit."""
+    P = held(grid)
+    ours, theirs = unit(found, truth) * (found @ P), truth @ P
+    return float(np.max(np.linalg.norm(ours - theirs, axis=0) / np.linalg.norm(theirs, axis=0)))

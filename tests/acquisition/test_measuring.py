@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is measured of a set-up is what it was made with, and comes back from arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ltcl.acquisition import Shots, VirtualRig, exposing
+from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.measuring import measure
+from ltcl.errors import AcquisitionError, InputError
+
+from .scanning.helpers import corner, rig
+
+
+@pytest.fixture(scope="module")
+def found() -> Calibration:
+    made = rig(projector_response="gamma2.2", response="gamma2.2", bits=12, ambient=0.02)
+    return measure(Shots(made), geometry="aligned")
+
+
+def test_camera_and_projector(found: Calibration) -> None:
+    codes = np.linspace(0.1, 1.0, 10)
+    np.testing.assert_allclose(found.projector.linear(codes), codes**2.2, atol=0.01)
+    light = np.linspace(0.05, 0.9, 10)
+    value = found.response.linear(0.004 + 0.996 * light ** (1 / 2.2))
+    np.testing.assert_allclose(value / light, np.mean(value / light), rtol=0.02)
+    scale = float(np.mean(value / light))
+    assert found.noise.electrons == pytest.approx(10000.0 / scale, rel=0.2)
+    np.testing.assert_allclose(found.ambient.value / scale, 0.02, rtol=0.05)
+    np.testing.assert_allclose(found.white.value.ravel() / scale, corner().sum(axis=1), rtol=0.03)
+    assert found.mixing is None
+    assert found.light.tolist() == [1.0]
+
+
+def test_exposures(found: Calibration) -> None:
+    """White fills the range in the shortest; the longest leaves ambient light a third of it."""
+    short, *_, deep = found.exposures
+    assert 0.3 < short * corner().sum(axis=1).max() < 0.95
+    assert 0.1 < 0.02 * deep < 0.4
+
+
+def test_arrays_make_the_same_again(found: Calibration) -> None:
+    arrays = found.to_arrays()
+    assert all(np.isfinite(array).all() for array in arrays.values())
+    again = Calibration.from_arrays(arrays)
+    assert (again.exposures, again.noise) == (found.exposures, found.noise)
+    for name, array in again.to_arrays().items():
+        np.testing.assert_array_equal(array, arrays[name], err_msg=name)
+    assert again.resampling.grid == (8, 16)
+
+
+def test_colours() -> None:
+    M = np.array([[1.0, 0.2, 0.0], [0.1, 1.0, 0.1], [0.0, 0.3, 1.0]])
+    made = VirtualRig([corner(4)] * 3, (4, 8), mixing=M, bits=12)
+    told = measure(Shots(made), geometry="aligned")
+    assert told.mixing is not None
+    np.testing.assert_allclose(told.mixing, M, atol=0.02)
+    np.testing.assert_allclose(told.light, told.mixing.sum(axis=1))
+
+
+def test_a_camera_with_few_exposures() -> None:
+    offered = (0.01, 0.05, 0.2, 0.5, 2.0, 6.0)
+    told = measure(Shots(rig(exposures=offered)), geometry="aligned")
+    assert set(told.exposures) <= set(offered)
+    assert exposing.offered(Shots(rig(exposures=offered)), [0.06, 0.04, 100.0]) == (0.05, 6.0)
+
+
+def test_a_projector_that_is_off() -> None:
+    dark = VirtualRig(np.zeros((16, 16)), (4, 4), ambient=0.1)
+    with pytest.raises(AcquisitionError):
+        measure(Shots(dark), geometry="aligned")
+
+
+def test_all_is_saturated() -> None:
+    bright = VirtualRig(np.eye(16), (4, 4), ambient=1e6)
+    with pytest.raises(AcquisitionError, match="the response of the camera"):
+        measure(Shots(bright), geometry="aligned")
+
+
+def test_what_is_measured_is_told() -> None:
+    told: list[str] = []
+    measure(Shots(rig(4)), geometry="aligned", tell=told.append)
+    assert told == ["exposure", "geometry", "response", "noise", "exposures", "black", "white", "projector"]
+
+
+def test_a_map_of_other_pixels_is_refused() -> None:
+    from ltcl.acquisition import Correspondence
+
+    with pytest.raises(InputError, match=r"geometry is from \(4, 4\) to \(4, 4\)"):
+        measure(Shots(rig(4)), geometry=Correspondence.aligned((4, 4)))
+    up = VirtualRig(np.eye(4), (2, 2), camera_grid=(4, 2), camera_map=np.kron(np.eye(4), np.ones((2, 1))))
+    with pytest.raises(InputError, match="geometry is 'aligned', but photographs are"):
+        measure(Shots(up), geometry="aligned")

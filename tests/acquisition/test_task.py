@@ -1,0 +1,366 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The closed loop: photographs of a known transport in, and the transport out; stopped, resumed, refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import scipy.sparse
+
+import ltcl
+from ltcl.acquisition import Calibration, FolderRig, Report, VirtualRig, acquire
+from ltcl.acquisition.radiometry import Response
+from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, PhotographMissing
+from ltcl.images import from_srgb
+from ltcl.store import BlockStore
+
+from .scanning.helpers import CLEAN, corner, dense, off, rig, unit
+
+GRID = (8, 16)
+ROOT = Path(__file__).resolve().parents[2]
+STRATEGIES = ("pixel", "hadamard", "adaptive")
+
+
+@pytest.mark.parametrize(("response", "bits"), [("srgb", 8), ("film", 12)])
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_patterns_that_no_scan_has_seen(strategy: str, response: str, bits: int) -> None:
+    """Curve of the camera, black, ambient light and noise are found from photographs alone."""
+    T = acquire(rig(response=response, bits=bits), geometry="aligned", strategy=strategy)
+    assert T.grid == GRID
+    assert off(dense(T), corner(), GRID) < 0.02
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_compensated_pictures(strategy: str) -> None:
+    """The pattern found with the measured transport, under the true one: 30 dB at least."""
+    T, truth = acquire(rig(seed=3), geometry="aligned", strategy=strategy), corner()
+    y, x = np.mgrid[:8, :16] / 16
+    desired = 0.25 + 0.1 * np.sin(7 * x + 4 * y)
+    scale = unit(dense(T), truth)
+    pattern = ltcl.compensate(T, (desired / scale).astype(np.float32), rtol=1e-3).pattern
+    seen = truth @ np.asarray(pattern, np.float64).ravel()
+    error = np.mean((seen - desired.ravel()) ** 2)
+    assert 10 * np.log10(desired.max() ** 2 / error) > 30
+
+
+@pytest.mark.parametrize("strategy", ["pixel", "hadamard"])
+def test_bounces_are_within_the_forecast_of_the_noise(tmp_path: Path, strategy: str) -> None:
+    """Bounces of T with noise drawn from the stored variance are as far off as those of the one measured."""
+    path, truth = tmp_path / "T.zarr", corner()
+    made = rig(read=0.004, gain=2000.0, bits=12, response="linear", seed=5)
+    line = Response(np.array([[-0.004 / 0.996, 1.0]]))
+    acquire(made, geometry="aligned", strategy=strategy, store=path, response=line, sigmas=0.0)
+    T, sigma = entries(path)
+    rng = np.random.default_rng(0)
+    image = truth.sum(axis=1).reshape(GRID).astype(np.float32)
+
+    def bounces(matrix: np.ndarray) -> np.ndarray:
+        given = ltcl.Transport(matrix, GRID)
+        return np.asarray(ltcl.separate(given, image, bounces=3, rtol=1e-5).bounces, np.float64)
+
+    wanted, drawn = bounces(truth), [bounces(truth + sigma * rng.normal(size=T.shape)) for _ in range(8)]
+    forecast = np.sqrt(np.mean((np.array(drawn) - wanted) ** 2, axis=(0, 2, 3)))
+    found = np.sqrt(np.mean((bounces(T) - wanted) ** 2, axis=(1, 2)))
+    assert (found < 2 * forecast).all(), (found, forecast)
+
+
+def entries(path: Path, channel: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """T and the standard deviation of its entries, dense."""
+    store = BlockStore.open(path)
+    blocks = [store.block(channel, b, "rows") for b in range(store.layout.blocks())]
+    T = np.concatenate([block.matrix.toarray() for block in blocks])
+    V = [
+        scipy.sparse.csr_array((b.variance, b.matrix.indices, b.matrix.indptr), shape=b.matrix.shape)
+        for b in blocks
+    ]
+    return T.astype(np.float64), np.sqrt(np.concatenate([part.toarray() for part in V]).astype(np.float64))
+
+
+@pytest.mark.parametrize("strategy", ["pixel", "hadamard"])
+def test_the_variance_of_an_entry_is_what_it_is(tmp_path: Path, strategy: str) -> None:
+    path = tmp_path / "T.zarr"
+    made = rig(read=0.004, gain=2000.0, bits=12, response="linear", seed=6)
+    line = Response(np.array([[-0.004 / 0.996, 1.0]]))
+    acquire(made, geometry="aligned", strategy=strategy, store=path, response=line, sigmas=0.0)
+    T, sigma = entries(path)
+    ratio = ((T - corner()) / sigma)[sigma > 0]
+    assert 0.85 < np.sqrt(np.mean(ratio**2)) < 1.2
+    assert np.mean(np.abs(ratio) > 4) < 0.003
+
+
+def test_blocks_of_pixels_make_a_coarser_transport() -> None:
+    T = acquire(rig(**CLEAN), geometry="aligned", strategy="block", block=2, sigmas=0.0)
+    cells = np.arange(128).reshape(4, 2, 8, 2).transpose(0, 2, 1, 3).reshape(32, 4)
+    truth = np.stack([corner()[:, cell].sum(axis=1) for cell in cells], axis=1)
+    truth = np.stack([truth[cell].mean(axis=0) for cell in cells])
+    assert T.grid == (4, 8)
+    found = dense(T)
+    np.testing.assert_allclose(unit(found, truth) * found, truth, atol=2e-3 * truth.max())
+
+
+def test_cells_cost_less_and_lose_no_light(tmp_path: Path) -> None:
+    T = acquire(rig(**CLEAN), geometry="aligned", strategy="adaptive", store=tmp_path / "T.zarr")
+    found = dense(T)
+    sums, truth = unit(found, corner()) * found.sum(axis=1), corner().sum(axis=1)
+    assert np.abs(sums / truth - 1).max() < 0.02
+    told = Report.of(tmp_path / "T.zarr")
+    assert told.patterns < 128
+    assert sum(level["patterns"] for level in told.levels) == told.patterns
+    assert [level["level"] for level in told.levels] == [4, 3, 2, 1]
+
+
+class Dying(VirtualRig):
+    """Fails, or ends the process, at one of its photographs."""
+
+    def __init__(self, at: int, kill: bool = False, **options: Any) -> None:
+        super().__init__(corner(), GRID, bits=12, ambient=0.01, **options)
+        self._left, self._kill = at, kill
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        self._left -= 1
+        if self._left == 0:
+            if self._kill:
+                os.kill(os.getpid(), signal.SIGKILL)
+            raise OSError("unplugged")
+        return super().photograph(codes, seconds)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_a_rig_that_fails_again_and_again(tmp_path: Path, strategy: str) -> None:
+    """Each run gets a little further; the result is that of a run that was never stopped, to the bit."""
+    options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy}
+    whole = acquire(rig(), store=tmp_path / "whole.zarr", **options)
+    path, failures, T = tmp_path / "T.zarr", [], whole
+    for at in (100, 280, 200, 10000):  # in the calibration, in the scan, further on, not at all
+        try:
+            T = acquire(Dying(at), store=path, **options)
+            break
+        except AcquisitionError as error:
+            failures.append(str(error))
+    assert len(failures) >= 2
+    assert T is not whole
+    assert all("unplugged" in text for text in failures)
+    np.testing.assert_array_equal(dense(T), dense(whole))
+    BlockStore.open(path).verify()
+
+
+def dying(at: int, path: str, strategy: str) -> None:
+    """An acquisition in a process of its own, ended without a chance to clean up."""
+    acquire(Dying(at, kill=True), geometry="aligned", strategy=strategy, store=path)
+
+
+@pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
+def test_killed_at_random_photographs(tmp_path: Path, strategy: str) -> None:
+    options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy}
+    whole = dense(acquire(rig(), store=tmp_path / "whole.zarr", **options))
+    rng, path = np.random.default_rng(2), tmp_path / "T.zarr"
+    for at in rng.integers(20, 450, 3):
+        code = f"from tests.acquisition.test_task import dying; dying({at}, {str(path)!r}, {strategy!r})"
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False)
+        if path.exists():
+            BlockStore.open(path).verify()
+    T = acquire(rig(), store=path, **options)
+    np.testing.assert_array_equal(dense(T), whole)
+
+
+def test_a_store_that_is_done_needs_no_rig_any_more(tmp_path: Path) -> None:
+    path = tmp_path / "T.zarr"
+    T = acquire(rig(), geometry="aligned", strategy="hadamard", store=path)
+    again = acquire(Dying(1), geometry="aligned", strategy="hadamard", store=path)
+    np.testing.assert_array_equal(dense(again), dense(T))
+    np.testing.assert_array_equal(dense(ltcl.load(path)), dense(T))
+    with pytest.raises(InputError, match="resume is False"):
+        acquire(rig(), geometry="aligned", store=path, resume=False)
+
+
+def test_other_settings_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "T.zarr"
+    with pytest.raises(AcquisitionError, match="unplugged"):
+        acquire(Dying(300), geometry="aligned", strategy="pixel", store=path)
+    for options, part in (
+        ({"strategy": "hadamard"}, "strategy is 'hadamard'"),
+        ({"sigmas": 2.0}, "sigmas is"),
+    ):
+        with pytest.raises(InputError, match=part):
+            acquire(rig(), geometry="aligned", store=path, **{"strategy": "pixel", **options})
+    with pytest.raises(InputError, match=r"rig has \(4, 8\) pixels"):
+        acquire(rig(4), geometry="aligned", strategy="pixel", store=path)
+    with pytest.raises(FileError, match="is still being scanned"):
+        Report.of(path)
+    other = tmp_path / "other.zarr"
+    ltcl.save(other, ltcl.Transport(np.eye(128), GRID))
+    with pytest.raises(InputError, match=r"which ltcl\.acquire did not make"):
+        acquire(rig(), geometry="aligned", store=other)
+    with pytest.raises(FileError, match="holds no calibration"):
+        Calibration.of(other)
+    with pytest.raises(FileError, match=r"was not made by ltcl\.acquire"):
+        Report.of(other)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "part"),
+    [
+        ({"strategy": "spiral"}, InputError, "strategy is 'spiral'"),
+        ({"geometry": "stripes"}, InputError, "geometry is 'stripes'"),
+        ({"geometry": 3}, InputTypeError, "geometry is a int"),
+        ({"order": 64}, InputError, "size is 64"),
+        ({"block": 1}, InputError, "block is 1"),
+        ({"threshold": 0.0}, InputError, "threshold is 0"),
+        ({"frames": 0}, InputError, "frames is 0"),
+        ({"resume": "no"}, InputTypeError, "resume is 'no'"),
+    ],
+)
+def test_bad_arguments_are_refused(options: dict[str, Any], error: type[Exception], part: str) -> None:
+    with pytest.raises(error, match=part):
+        acquire(rig(), **{"geometry": "aligned", "strategy": "pixel", **options})
+
+
+def test_one_exposure_tells_no_response() -> None:
+    with pytest.raises(InputError, match="one exposure, which tells no response"):
+        acquire(rig(exposures=[0.5]), geometry="aligned", strategy="pixel")
+    line = Response(np.array([[-0.004 / 0.996, 1.0]]))
+    made = rig(exposures=[0.5], response="linear")
+    T = acquire(made, geometry="aligned", strategy="pixel", response=line)
+    assert off(dense(T), corner(), GRID) < 0.02
+
+
+@pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
+def test_colours_that_mix(strategy: str) -> None:
+    M = np.array([[0.9, 0.15, 0.0], [0.05, 0.8, 0.1], [0.0, 0.2, 0.9]])
+    colours = [corner(4, albedo) for albedo in (0.7, 0.5, 0.3)]
+    made = VirtualRig(colours, (4, 8), mixing=M, bits=12, ambient=0.01)
+    T = acquire(made, geometry="aligned", strategy=strategy)
+    rng = np.random.default_rng(0)
+    p = rng.random((4, 8, 3))
+    seen, wanted = np.asarray(T @ p, np.float64), np.zeros((4, 8, 3))
+    for c in range(3):
+        wanted[..., c] = (colours[c] @ (p.reshape(-1, 3) @ M[c])).reshape(4, 8)
+        scale = np.vdot(seen[..., c], wanted[..., c]) / np.vdot(seen[..., c], seen[..., c])
+        difference = np.linalg.norm(scale * seen[..., c] - wanted[..., c])
+        assert difference < 0.02 * np.linalg.norm(wanted[..., c])
+
+
+def test_a_camera_of_its_own_pixels() -> None:
+    """Found by Gray code: a camera twice as fine, which sees all but the last two columns."""
+    up = scipy.sparse.kron(scipy.sparse.eye_array(16), np.ones((2, 1)))
+    narrow = scipy.sparse.csr_array(scipy.sparse.kron(scipy.sparse.eye_array(8), np.ones((2, 1))))
+    keep = scipy.sparse.csr_array(up)[:28]
+    C = scipy.sparse.kron(narrow, keep, format="csr")
+    made = rig(camera_grid=(16, 28), camera_map=C)
+    T = acquire(made, strategy="pixel")
+    seen = ~T.masked.reshape(GRID)
+    assert seen[:, :13].all()
+    inside = np.zeros(GRID, bool)
+    inside[1:-1, 1:12] = True
+    part = inside.ravel()
+    found, truth = dense(T)[part], corner()[part]
+    scale = unit(found, truth)
+    P = np.random.default_rng(0).random((128, 4))
+    sums = np.linalg.norm(scale * found.sum(axis=1) - truth.sum(axis=1)) / np.linalg.norm(truth.sum(axis=1))
+    assert sums < 0.02
+    assert np.linalg.norm(scale * (found @ P) - truth @ P) < 0.25 * np.linalg.norm(truth @ P)
+
+
+def test_a_person_takes_the_photographs(tmp_path: Path) -> None:
+    """Patterns out, photographs in, in rounds; what was photographed is asked for once."""
+    line = Response(np.array([[-0.004 / 0.996, 1.0]]))
+    given: dict[str, Any] = {"strategy": "pixel", "response": line, "frames": 2, "exposures": [0.5, 8.0]}
+    scene, folder, store = rig(4, response="linear"), tmp_path / "photos", tmp_path / "T.zarr"
+    rounds = 0
+    while True:
+        person = FolderRig(folder, (4, 8), 1)
+        try:
+            T = acquire(person, geometry="aligned", store=store, **given)
+            break
+        except PhotographMissing:
+            rounds += 1
+            assert rounds < 30
+        _photograph_all(scene, folder)
+    assert off(dense(T), corner(4), (4, 8)) < 0.05
+
+
+def _photograph_all(scene: VirtualRig, folder: Path) -> None:
+    rows = (folder / "shots.csv").read_text().splitlines()[1:]
+    for row in rows:
+        _, pattern, seconds, save = row.split(",")
+        target = folder / f"{save}.png"
+        if target.exists():
+            continue
+        codes = np.asarray(cv2.imread(str(folder / pattern), cv2.IMREAD_UNCHANGED), np.float32)
+        codes /= 65535 if codes.max() > 255 else 255
+        image = scene.photograph(codes, float(seconds))
+        cv2.imwrite(str(target), (image.astype(np.uint16) * 16))
+
+
+class Swapping(VirtualRig):
+    """Gives the long exposures for the short ones, from some photograph on."""
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        if codes.sum() in (1.0, 2.0) and codes.max() == 1.0:
+            seconds = 1.0 / seconds
+        return super().photograph(codes, seconds)
+
+
+def test_exposures_in_the_wrong_order_are_named() -> None:
+    made = Swapping(corner(4), (4, 8), bits=12, ambient=0.05)
+    with pytest.raises(
+        AcquisitionError, match=r"photographs \d+ to \d+: images\[\d\] has .* is not brighter"
+    ):
+        acquire(made, geometry="aligned", strategy="pixel")
+
+
+def test_progress_is_told() -> None:
+    told: list[tuple[int, int]] = []
+    acquire(rig(4), geometry="aligned", strategy="hadamard", progress=lambda *n: told.append(n))
+    assert told[-1][0] == told[-1][1]
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+
+
+def test_auto_says_why(tmp_path: Path) -> None:
+    path = tmp_path / "T.zarr"
+    acquire(rig(), geometry="aligned", store=path)
+    told = Report.of(path)
+    assert told.strategy in ("pixel", "hadamard")
+    assert "signal over noise of a weak entry" in told.why
+    assert told.coverage == 1.0
+    light = np.linspace(0.0, 1.0, 9)
+    np.testing.assert_allclose(from_srgb(Calibration.of(path).projector.codes(light)), light, atol=0.01)
+    assert 0 < told.noise_sum < told.noise_direct < 0.1
+    assert told.defect < 0.3
+    for line in (told.to_json(), str(told)):
+        assert told.strategy in line
+
+
+def test_a_pixel_that_every_exposure_saturates(tmp_path: Path) -> None:
+    """It is not told: masked, its entry of unknown variance; the others are as they are."""
+    T = 0.02 * np.eye(32)
+    T[5, 5] = 5.0
+    made, path = VirtualRig(T, (4, 8), bits=12, response="linear"), tmp_path / "T.zarr"
+    line = Response(np.array([[-0.004 / 0.996, 1.0]]))
+    given = {"strategy": "pixel", "exposures": [4.0, 8.0], "response": line}
+    found = acquire(made, geometry="aligned", store=path, **given)
+    assert np.flatnonzero(found.masked).tolist() == [5]
+    told = Report.of(path)
+    assert told.masked == 1 / 32
+    assert told.unknown > 0
+    np.testing.assert_allclose(np.delete(found.first_bounce, 5), 0.02, rtol=0.1)
+
+
+def test_what_a_report_does_not_know_is_null() -> None:
+    part: dict[str, Any] = {"coverage": 1.0, "masked": 0.0, "saturated": 0.0, "entries": 9, "unknown": 0.0}
+    told = Report(
+        "pixel", "as asked for", (4, 8), 1, 36, 72, [0.1, 2.0], **part, noise_direct=0.01, noise_sum=0.02,
+        defect=float("nan"), levels=[{"level": 1, "cells": 2, "entries": 8, "colours": 2, "patterns": 8}],
+    )  # fmt: skip
+    assert json.loads(told.to_json())["defect"] is None
+    assert "reciprocity not told" in str(told)
+    assert "in 2 group(s) without conflict" in str(told)
