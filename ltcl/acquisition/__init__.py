@@ -2,7 +2,8 @@
 """From photographs to a transport: what drives projectors and cameras, and what their pictures say.
 
     rig         Rig, what a set-up of projector and camera must offer; Shots, which checks and counts
-    rigs/       set-ups: virtual (over a known T), folder (photographs taken by a person)
+    rigs/       set-ups: virtual (over a known T), Mitsuba (rendered), folder (photographs taken by a person),
+                live (a camera on a cable and a second display)
     radiometry/ light from codes: response, noise, exposures, black, merging, colours
     geometry/   which projector pixel a camera pixel sees: Gray code, phase shift, resampling
 
@@ -13,6 +14,27 @@ from __future__ import annotations
 
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.rig import Rig, Shots
-from ltcl.acquisition.rigs import FolderRig, VirtualRig
+from ltcl.acquisition.rigs import (
+    Display,
+    FolderRig,
+    GPhoto2Camera,
+    LiveRig,
+    MitsubaRig,
+    OpenCVCamera,
+    VirtualRig,
+    mitsuba_scene,
+)
 
-__all__ = ["Correspondence", "FolderRig", "Rig", "Shots", "VirtualRig"]
+__all__ = [
+    "Correspondence",
+    "Display",
+    "FolderRig",
+    "GPhoto2Camera",
+    "LiveRig",
+    "MitsubaRig",
+    "OpenCVCamera",
+    "Rig",
+    "Shots",
+    "VirtualRig",
+    "mitsuba_scene",
+]
