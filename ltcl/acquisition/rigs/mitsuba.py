@@ -216,7 +216,7 @@ def _called(scene: Any) -> str:
     if isinstance(scene, dict):
         return "dict"
     if isinstance(scene, (str, os.PathLike)):
-        return scene if scene in SCENES else os.path.basename(os.fspath(scene))
+        return os.path.basename(os.fspath(scene))  # a name of ours is its own
     raise InputTypeError(
         f"scene is a {type(scene).__name__}; it must be one of {', '.join(SCENES)}, a dict or an XML file"
     )
