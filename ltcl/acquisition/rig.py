@@ -262,7 +262,7 @@ def to_unit(name: str, image: np.ndarray, source: Any) -> np.ndarray:
 
     Examples
     --------
-    >>> to_unit("photograph 1", np.array([[0, 51, 255]], np.uint8), None)
+    >>> to_unit("photograph 1", np.array([[0, 51, 255]], np.uint8), None).round(2)
     array([[0. , 0.2, 1. ]], dtype=float32)
     """
     levels = _levels(source, image.dtype)

@@ -111,7 +111,7 @@ class OpenCVCamera:
     >>> import tempfile
     >>> path = f"{tempfile.mkdtemp()}/grey.avi"
     >>> video = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 30, (32, 16))
-    >>> video.write(np.full((16, 32, 3), 128, np.uint8))
+    >>> _ = video.write(np.full((16, 32, 3), 128, np.uint8))
     >>> video.release()
     >>> with OpenCVCamera(path, channels=1, seconds=1 / 30) as camera:
     ...     camera.frame().shape

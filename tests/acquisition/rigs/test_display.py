@@ -20,7 +20,9 @@ def dummy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def screen() -> np.ndarray:
     """(H, W, 3)."""
-    return pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    surface = pygame.display.get_surface()
+    assert surface is not None
+    return pygame.surfarray.array3d(surface).swapaxes(0, 1)
 
 
 def test_pixels_are_square_blocks_in_the_middle() -> None:

@@ -29,6 +29,7 @@ def scene(**options: Any) -> VirtualRig:
 def codes_on_screen() -> np.ndarray:
     """What the middles of the blocks show, (h, w) of green, if they stand in the middle of the surface."""
     surface = pygame.display.get_surface()
+    assert surface is not None
     width, height = surface.get_size()
     block = min(width // GRID[1], height // GRID[0])
     x, y = (width - GRID[1] * block) // 2 + block // 2, (height - GRID[0] * block) // 2 + block // 2
