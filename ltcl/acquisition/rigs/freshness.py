@@ -113,11 +113,19 @@ class Freshness:
             for _ in range(self._retakes + 1 if plain else 1):
                 self._stage.show(np.full_like(codes, code))
                 flash = self._steady()
-                if self._unlike(flash, frame):
+                if self._came(flash, frame, code):
                     return flash
         if plain:
             raise AcquisitionError("the frame is stale: the camera sees no flash of the display any more")
         return None
+
+    def _came(self, flash: Frame, frame: Frame, code: float) -> bool:
+        """Whether the flash is what was shown last: white only adds light, black only takes it away.
+
+        Unlike `frame` alone would not do: an earlier flash may come that late.
+        """
+        step = (flash.cells - frame.cells) * (2 * code - 1)
+        return bool(step.max() > self.survey.tolerance and step.min() >= -self.survey.tolerance)
 
     def _plain(self, frame: Frame) -> bool:
         """Whether white and black must look different in this exposure."""

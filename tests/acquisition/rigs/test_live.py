@@ -89,17 +89,30 @@ def test_latency_that_jumps_spoils_no_photograph(clock: Clock, display: Display)
     camera = Watcher(clock, scene(**CLEAN), latency=0.05, readout=0.0)
     rig = LiveRig(camera, display)
     rig.calibrate()
-    late, seen = [0.0], [0.0]
+    late = [0.0]
 
-    def latency(moment: float) -> float:
-        # Frames hang for a while and catch up; none shows an older picture than the one before.
+    def latency(_: float) -> float:
         late[0] = rng.uniform(0, 0.4) if rng.random() < 0.1 else max(0.0, late[0] - FRAME)
-        seen[0] = max(seen[0], moment - 0.05 - late[0])
-        return moment - seen[0]
+        return 0.05 + late[0]
 
     camera.latency = latency
     for codes in [*patterns(15), *(single((1, k)) for k in range(8))]:
         np.testing.assert_array_equal(rig.photograph(codes, SECONDS), truth.photograph(codes, SECONDS))
+
+
+@pytest.mark.parametrize("readout", [0.0, 0.03])
+def test_latency_that_grows_tenfold_spoils_no_photograph(
+    clock: Clock, display: Display, readout: float
+) -> None:
+    linear = {**CLEAN, "response": "linear", "projector_response": "linear"}
+    camera, truth = Watcher(clock, scene(**linear), latency=0.08, readout=readout), scene(**linear)
+    rig = LiveRig(camera, display)
+    codes = patterns(3)
+    rig.photograph(codes[0], SECONDS)
+    camera.latency = lambda _: 0.8
+    faint = [single((1, k), 2 / 255) for k in range(4)]
+    for shown in [codes[1], codes[2], *faint]:
+        np.testing.assert_array_equal(rig.photograph(shown, SECONDS), truth.photograph(shown, SECONDS))
 
 
 def test_a_camera_that_freezes_is_named_stale(clock: Clock, display: Display) -> None:

@@ -60,7 +60,8 @@ class Watcher:
     """A streaming camera with a rolling shutter.
 
     Row r of the frame that arrives at time t shows what was on the screen at
-    t - latency(t) - readout (1 - r / H). Frames wait in a queue; who reads too late gets old ones.
+    t - latency(t) - readout (1 - r / H), but nothing older than the frame before: when the latency grows,
+    frames hang. Frames wait in a queue; who reads too late gets old ones.
     """
 
     channels = 1
@@ -85,6 +86,7 @@ class Watcher:
         self.unplugged = False
         self.frozen: np.ndarray | None = None
         self._index = 0
+        self._seen = -math.inf
         self._history: list[tuple[float, np.ndarray]] = [(-math.inf, np.zeros(GRID, np.float32))]
         clock.watchers.append(self._look)
 
@@ -108,7 +110,8 @@ class Watcher:
 
     def _picture(self, arrival: float) -> np.ndarray:
         h = GRID[0]
-        moments = arrival - self.latency(arrival) - self.readout * (1 - np.arange(h) / h)
+        self._seen = max(self._seen, arrival - self.latency(arrival))
+        moments = self._seen - self.readout * (1 - np.arange(h) / h)
         places = [max(k for k, (since, _) in enumerate(self._history) if since <= m) for m in moments]
         image = None
         for place in sorted(set(places)):
