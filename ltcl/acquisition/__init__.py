@@ -2,7 +2,8 @@
 """From photographs to a transport: what drives projectors and cameras, and what their pictures say.
 
     rig         Rig, what a set-up of projector and camera must offer; Shots, which checks and counts
-    rigs/       set-ups: virtual (over a known T), folder (photographs taken by a person)
+    rigs/       set-ups: virtual (over a known T), Mitsuba (rendered), folder (photographs taken by a person),
+                live (a camera on a cable and a second display)
     radiometry/ light from codes: response, noise, exposures, black, merging, colours
     geometry/   which projector pixel a camera pixel sees: Gray code, phase shift, resampling
     calibration, measuring, exposing    all that is measured once of a set-up, and for how many seconds
@@ -17,8 +18,32 @@ from __future__ import annotations
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.rig import Rig, Shots
-from ltcl.acquisition.rigs import FolderRig, VirtualRig
+from ltcl.acquisition.rigs import (
+    Display,
+    FolderRig,
+    GPhoto2Camera,
+    LiveRig,
+    MitsubaRig,
+    OpenCVCamera,
+    VirtualRig,
+    mitsuba_scene,
+)
 from ltcl.acquisition.scanning.report import Report
 from ltcl.acquisition.task import acquire
 
-__all__ = ["Calibration", "Correspondence", "FolderRig", "Report", "Rig", "Shots", "VirtualRig", "acquire"]
+__all__ = [
+    "Calibration",
+    "Correspondence",
+    "Display",
+    "FolderRig",
+    "GPhoto2Camera",
+    "LiveRig",
+    "MitsubaRig",
+    "OpenCVCamera",
+    "Report",
+    "Rig",
+    "Shots",
+    "VirtualRig",
+    "acquire",
+    "mitsuba_scene",
+]

@@ -207,26 +207,14 @@ class Shots:
         """The scaled image; remembers the first for comparison, but only a good one."""
         name = f"photograph {number}"
         image = np.asarray(image)
-        _refuse_no_photograph(name, image, self.channels)
+        check_photograph(name, image, self.channels)
         kind = (image.shape, image.dtype)
         if self._first is not None and kind != self._first:
             was, dtype = self._first
             raise AcquisitionError(
                 f"{name} is {image.dtype} {image.shape}; it must be {dtype} {was}, as the first was"
             )
-        levels = _levels(self.rig, image.dtype)
-        if levels is None:
-            with np.errstate(over="ignore"):
-                scaled = image.astype(np.float32, copy=False)
-            if not np.isfinite(scaled).all():
-                bad = int(np.count_nonzero(~np.isfinite(scaled)))
-                raise AcquisitionError(f"{name} has {bad} NaN or infinite value(s); all must be finite")
-        else:
-            if image.max() > levels:
-                raise AcquisitionError(
-                    f"{name} reaches {image.max()}; rig.bits says that {levels} is the largest code"
-                )
-            scaled = image * np.float32(1.0 / levels)
+        scaled = to_unit(name, image, self.rig)
         self._first = kind
         return scaled
 
@@ -255,7 +243,7 @@ def _exposures(given: Any) -> tuple[float, ...] | None:
     return tuple(float(seconds) for seconds in offered)
 
 
-def _levels(rig: Rig, dtype: np.dtype) -> int | None:
+def _levels(rig: Any, dtype: np.dtype) -> int | None:
     if dtype.kind == "f":
         return None
     if dtype == np.uint8:
@@ -264,7 +252,36 @@ def _levels(rig: Rig, dtype: np.dtype) -> int | None:
     return (1 << (16 if bits is None else checks.count("rig.bits", bits, least=9, most=16))) - 1
 
 
-def _refuse_no_photograph(name: str, image: np.ndarray, channels: int) -> None:
+def to_unit(name: str, image: np.ndarray, source: Any) -> np.ndarray:
+    """A photograph of a rig or a camera as float32, codes over full scale.
+
+    Raises
+    ------
+    AcquisitionError
+        It reaches past the bits that `source` says are in use, or is not finite.
+
+    Examples
+    --------
+    >>> to_unit("photograph 1", np.array([[0, 51, 255]], np.uint8), None).round(2)
+    array([[0. , 0.2, 1. ]], dtype=float32)
+    """
+    levels = _levels(source, image.dtype)
+    if levels is None:
+        with np.errstate(over="ignore"):
+            scaled = image.astype(np.float32, copy=False)
+        if not np.isfinite(scaled).all():
+            bad = int(np.count_nonzero(~np.isfinite(scaled)))
+            raise AcquisitionError(f"{name} has {bad} NaN or infinite value(s); all must be finite")
+        return scaled
+    if image.max() > levels:
+        raise AcquisitionError(
+            f"{name} reaches {image.max()}; rig.bits says that {levels} is the largest code"
+        )
+    return image * np.float32(1.0 / levels)
+
+
+def check_photograph(name: str, image: np.ndarray, channels: int) -> None:
+    """Refuse what is no photograph of so many channels, or an empty one."""
     if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
         raise AcquisitionError(f"{name} holds {image.dtype}; it must hold uint8, uint16 or float")
     colours = () if channels == 1 else (3,)

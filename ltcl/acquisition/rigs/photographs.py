@@ -9,16 +9,15 @@ would clip noise); 65535 is the sensor's white level.
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ltcl import checks, images
-from ltcl.acquisition.rigs import exif
+from ltcl.acquisition.rigs import exif, extras
 from ltcl.acquisition.rigs.exif import Taken
-from ltcl.errors import AcquisitionError, FileError
+from ltcl.errors import FileError
 from ltcl.files import input_file
 
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
@@ -57,13 +56,8 @@ def read(path: Path) -> Photograph:
 
 
 def _developed(path: Path) -> Photograph:
-    try:
-        rawpy: Any = importlib.import_module("rawpy")
-    except ImportError:
-        raise AcquisitionError(
-            f"{path}: camera RAW needs rawpy, which is not installed; "
-            'install it with pip install "ltcl[camera]", or save the photographs as 16-bit TIFF'
-        ) from None
+    instead = ", or save the photographs as 16-bit TIFF"
+    rawpy = extras.load("rawpy", "camera", f"{path}: camera RAW", instead)
     try:
         with rawpy.imread(str(path)) as raw:
             _check_fits(raw.sizes)

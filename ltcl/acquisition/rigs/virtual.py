@@ -15,9 +15,6 @@ Known limit: no blur, no light that falls on the camera outside T.
 
 from __future__ import annotations
 
-import hashlib
-import struct
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -25,6 +22,7 @@ import numpy as np
 from ltcl import channels, checks
 from ltcl.acquisition.rig import as_codes, as_seconds
 from ltcl.acquisition.rigs import curves
+from ltcl.acquisition.rigs.noise import NoiseStreams
 from ltcl.acquisition.rigs.sensor import Sensor
 from ltcl.errors import InputError
 
@@ -122,9 +120,8 @@ class VirtualRig:
         self._ambient = _ambient(ambient, rows, self.channels)
         self._sensitivity = checks.number("sensitivity", sensitivity, above=0.0)
         self.exposures = None if exposures is None else tuple(exposures)
-        self._seed = checks.count("seed", seed, least=0)
+        self._noise = NoiseStreams(seed)
         self._named = {"response": curves.called(response), "projector": curves.called(projector_response)}
-        self._asked: Counter[bytes] = Counter()
         self._last: tuple[np.ndarray, np.ndarray] | None = None  # brackets ask for the same codes again
 
     @property
@@ -154,7 +151,7 @@ class VirtualRig:
         """
         codes, seconds = as_codes(codes, self.projector_grid, self.channels), as_seconds(seconds)
         value = self._sensitivity * seconds * self.radiance(codes)
-        return self._sensor.expose(np.maximum(value, 0.0), self._noise(codes, seconds))
+        return self._sensor.expose(np.maximum(value, 0.0), self._noise.of(codes, seconds))
 
     def radiance(self, codes: Any) -> np.ndarray:
         """L, without a sensor: float64, (H, W) or (H, W, 3). What the photographs are to be compared with.
@@ -202,20 +199,11 @@ class VirtualRig:
             "gain": sensor.electrons,
             "read": sensor.read,
             "sensitivity": self._sensitivity,
-            "seed": self._seed,
+            "seed": self._noise.seed,
         }
 
     def _lit(self, d: int, code: np.ndarray) -> np.ndarray:
         return self._projector_black + (1.0 - self._projector_black) * self._projector[d](code)
-
-    def _noise(self, codes: np.ndarray, seconds: float) -> np.random.Generator:
-        """A counter-based stream (Philox) whose key is all that the noise may depend on."""
-        asked = hashlib.blake2b(repr(codes.shape).encode() + codes.tobytes(), digest_size=16)
-        asked.update(struct.pack("<d", seconds))
-        place = asked.digest()
-        key = hashlib.blake2b(place + f"{self._seed} {self._asked[place]}".encode(), digest_size=16)
-        self._asked[place] += 1
-        return np.random.Generator(np.random.Philox(key=int.from_bytes(key.digest(), "little")))
 
 
 def _matrices(T: Any) -> tuple[Any, ...]:
