@@ -56,7 +56,8 @@ def _find_first_bounce(store: BlockStore) -> None:
         for block in range(store.layout.blocks()):
             start, stop = store.layout.span(block)
             F[channel, start:stop] = store.block(channel, block, "rows").matrix.diagonal(start)
-    store.extra("masked", np.asarray((F <= 0).any(axis=0)))
+    if "masked" not in store.extras:  # of a run that was killed between the two
+        store.extra("masked", np.asarray((F <= 0).any(axis=0)))
     store.extra("first_bounce", F)
 
 
