@@ -145,8 +145,8 @@ def test_what_does_not_rise_above_the_launch_floor_has_no_slope(load: Callable[[
 
 
 def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any) -> None:
-    at = load("_ways").problem(3)
-    truth = at.l_out - dihedral(3, albedo=0.8).A @ at.l_out
+    at = load("_ways").problem(4)
+    truth = at.l_out - dihedral(4, albedo=0.8).A @ at.l_out
     np.testing.assert_allclose(at.l_d, truth, rtol=1e-6)
     found = load("fig7").ways(given, at)
     assert sorted(found) == ["both", "iteration", "peer", "rows", "series"]
@@ -158,7 +158,7 @@ def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any
 
 def test_rows_in_wavelets_are_those_of_R(load: Callable[[str], Any], given: Any) -> None:
     ways = load("_ways")
-    at = ways.problem(3)
+    at = ways.problem(4)
     R = ways.dense(given, at).R.to_dense()
     W = Wavelet(given.device, at.rows.grid, "db2").to_dense()
     both = ways.of_both(given, at)
