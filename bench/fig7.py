@@ -150,10 +150,11 @@ class Law:
 def law(pixels: np.ndarray, spent: np.ndarray) -> Law:
     """The slope of log time over log N above the launch floor.
 
-    The floor is the time at the smallest N, where a solve is launches and checks. Points count from where all
-    take at least five times as long, and the last three in any case; the slope is 0 where these do not rise.
+    The floor is the least time at any N: small solves are launches and checks, whose time varies. Points
+    count from where all take at least five times as long, and the last three in any case; the slope is 0
+    where the floor is one of these.
     """
-    floor = float(spent[0])
+    floor = float(spent.min())
     first = min(int(np.flatnonzero(spent < ABOVE * floor)[-1]) + 1, len(pixels) - LEAST)
     pixels, above = pixels[first:], spent[first:] - floor
     if above.min() <= 0.0:
