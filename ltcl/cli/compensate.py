@@ -208,7 +208,7 @@ def run(
         if json:
             console.answer({"folder": out, **text, **compensate_frames.entry(source, done)})
         else:
-            compensate_frames.show(done, told)
+            compensate_frames.show(done, told, gain == "auto")
         return
     names = {"background": background, "weights": weights}
     entries = compensate_pictures.run(T, picture, desired, out, text, names, settings)

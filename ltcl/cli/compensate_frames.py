@@ -81,7 +81,7 @@ def entry(path: Path, done: CompensatedFrames) -> dict[str, Any]:
     }
 
 
-def show(done: CompensatedFrames, told: str) -> None:
+def show(done: CompensatedFrames, told: str, auto: bool = False) -> None:
     """Print what came out, what is `told` of the errors, and on stderr what would help."""
     worst, most = done.worst, done.most_clipped
     console.table(
@@ -105,7 +105,8 @@ def show(done: CompensatedFrames, told: str) -> None:
         typer.echo(told)
     if most.clipped > _MANY:
         count = sum(record.clipped > _MANY for record in done.records)
+        advice = "" if auto else f"; try a --gain below {done.gain:.3g}"
         console.note(
-            f"{count} frame(s) ask for light beyond the projector's, frame {most.number} ({most.name}) most; "
-            f"try a --gain below {done.gain:.3g}"
+            f"{count} frame(s) ask for light beyond the projector's, frame {most.number} ({most.name}) "
+            f"most{advice}"
         )

@@ -28,12 +28,17 @@ def _bytes(text: str) -> int:
 
 _Out = Annotated[
     Path,
-    typer.Option("--out", "-o", metavar="FILE", help="The compressed transport: .npz.", show_default=False),
+    typer.Option(
+        "--out", "-o", metavar="FILE", help="The compressed transport: .npz or .zarr.", show_default=False
+    ),
 ]
 _Budget = Annotated[
     int | None,
     typer.Option(
-        parser=_bytes, metavar="SIZE", help="Bytes that it may take, such as 50MB.", show_default=False
+        parser=_bytes,
+        metavar="SIZE",
+        help="Bytes that the numbers of R may take, such as 50MB.",
+        show_default=False,
     ),
 ]
 _Basis = Annotated[
@@ -64,9 +69,13 @@ def run(
     from ltcl.compression import compress
 
     formats.find(out)  # refused before a long computation
-    if out.suffix.lower() != ".npz":
-        raise InputError(f"--out is {out}; a compressed transport must be a .npz file")
+    if out.suffix.lower() not in (".npz", ".zarr"):
+        raise InputError(f"--out is {out}; a compressed transport must be a .npz or a .zarr")
+    transports.refuse_same(out, file)
     T = transports.load(file, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
+    if T.is_compressed:
+        error = f"with an error of {T.error:.2g}"
+        raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
     with console.Steps(1) as steps:
         steps.item(str(file))
         C = compress(T, rtol, budget, basis=basis or None, progress=steps.at)
@@ -76,7 +85,7 @@ def run(
         "out": out,
         "bytes": C.compression.uncompressed,
         "bytes_compressed": C.nbytes,
-        "bytes_on_disk": out.stat().st_size,
+        "bytes_on_disk": transports.on_disk(out),
         "solution_error": C.error,
         "compression": C.compression,
     }
@@ -93,9 +102,14 @@ def _show(text: dict[str, Any]) -> None:
     window = "x".join(map(str, made["window"]))
     typer.echo(f"Tried on {window} pixels, errors in the 2-norm of R")
     console.table(
-        ("channel", "basis", "core", "kept a row", "bytes", "error", "product", "left because"),
-        [(colour, *_trial(trial)) for colour, channel in pairs for trial in channel["trials"]],
+        ("channel", "basis", "core", "kept a row", "bytes", "error", "product", "taken, or left because"),
+        [
+            (colour, *_trial(trial, channel["basis"]))
+            for colour, channel in pairs
+            for trial in channel["trials"]
+        ],
     )
+    typer.echo("  taken: the fewest bytes of all whose time x bytes is within a quarter of the least")
     typer.echo("\nTaken, on all pixels")
     console.table(
         (
@@ -119,12 +133,12 @@ def _show(text: dict[str, Any]) -> None:
     before, after = (checks.size(text[name]) for name in ("bytes", "bytes_compressed"))
     more = ", which is more" if text["bytes_compressed"] >= text["bytes"] else ""
     typer.echo(
-        f"\n{text['out']}: {before} to {after}{more}, solutions within {within}, "
+        f"\n{text['out']}: {before} to {after}{more} with the first bounce, solutions within {within}, "
         f"{checks.size(text['bytes_on_disk'])} on disk, in {made['seconds']:.3g} s"
     )
 
 
-def _trial(trial: dict[str, Any]) -> tuple:
+def _trial(trial: dict[str, Any], taken: str) -> tuple:
     return (
         trial["basis"],
         _core(trial),
@@ -132,7 +146,7 @@ def _trial(trial: dict[str, Any]) -> tuple:
         checks.size(trial["nbytes"]),
         trial["error"],
         _time(trial["seconds"]),
-        trial["left"],
+        trial["left"] or ("taken" if trial["basis"] == taken else None),
     )
 
 

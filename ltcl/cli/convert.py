@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from ltcl import checks
-from ltcl.cli import console, info, options
+from ltcl.cli import console, info, options, transports
 from ltcl.errors import InputError
 from ltcl.store import Parts, Record, formats
 
@@ -43,12 +43,7 @@ def run(
     if json:
         console.answer({"source": source, **facts})
     else:
-        typer.echo(f"{target}: {facts['stored']}, {checks.size(_on_disk(target))} on disk")
-
-
-def _on_disk(path: Path) -> int:
-    files = path.rglob("*") if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
+        typer.echo(f"{target}: {facts['stored']}, {checks.size(transports.on_disk(target))} on disk")
 
 
 def _with_grids(record: Record | Parts, grid: Any, camera_grid: Any) -> Record | Parts:

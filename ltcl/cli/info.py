@@ -69,7 +69,7 @@ def _show(found: list[dict[str, Any]]) -> None:
                 _times(entry["shape"]),
                 entry["channels"],
                 _times(entry["grid"]) or "not told",
-                _times(entry["camera_grid"]) or _untold(entry["shape"]),
+                _camera(entry),
                 f"{entry['stored']} {entry['dtype']}",
                 entry["entries"],
                 checks.size(entry["nbytes"]),
@@ -169,8 +169,13 @@ def _times(shape: Any) -> str:
     return "" if shape is None else f"{shape[0]} x {shape[1]}"
 
 
-def _untold(shape: Any) -> str:
-    return "the same" if shape[0] == shape[1] else "not told"
+def _camera(entry: dict[str, Any]) -> str:
+    """The grid of a camera, where it is not that of the projector."""
+    rows, columns = entry["shape"]
+    given = entry["camera_grid"]
+    if given is None or tuple(given) == tuple(entry["grid"] or ()):
+        return "the same" if rows == columns else "not told"
+    return _times(given)
 
 
 def _range(limits: Any) -> str | None:

@@ -42,6 +42,7 @@ def run(
     from ltcl.store import inverses
 
     inverses.check_name(out)  # refused before a long computation
+    transports.refuse_same(out, file)
     T = transports.load(file, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
     with console.Steps(1) as steps:
         steps.item(str(file))

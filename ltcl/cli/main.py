@@ -32,13 +32,27 @@ from ltcl.cli import (
 )
 from ltcl.errors import LtclError
 
+_UsageError: Any = typer.BadParameter.__base__  # typer exports those below it only
+_GIVEN = "ltcl.given"  # of a context: the words after the program's name
+
 
 class _Commands(TyperGroup):
-    """Turns what a command raises on purpose into one line and an exit code."""
+    """Turns what a command raises on purpose, and wrong usage, into one line and an exit code."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.meta[_GIVEN] = given = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except _UsageError as error:
+            if not given:  # which shows the help
+                raise
+            raise _failed(_usage(error, given), 2) from error
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
+        except _UsageError as error:
+            raise _failed(_usage(error, ctx.meta[_GIVEN]), 2) from error
         except LtclError as error:
             raise _failed(str(error), 1) from error
         except MemoryError as error:
@@ -52,12 +66,48 @@ def _failed(message: str, code: int) -> typer.Exit:
     return typer.Exit(code)
 
 
+# What typer says of a value, and how we say it.
+_TYPERS = (
+    ("^Value error, .* is not one of ", "it must be one of "),
+    ("^Input should be", "it must be"),
+    (", unable to parse .*", ""),
+)
+
+
+def _usage(error: Any, given: Sequence[str]) -> str:
+    """Wrong usage in one line: the option, what it was, what it must be, where there is more to read."""
+    path = error.ctx.command_path if error.ctx else "ltcl"
+    text = error.format_message().rstrip(".")
+    names = getattr(getattr(error, "param", None), "opts", [])
+    for value in filter(None, (_value(given, name) for name in names)):
+        _, _, wanted = text.partition(": ")
+        for typers, ours in _TYPERS:
+            wanted = re.sub(typers, ours, wanted)
+        text = f"{'/'.join(names)} is {value!r}; {wanted.replace(f'{value!r} is', 'it is')}"
+    return f"{text}; see '{path} --help'"
+
+
+def _value(given: Sequence[str], name: str) -> str | None:
+    """What stands behind an option.
+
+    >>> _value(["info", "--size", "2"], "--size"), _value(["--size=2"], "--size"), _value(["2"], "--size")
+    ('2', '2', None)
+    """
+    for word, behind in zip(given, [*given[1:], None], strict=True):
+        if word == name:
+            return behind
+        if word.startswith(f"{name}="):
+            return word.removeprefix(f"{name}=")
+    return None
+
+
 # How the library's messages name arguments that are options here.
 _ARGUMENT = re.compile(
     r"\b(grid|camera_grid|on_dark|first_bounce|method|rtol|gain|loss|batch|format|encoding)="
     r"(?:'([\w-]+)'|\((\w+), (\w+)\)|(\d[\d.e-]*))"
 )
 _SUBJECT = re.compile(r"(^|: |; )(rtol|method|exact|inverse|budget|fps)(?= (?:is|has|mixes) )")
+_RTOL = re.compile(r"(\brtol is \S+; it must be) (?:a finite number at least 0 and below 1|above 0$)")
 _COMMAND = re.compile(r"ltcl\.(invert|compress)\(T(?:, (\w+)=(?:\.\.\.|'(\w+)'))?\)")
 
 _WORDS = {
@@ -91,6 +141,7 @@ def as_options(message: str) -> str:
 
     for words, shown in _WORDS.items():
         message = message.replace(words, shown)
+    message = _RTOL.sub(r"\1 above 0 and below 1", message)
     message = _SUBJECT.sub(r"\1--\2", _COMMAND.sub(command, message))
     return _ARGUMENT.sub(option, message)
 

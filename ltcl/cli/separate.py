@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from ltcl import report
+from ltcl import checks, report
 from ltcl.cli import console, options, pictures, results, transports
 from ltcl.separation import Separation
 
@@ -126,7 +126,7 @@ def _show(out: Path, entries: list[dict[str, Any]], told: str) -> None:
                 part["part"],
                 None if part["share"] is None else f"{100 * part['share']:.2f} %",
                 sum(channel["products"] for channel in part["channels"]) if part["channels"] else None,
-                max((channel["residual"] for channel in part["channels"]), default=None),
+                _residual(part["channels"]),
                 part["png_scale"],
             )
             for entry in entries
@@ -137,3 +137,13 @@ def _show(out: Path, entries: list[dict[str, Any]], told: str) -> None:
     typer.echo(f"\neach part as .exr and .png in {', '.join(map(str, places))}")
     if told:
         typer.echo(told)
+    channels = [channel for entry in entries for part in entry["parts"] for channel in part["channels"]]
+    bounds = [channel["error"] for channel in channels if channel["error"] is not None]
+    if bounds:
+        worst = 100 * float(checks.upwards(max(bounds)))
+        typer.echo(f"by the inverse, each part is off by up to {worst:.2g} %")
+
+
+def _residual(channels: list[dict[str, Any]]) -> float | None:
+    """The largest; None where there is none, as of an inverse."""
+    return max((c["residual"] for c in channels if c["error"] is None), default=None)

@@ -93,13 +93,31 @@ def _with_first_bounce(exact: Transport, T: Transport) -> Transport:
     )
 
 
+def refuse_same(out: Path, file: Path) -> None:
+    """Refuse to put what is made of a transport in the place of the transport.
+
+    Raises
+    ------
+    InputError
+        Both are one file.
+    """
+    if out.exists() and file.exists() and out.samefile(file):
+        raise InputError(f"--out is {out}, which is TRANSPORT itself; it must be another file")
+
+
+def on_disk(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
 def caveat(what: str, T: Transport, exact: Path | None = None) -> str:
     """A line on which transport `what` is shown is of; none where T is no compressed one.
 
     >>> caveat("errors are", Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2)))
     ''
     """
-    if exact is not None:
+    if exact is not None and T.error:
         return f"{what} of {exact}, by which solutions were corrected"
     off = f"which itself is off by up to {100 * float(checks.upwards(T.error)):.2g} %"
     return f"{what} of the compressed transport, {off}" if T.error else ""

@@ -141,7 +141,7 @@ class Interreflection:
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1 of R, (stop - start, N) float32."""
-        lit, name = self.F > 0, f"rows {start} to {stop - 1} of T"
+        lit, name = self.F > 0, f"T in rows {start} to {stop - 1}"
         rows = checks.finite(name, checks.real(name, self.T.rows(start, stop)))
         block = rows / np.where(lit, self.F, np.inf)
         here = np.arange(stop - start)

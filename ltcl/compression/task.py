@@ -78,9 +78,9 @@ def compress(
     Returns
     -------
     Transport
-        Its `error` is the bound on solutions, at most `rtol`; `nbytes` what it takes; `compression` a
-        `Compression`, which tells how it was made. Its systems solve on coefficients where both sides have
-        one basis.
+        Its `error` is the bound on solutions, at most `rtol`; `nbytes` what it takes with its first bounce,
+        which is in no budget; `compression` a `Compression`, which tells how it was made. Its systems solve
+        on coefficients where both sides have one basis.
 
     Raises
     ------

@@ -16,6 +16,7 @@ import scipy.sparse
 from ltcl import checks, parts
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import as_path
+from ltcl.solvers import Inverse
 from ltcl.store import arrays, formats
 from ltcl.store.blocks import BlockStore, StoredRows
 from ltcl.store.compressed import Parts
@@ -130,7 +131,8 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     (2, 3)
     """
     if not isinstance(T, Transport):
-        raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport")
+        also = "; ltcl.save_inverse saves it" if isinstance(T, Inverse) else ""
+        raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport{also}")
     if T.blocks is not None:
         raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
     held = (np.ndarray, scipy.sparse.csr_array, StoredRows)

@@ -38,6 +38,28 @@ def test_the_tables_tell_what_was_tried(program: Program, colour_transport: Path
     assert f"solutions within {within}, " in outcome.out
 
 
+def test_a_folder_of_row_blocks_takes_it_too(program: Program, transport: Path, tmp_path: Path) -> None:
+    out = tmp_path / "C.zarr"
+    outcome = program("compress", transport, "--out", out, "--rtol", "0.05", "--basis", "haar")
+    assert outcome.code == 0
+    assert "  taken" in outcome.out
+    assert 0.0 < ltcl.load(out).error <= 0.05
+
+
+def test_what_it_came_from_is_never_replaced(program: Program, transport: Path, tmp_path: Path) -> None:
+    own = tmp_path / "T.npz"
+    own.write_bytes(before := transport.read_bytes())
+    for command in ("compress", "invert"):
+        program(command, own, "--out", own).refused("which is TRANSPORT itself; it must be another file")
+    assert own.read_bytes() == before
+
+
+def test_what_is_compressed_already_is_named(program: Program, transport: Path, tmp_path: Path) -> None:
+    C = tmp_path / "C.npz"
+    ltcl.save(C, ltcl.compress(ltcl.load(transport), 0.05, basis="haar"))
+    program("compress", C, "--out", tmp_path / "D.npz").refused(f"{C}: is compressed already")
+
+
 def test_refusals(program: Program, transport: Path, tmp_path: Path) -> None:
     out = tmp_path / "C.npz"
     program("compress", transport, "--out", out, "--rtol", "2").refused("rtol is 2.0")

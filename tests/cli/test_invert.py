@@ -127,3 +127,20 @@ def test_info_tells_of_an_inverse(
     cut = inverse.with_name("cut.npz")
     cut.write_bytes(inverse.read_bytes()[:-40])
     program("info", cut).refused(f"{cut}: ")
+
+
+def test_parts_by_an_inverse_have_a_bound_and_no_residual(
+    program: Program, transport: Path, picture: Path, inverse: Path, tmp_path: Path
+) -> None:
+    outcome = program("separate", transport, picture, "--inverse", inverse, "--out", tmp_path / "parts")
+    assert outcome.code == 0
+    assert "diverges" not in outcome.out
+    assert "by the inverse, each part is off by up to 0." in outcome.out
+
+
+@pytest.mark.parametrize("rtol", ["0", "1", "1.5", "-1"])
+def test_a_tolerance_has_one_range(
+    program: Program, transport: Path, picture: Path, tmp_path: Path, rtol: str
+) -> None:
+    outcome = program("compensate", transport, picture, "--out", tmp_path / "out", "--rtol", rtol)
+    outcome.refused("; it must be above 0 and below 1")

@@ -71,7 +71,27 @@ def test_wrong_usage_exits_with_2(program: Program, arguments: list[str]) -> Non
     outcome = program(*arguments)
     assert outcome.code == 2
     assert outcome.out == ""
-    assert outcome.err
+    assert len(outcome.err.splitlines()) == 1
+    assert outcome.err.startswith("ltcl: error: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ["demo", "--size", "2"],
+            "--size is '2'; it must be greater than or equal to 4; see 'ltcl demo --help'",
+        ),
+        (["compress", "a", "--out=b", "--rtol=x"], "--rtol is 'x'; it must be a valid number"),
+        (["info", "a", "--xyz"], "No such option: --xyz"),
+        (["--xyz"], "No such option: --xyz; see 'ltcl --help'"),
+        (["convert", "a", "b", "--grid", "0x5"], "--grid is '0x5'; it is no grid; write height x width"),
+    ],
+)
+def test_wrong_usage_names_the_option_and_what_it_was(
+    program: Program, arguments: list[str], line: str
+) -> None:
+    assert f"ltcl: error: {line}" in program(*arguments).err
 
 
 def _raising(error: BaseException) -> Any:
@@ -118,7 +138,10 @@ def test_what_a_command_raises_becomes_a_line(
         ("such as ltcl.compress(T, basis='db2') has it", "such as 'ltcl compress --basis db2' has it"),
         ("that run had batch=1, this one has 4", "that run had --batch 1, this one has 4"),
         ("that run had encoding='auto', this one", "that run had --encoding auto, this one"),
-        ("rtol and atol are both 0; one of them must be positive", "--rtol is 0; it must be above 0"),
+        (
+            "rtol and atol are both 0; one of them must be positive",
+            "--rtol is 0; it must be above 0 and below 1",
+        ),
     ],
 )
 def test_arguments_are_named_as_options(message: str, shown: str) -> None:

@@ -80,7 +80,7 @@ def test_bad_rows_are_refused_by_number():
             return np.full((stop - start, 4), np.nan) if start else np.ones((stop - start, 3))
 
     R = Interreflection(source("T", Broken()), np.ones(4))
-    with pytest.raises(InputError, match=r"rows 2 to 3 of T has 8 NaN"):
+    with pytest.raises(InputError, match=r"T in rows 2 to 3 has 8 NaN"):
         R.rows(2, 4)
     with pytest.raises(InputError, match=r"T\.rows\(0, 2\) gave shape \(2, 3\); it must be \(2, 4\)"):
         R.rows(0, 2)
