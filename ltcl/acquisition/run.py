@@ -170,14 +170,8 @@ def _scan_cells(run: Run, progress: Progress) -> None:
     found = adaptive.scan(run.pictures, log, run.wanted.threshold, run.wanted.sigmas)
     mixing = run.pictures.calibration.mixing
     arrays = core.arrays(found.core, mixing)
-    beside = {name: run.store.extra(name) for name in run.store.extras if name.startswith(PREFIX)}
-    facts = run.store.attributes | {
-        "patterns": log.done,
-        "levels": [told._asdict() for told in found.levels],
-    }
-    zarr_folder.write(
-        run.store.path, Parts(arrays), extras=beside, attributes=facts, provenance=run.store.provenance
-    )
+    run.store.update(patterns=log.done, levels=[told._asdict() for told in found.levels])
+    zarr_folder.conclude(run.store, Parts(arrays), core.variances(found.core))
 
 
 def _plain(wanted: Settings) -> dict[str, Any]:

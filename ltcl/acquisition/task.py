@@ -124,7 +124,9 @@ def acquire(
         found = _found(path, resume)
         if found is not None:
             run.refuse_other(found, shots, wanted)
-        if found is None or not found.final:
+        if found is not None and found.final:
+            found.finalize()  # removes what a process that was killed at the very end had left
+        else:
             begun = found and run.resumed(found, shots, wanted)
             begun = begun or run.begin(path, shots, wanted, geometry, response)
             run.scan(begun, progress or (lambda done, total: None))

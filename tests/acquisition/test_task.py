@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,8 +24,26 @@ from ltcl.store import BlockStore
 from .scanning.helpers import CLEAN, corner, dense, off, rig, unit
 
 GRID = (8, 16)
-ROOT = Path(__file__).resolve().parents[2]
 STRATEGIES = ("pixel", "hadamard", "adaptive")
+
+
+class Scanned(NamedTuple):
+    """Of `rig()`, which nobody stopped."""
+
+    T: ltcl.Transport
+    path: Path
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scanned]:
+    """The scan of each strategy, made once."""
+
+    @cache
+    def made(strategy: str) -> Scanned:
+        path = tmp_path_factory.mktemp(strategy) / "T.zarr"
+        return Scanned(acquire(rig(), geometry="aligned", strategy=strategy, store=path), path)
+
+    return made
 
 
 @pytest.mark.parametrize(("response", "bits"), [("srgb", 8), ("film", 12)])
@@ -40,9 +56,9 @@ def test_patterns_that_no_scan_has_seen(strategy: str, response: str, bits: int)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_compensated_pictures(strategy: str) -> None:
+def test_compensated_pictures(scanned: Callable[[str], Scanned], strategy: str) -> None:
     """The pattern found with the measured transport, under the true one: 30 dB at least."""
-    T, truth = acquire(rig(seed=3), geometry="aligned", strategy=strategy), corner()
+    T, truth = scanned(strategy).T, corner()
     y, x = np.mgrid[:8, :16] / 16
     desired = 0.25 + 0.1 * np.sin(7 * x + 4 * y)
     scale = unit(dense(T), truth)
@@ -119,26 +135,26 @@ def test_cells_cost_less_and_lose_no_light(tmp_path: Path) -> None:
 
 
 class Dying(VirtualRig):
-    """Fails, or ends the process, at one of its photographs."""
+    """Fails at one of its photographs."""
 
-    def __init__(self, at: int, kill: bool = False, **options: Any) -> None:
+    def __init__(self, at: int, **options: Any) -> None:
         super().__init__(corner(), GRID, bits=12, ambient=0.01, **options)
-        self._left, self._kill = at, kill
+        self._left = at
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
         self._left -= 1
         if self._left == 0:
-            if self._kill:
-                os.kill(os.getpid(), signal.SIGKILL)
             raise OSError("unplugged")
         return super().photograph(codes, seconds)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_a_rig_that_fails_again_and_again(tmp_path: Path, strategy: str) -> None:
+def test_a_rig_that_fails_again_and_again(
+    tmp_path: Path, scanned: Callable[[str], Scanned], strategy: str
+) -> None:
     """Each run gets a little further; the result is that of a run that was never stopped, to the bit."""
     options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy}
-    whole = acquire(rig(), store=tmp_path / "whole.zarr", **options)
+    whole = scanned(strategy).T
     path, failures, T = tmp_path / "T.zarr", [], whole
     for at in (100, 280, 200, 10000):  # in the calibration, in the scan, further on, not at all
         try:
@@ -153,28 +169,8 @@ def test_a_rig_that_fails_again_and_again(tmp_path: Path, strategy: str) -> None
     BlockStore.open(path).verify()
 
 
-def dying(at: int, path: str, strategy: str) -> None:
-    """An acquisition in a process of its own, ended without a chance to clean up."""
-    acquire(Dying(at, kill=True), geometry="aligned", strategy=strategy, store=path)
-
-
-@pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
-def test_killed_at_random_photographs(tmp_path: Path, strategy: str) -> None:
-    options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy}
-    whole = dense(acquire(rig(), store=tmp_path / "whole.zarr", **options))
-    rng, path = np.random.default_rng(2), tmp_path / "T.zarr"
-    for at in rng.integers(20, 450, 3):
-        code = f"from tests.acquisition.test_task import dying; dying({at}, {str(path)!r}, {strategy!r})"
-        subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False)
-        if path.exists():
-            BlockStore.open(path).verify()
-    T = acquire(rig(), store=path, **options)
-    np.testing.assert_array_equal(dense(T), whole)
-
-
-def test_a_store_that_is_done_needs_no_rig_any_more(tmp_path: Path) -> None:
-    path = tmp_path / "T.zarr"
-    T = acquire(rig(), geometry="aligned", strategy="hadamard", store=path)
+def test_a_store_that_is_done_needs_no_rig_any_more(scanned: Callable[[str], Scanned]) -> None:
+    T, path = scanned("hadamard")
     again = acquire(Dying(1), geometry="aligned", strategy="hadamard", store=path)
     np.testing.assert_array_equal(dense(again), dense(T))
     np.testing.assert_array_equal(dense(ltcl.load(path)), dense(T))

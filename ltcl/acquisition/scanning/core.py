@@ -17,7 +17,7 @@ from ltcl.acquisition.scanning.cells import Cells
 
 
 def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """The arrays of the transport of a core, and the variance of its entries in `core_variance_0`, ...
+    """The arrays of the transport of a core, which is completed.
 
     Examples
     --------
@@ -38,10 +38,10 @@ def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray
     if mixing is not None:
         found["mixing"] = mixing
     found |= {"basis_0.name": np.array("pyramid"), "basis_0.grid": np.array(cells.grid)}
-    for c, (C, variance) in enumerate(zip(matrices, core.matrices("variance"), strict=True)):
+    for c, C in enumerate(matrices):
         R = C.copy()
         R.data[R.indices == np.repeat(np.arange(n), np.diff(R.indptr))] -= 1.0
-        found[f"columns_{c}"], found[f"core_variance_{c}"] = np.ones(n), variance.data
+        found[f"columns_{c}"] = np.ones(n)
         found |= {f"system_{c}.sign": np.array(1.0), f"system_{c}.solution_error": np.array(0.0)}
         found |= {
             f"system_{c}.R.{name}": np.asarray(part)
@@ -60,6 +60,11 @@ def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray
             }.items()
         }
     return found
+
+
+def variances(core: Core) -> dict[str, np.ndarray]:
+    """The variance of the entries of a core that is complete, in `core_variance_0` and so on."""
+    return {f"core_variance_{c}": part.data for c, part in enumerate(core.matrices("variance"))}
 
 
 def diagonal(cells: Cells, C: scipy.sparse.csr_array) -> np.ndarray:
