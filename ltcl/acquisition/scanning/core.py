@@ -12,12 +12,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ltcl.acquisition.scanning import thresholds
 from ltcl.acquisition.scanning.adaptive import Core
 from ltcl.acquisition.scanning.cells import Cells
 
 
-def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def arrays(core: Core, mixing: np.ndarray | None = None, sigmas: float = 0.0) -> dict[str, np.ndarray]:
     """The arrays of the transport of a core, which is completed.
+
+    A first bounce that is not above 0 by `sigmas` standard deviations is 0, so that its pixel can be masked.
 
     Examples
     --------
@@ -33,7 +36,10 @@ def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray
     core.complete()
     cells, matrices = core.cells, core.matrices()
     n = cells.grid[0] * cells.grid[1]
-    F = np.stack([diagonal(cells, C) for C in matrices])
+    own, noise = (
+        np.stack([diagonal(cells, part) for part in parts]) for parts in (matrices, core.matrices("variance"))
+    )
+    F = thresholds.light(own, noise, sigmas)
     found: dict[str, Any] = {"grid": np.array(cells.grid), "first_bounce": F}
     if mixing is not None:
         found["mixing"] = mixing
@@ -50,7 +56,7 @@ def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray
                 "error": 0.0,
                 "out": -1,
                 "into": 0,
-                "diagonal": F[c] - 1.0,
+                "diagonal": own[c] - 1.0,
                 "core.kind": "csr",
                 "core.error": 0.0,
                 "core.shape": np.array(R.shape, np.int64),

@@ -307,4 +307,6 @@ class BlockStore:
             raise FileError(f"{self.path}: is final; nothing is written to it any more")
 
     def _document(self) -> dict[str, Any]:
-        return sealed.unseal(nodes.read_file(self.path, "zarr.json", sealed.LARGEST), "zarr.json")
+        document = sealed.unseal(nodes.read_file(self.path, "zarr.json", sealed.LARGEST), "zarr.json")
+        layout.refuse_parts(document["attributes"])
+        return document
