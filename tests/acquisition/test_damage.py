@@ -123,6 +123,34 @@ def test_damage_to_half_a_scan_is_noticed_when_it_goes_on(
             ltcl.acquire(rig, store=path, **given)
 
 
+def test_loading_reads_the_transport_and_no_more(
+    stores: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a compressed one neither the calibration, which may be large, nor the variances."""
+    real, asked = BlockStore.extra, []
+    monkeypatch.setattr(BlockStore, "extra", lambda store, name: asked.append(name) or real(store, name))
+    ltcl.load(stores["adaptive"])
+    assert {"grid", "first_bounce", "system_0.R.core.data"} <= set(asked)
+    assert not [name for name in asked if name.startswith(("calibration.", "core_variance"))]
+    assert {"core_variance_0", "calibration.white.value"} <= set(BlockStore.open(stores["adaptive"]).extras)
+
+
+def test_a_compressed_store_that_names_no_arrays(stores: dict[str, Path], tmp_path: Path) -> None:
+    path = Path(shutil.copytree(stores["adaptive"], tmp_path / "T.zarr"))
+    good = (path / "zarr.json").read_bytes()
+    for change, text in (
+        ({"arrays": None}, "without its texts and the names of its arrays"),
+        ({"arrays": ["grid", 3]}, "name is 3"),
+        ({"arrays": ["../grid"]}, r"name is '\.\./grid'"),
+        ({"arrays": ["grid"]}, "a compressed transport has the array 'first_bounce', which is missing"),
+        ({"arrays": ["nothing"]}, "extra/nothing is missing"),
+    ):
+        forge(path / "zarr.json", lambda told, change=change: told["state"].update(change))
+        with pytest.raises(FileError, match=text):
+            ltcl.load(path)
+        (path / "zarr.json").write_bytes(good)
+
+
 def forge(file: Path, change: Callable[[dict[str, Any]], None]) -> None:
     """Change a document and seal it again, as an enemy could."""
     document = json.loads(file.read_bytes())

@@ -314,9 +314,11 @@ def test_exposures_in_the_wrong_order_are_named() -> None:
         acquire(made, geometry="aligned", strategy="pixel")
 
 
-def test_progress_is_told() -> None:
+@pytest.mark.parametrize("strategy", ["hadamard", "adaptive"])
+def test_progress_is_told(strategy: str) -> None:
+    """To the end, though a scan by cells does not know beforehand how many patterns it takes."""
     told: list[tuple[int, int]] = []
-    acquire(rig(4), geometry="aligned", strategy="hadamard", progress=lambda *n: told.append(n))
+    acquire(rig(4), geometry="aligned", strategy=strategy, progress=lambda *n: told.append(n))
     assert told[-1][0] == told[-1][1]
     assert [done for done, _ in told] == sorted(done for done, _ in told)
 
