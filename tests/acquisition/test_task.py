@@ -9,15 +9,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl.acquisition import Calibration, FolderRig, Report, VirtualRig, acquire
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire
 from ltcl.acquisition.radiometry import Response
-from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, PhotographMissing
+from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError
 from ltcl.images import from_srgb
 from ltcl.store import BlockStore
 
@@ -264,37 +263,6 @@ def test_a_camera_of_its_own_pixels() -> None:
     sums = np.linalg.norm(scale * found.sum(axis=1) - truth.sum(axis=1)) / np.linalg.norm(truth.sum(axis=1))
     assert sums < 0.02
     assert np.linalg.norm(scale * (found @ P) - truth @ P) < 0.25 * np.linalg.norm(truth @ P)
-
-
-def test_a_person_takes_the_photographs(tmp_path: Path) -> None:
-    """Patterns out, photographs in, in rounds; what was photographed is asked for once."""
-    line = Response(np.array([[-0.004 / 0.996, 1.0]]))
-    given: dict[str, Any] = {"strategy": "pixel", "response": line, "frames": 2, "exposures": [0.5, 8.0]}
-    scene, folder, store = rig(4, response="linear"), tmp_path / "photos", tmp_path / "T.zarr"
-    rounds = 0
-    while True:
-        person = FolderRig(folder, (4, 8), 1)
-        try:
-            T = acquire(person, geometry="aligned", store=store, **given)
-            break
-        except PhotographMissing:
-            rounds += 1
-            assert rounds < 30
-        _photograph_all(scene, folder)
-    assert off(dense(T), corner(4), (4, 8)) < 0.05
-
-
-def _photograph_all(scene: VirtualRig, folder: Path) -> None:
-    rows = (folder / "shots.csv").read_text().splitlines()[1:]
-    for row in rows:
-        _, pattern, seconds, save = row.split(",")
-        target = folder / f"{save}.png"
-        if target.exists():
-            continue
-        codes = np.asarray(cv2.imread(str(folder / pattern), cv2.IMREAD_UNCHANGED), np.float32)
-        codes /= 65535 if codes.max() > 255 else 255
-        image = scene.photograph(codes, float(seconds))
-        cv2.imwrite(str(target), (image.astype(np.uint16) * 16))
 
 
 class Swapping(VirtualRig):
