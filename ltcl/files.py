@@ -55,13 +55,13 @@ def input_file(path: Any) -> Path:
     return path
 
 
-def as_path(path: Any) -> Path:
+def as_path(path: Any, name: str = "path") -> Path:
     """Return `path` (str or os.PathLike) as a Path; refuse everything else."""
     try:
         return Path(path)
     except TypeError:
         raise InputTypeError(
-            f"path is {path!r}; it must be a str or a path, not {type(path).__name__}"
+            f"{name} is {path!r}; it must be a str or a path, not {type(path).__name__}"
         ) from None
 
 

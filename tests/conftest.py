@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,3 +47,9 @@ def shared_data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"../shared/data is absent ({DATA})")
     return DATA
+
+
+@pytest.fixture
+def disk_without_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flushing matters to a power cut, which no test can cause; `test_flushing.py` counts the calls."""
+    monkeypatch.setattr(os, "fsync", lambda handle: None)

@@ -40,7 +40,7 @@ from ltcl.acquisition.radiometry import (
     projector,
 )
 from ltcl.acquisition.rig import Shots
-from ltcl.errors import InputError
+from ltcl.errors import AcquisitionError, InputError
 
 Tell = Callable[[str], None]
 _BRACKET, _SPAN = 8, 16.0  # exposures to find the response from, and how far from that of white
@@ -95,6 +95,7 @@ def measure(
     run = _Run(shots, tell or (lambda _: None))
     run.tell("exposure")
     seconds = exposure(shots, shots.grid)
+    _refuse_saturated(run, seconds)
     run.tell("geometry")
     R = _resampling(run, geometry, seconds)
     run.tell("response")
@@ -132,10 +133,6 @@ class _Run:
         self.shots.prepare(wanted)
         return [self.shots.photograph(codes, t) for codes, t in wanted]
 
-    @property
-    def levels(self) -> int | None:
-        return None if self.shots.levels is None else self.shots.levels + 1
-
     def merged(
         self,
         codes: np.ndarray,
@@ -149,13 +146,26 @@ class _Run:
         times = [t for t in seconds for _ in range(again)]
         images, last = self.take([(codes, t) for t in times]), self.shots.count
         with exposing.telling(f"photographs {last + 1 - len(images)} to {last}"):
-            return merge(images, times, response, noise, levels=self.levels, black=offset)
+            return merge(images, times, response, noise, levels=self.shots.levels, black=offset)
+
+
+def _refuse_saturated(run: _Run, seconds: float) -> None:
+    """Refuse a scene that is white throughout where no shorter exposure is left."""
+    if exposing.offered(run.shots, [seconds / 2])[0] < seconds:
+        return
+    (image,) = run.take([(run.white, seconds)])
+    if image.min() >= _TOP:
+        raise AcquisitionError(
+            f"every pixel is saturated under white at the shortest exposure, {seconds:g} s; there must be "
+            "less light on the camera: a smaller aperture, a darker projector or room"
+        )
 
 
 def _resampling(run: _Run, geometry: str | Correspondence, seconds: float) -> Resampling:
     grid = run.shots.grid
     if geometry == "graycode":
-        return Resampling.of(measure_geometry(run.shots, grid, seconds=seconds))
+        with exposing.telling("the geometry"):
+            return Resampling.of(measure_geometry(run.shots, grid, seconds=seconds))
     if not isinstance(geometry, Correspondence):
         if run.shots.camera_grid != grid:
             raise InputError(
@@ -188,7 +198,7 @@ def _response(run: _Run, seconds: float) -> Response:
     images = run.take([(codes, t) for t in times for codes in lit])
     beside = [np.hstack(images[k : k + len(lit)]) for k in range(0, len(images), len(lit))]
     with exposing.telling("the response of the camera"):
-        return calibrate(beside, times, levels=run.levels, saturation=_TOP)
+        return calibrate(beside, times, levels=run.shots.levels, saturation=_TOP)
 
 
 def _bright(run: _Run, response: Response, seconds: float) -> float:
@@ -203,7 +213,7 @@ def _noise(run: _Run, response: Response, seconds: float, deep: float) -> NoiseM
     scenes = ((ramp, seconds), (run.black, seconds), (run.black, deep))
     bursts = [run.take([(codes, t)] * _BURST) for codes, t in scenes]
     with exposing.telling("the noise of the camera"):
-        found = estimate(bursts, response=response, levels=run.levels)
+        found = estimate(bursts, response=response, levels=run.shots.levels)
     return replace(found, read=max(found.read, _QUIETEST))
 
 
@@ -214,10 +224,10 @@ def _black(
     images = run.take([(run.black, t) for t in times])
     if times[0] < times[-1]:
         with exposing.telling("black"):
-            found = black.measure(images, times, response, noise, levels=run.levels)
+            found = black.measure(images, times, response, noise, levels=run.shots.levels)
         return found.offset, found.ambient
     offset = np.zeros(run.shots.channels)  # one exposure does not tell it from ambient light, nor need it
-    return offset, merge(images, times, response, noise, levels=run.levels, black=offset)
+    return offset, merge(images, times, response, noise, levels=run.shots.levels, black=offset)
 
 
 def _projector(

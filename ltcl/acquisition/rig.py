@@ -70,7 +70,7 @@ class Shots:
     camera_grid : (H, W), or None
         Of the camera, once there was a photograph.
     levels : int, or None
-        The largest code of an integer camera, once there was a photograph; None of a float camera.
+        Codes of an integer camera, 256 of 8 bits, once there was a photograph; None of a float camera.
 
     Raises
     ------
@@ -86,7 +86,7 @@ class Shots:
     >>> shots.photograph([[0, 1]], seconds=1).round(2)
     array([[0. , 0.5]], dtype=float32)
     >>> shots.count, shots.camera_grid, shots.levels
-    (1, (1, 2), 255)
+    (1, (1, 2), 256)
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -112,8 +112,9 @@ class Shots:
 
     @property
     def levels(self) -> int | None:
-        """The largest code; None of a float camera, or before the first photograph."""
-        return None if self._first is None else _levels(self.rig, self._first[1])
+        """How many codes there are; None of a float camera, or before the first photograph."""
+        largest = None if self._first is None else _largest(self.rig, self._first[1])
+        return None if largest is None else largest + 1
 
     def prepare(self, shots: Iterable[tuple[Any, float]]) -> None:
         """Tell the rig which (codes, seconds) come next, in order; nothing happens where it does not care.
@@ -243,7 +244,7 @@ def _exposures(given: Any) -> tuple[float, ...] | None:
     return tuple(float(seconds) for seconds in offered)
 
 
-def _levels(rig: Any, dtype: np.dtype) -> int | None:
+def _largest(rig: Any, dtype: np.dtype) -> int | None:
     if dtype.kind == "f":
         return None
     if dtype == np.uint8:
@@ -265,19 +266,19 @@ def to_unit(name: str, image: np.ndarray, source: Any) -> np.ndarray:
     >>> to_unit("photograph 1", np.array([[0, 51, 255]], np.uint8), None).round(2)
     array([[0. , 0.2, 1. ]], dtype=float32)
     """
-    levels = _levels(source, image.dtype)
-    if levels is None:
+    largest = _largest(source, image.dtype)
+    if largest is None:
         with np.errstate(over="ignore"):
             scaled = image.astype(np.float32, copy=False)
         if not np.isfinite(scaled).all():
             bad = int(np.count_nonzero(~np.isfinite(scaled)))
             raise AcquisitionError(f"{name} has {bad} NaN or infinite value(s); all must be finite")
         return scaled
-    if image.max() > levels:
+    if image.max() > largest:
         raise AcquisitionError(
-            f"{name} reaches {image.max()}; rig.bits says that {levels} is the largest code"
+            f"{name} reaches {image.max()}; rig.bits says that {largest} is the largest code"
         )
-    return image * np.float32(1.0 / levels)
+    return image * np.float32(1.0 / largest)
 
 
 def check_photograph(name: str, image: np.ndarray, channels: int) -> None:

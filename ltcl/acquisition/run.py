@@ -23,8 +23,9 @@ from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.columns import Code
 from ltcl.acquisition.scanning.log import Log
 from ltcl.acquisition.scanning.pictures import Pictures
-from ltcl.errors import InputError
+from ltcl.errors import FileError, InputError
 from ltcl.store import BlockStore, zarr_folder
+from ltcl.store.blocks import creating
 from ltcl.store.compressed import Parts
 
 logger = logging.getLogger(__name__)
@@ -65,6 +66,7 @@ def begin(
     path: Path, shots: Shots, wanted: Settings, geometry: str | Correspondence, response: Response | None
 ) -> Run:
     """Measure the set-up and make the store; it is one to be resumed from the last line on."""
+    creating.check(path, overwrite=True)
     told = measuring.measure(
         shots,
         geometry=geometry,
@@ -90,7 +92,11 @@ def begin(
 
 def refuse_other(found: BlockStore, shots: Shots, wanted: Settings) -> None:
     """Refuse to go on with what was begun with another rig, or with other settings."""
-    made, asked = found.attributes["settings"], _plain(wanted)
+    (made, planned, strategy), asked = _state(found), _plain(wanted)
+    if strategy not in plan.STRATEGIES or type(planned.get("patterns")) is not int:
+        raise FileError(
+            f"{found.path}: its scan is {strategy!r:.40} of {planned!r:.40}; that is none of ltcl"
+        )
     other = [name for name in asked if made.get(name) != asked[name]]
     if other:
         name = other[0]
@@ -104,6 +110,13 @@ def refuse_other(found: BlockStore, shots: Shots, wanted: Settings) -> None:
             f"rig has {shots.grid} pixels and {shots.channels} channel(s), but {found.path} was begun with "
             f"{grid} and {channels}; it must be that rig, or another store"
         )
+
+
+def _state(found: BlockStore) -> tuple[dict[str, Any], dict[str, Any], Any]:
+    """Settings and plan, empty where there are none, and the strategy."""
+    told = found.attributes
+    made, planned = (part if isinstance(part, dict) else {} for part in map(told.get, ("settings", "plan")))
+    return made, planned, told["strategy"]
 
 
 def resumed(found: BlockStore, shots: Shots, wanted: Settings) -> Run:
@@ -135,7 +148,7 @@ def _create(path: Path, pictures: Pictures, strategy: str, wanted: Settings) -> 
         "channels": pictures.channels,
         "orientation": "columns",
         "provenance": told,
-        "overwrite": path.exists(),  # a run that ended before its calibration was committed
+        "overwrite": True,  # what a run left that ended before its calibration was committed
     }
     if strategy == "adaptive":
         most = adaptive.most_patterns(Cells((h, w)))
@@ -159,6 +172,7 @@ def scan(run: Run, progress: Progress) -> None:
         progress(done, total)
 
     columns.scan(run.pictures, run.code, run.store, run.wanted.sigmas, tell)
+    columns.keep_first_bounce(run.store, run.wanted.sigmas)
     run.store.update(patterns=total)
     run.store.finalize()
 
@@ -169,15 +183,10 @@ def _scan_cells(run: Run, progress: Progress) -> None:
     log = Log(run.store, run.pictures, lambda done: progress(done, max(done, total)))
     found = adaptive.scan(run.pictures, log, run.wanted.threshold, run.wanted.sigmas)
     mixing = run.pictures.calibration.mixing
-    arrays = core.arrays(found.core, mixing)
-    beside = {name: run.store.extra(name) for name in run.store.extras if name.startswith(PREFIX)}
-    facts = run.store.attributes | {
-        "patterns": log.done,
-        "levels": [told._asdict() for told in found.levels],
-    }
-    zarr_folder.write(
-        run.store.path, Parts(arrays), extras=beside, attributes=facts, provenance=run.store.provenance
-    )
+    arrays = core.arrays(found.core, mixing, run.wanted.sigmas)
+    run.store.update(patterns=log.done, levels=[told._asdict() for told in found.levels])
+    zarr_folder.conclude(run.store, Parts(arrays), core.variances(found.core))
+    progress(log.done, log.done)
 
 
 def _plain(wanted: Settings) -> dict[str, Any]:

@@ -111,7 +111,7 @@ def acquire(
     wanted = Settings(
         checks.one_of("strategy", strategy, ("auto", *plan.STRATEGIES)),
         _named(geometry),
-        None if exposures is None else tuple(float(t) for t in exposures),
+        _seconds(exposures),
         checks.count("block", block, least=2),
         Hadamard(order).size,
         checks.number("threshold", threshold, above=0.0, below=1.0),
@@ -119,12 +119,15 @@ def acquire(
         checks.count("frames", frames),
     )
     checks.flag("resume", resume)
+    _refuse_kinds(response, progress)
     shots = Shots(rig)
     with _place(store) as path:
         found = _found(path, resume)
         if found is not None:
             run.refuse_other(found, shots, wanted)
-        if found is None or not found.final:
+        if found is not None and found.final:
+            found.finalize()  # removes what a process that was killed at the very end had left
+        else:
             begun = found and run.resumed(found, shots, wanted)
             begun = begun or run.begin(path, shots, wanted, geometry, response)
             run.scan(begun, progress or (lambda done, total: None))
@@ -143,10 +146,26 @@ def _named(geometry: str | Correspondence) -> str:
     return "given"
 
 
+def _seconds(exposures: Any) -> tuple[float, ...] | None:
+    if exposures is None:
+        return None
+    found = checks.finite("exposures", checks.real("exposures", exposures))
+    if found.ndim != 1 or found.size == 0 or found.min() <= 0:
+        raise InputError(f"exposures is {exposures!r}; it must be a sequence of positive seconds")
+    return tuple(found.astype(float).tolist())
+
+
+def _refuse_kinds(response: Any, progress: Any) -> None:
+    if not isinstance(response, Response | None):
+        raise InputTypeError(f"response is a {type(response).__name__}; it must be a Response, or None")
+    if progress is not None and not callable(progress):
+        raise InputTypeError(f"progress is {progress!r}; it must be a function of two ints, or None")
+
+
 @contextlib.contextmanager
 def _place(store: str | os.PathLike[str] | None) -> Iterator[Path]:
     if store is not None:
-        yield as_path(store)
+        yield as_path(store, "store")
         return
     with tempfile.TemporaryDirectory(prefix="ltcl-") as folder:
         yield Path(folder) / "T.zarr"
@@ -154,7 +173,7 @@ def _place(store: str | os.PathLike[str] | None) -> Iterator[Path]:
 
 def _found(path: Path, resume: bool) -> BlockStore | None:
     """The store of an earlier run whose calibration was committed."""
-    if not path.exists():
+    if not os.path.exists(path) or (path.is_dir() and not any(path.iterdir())):
         return None
     if not resume:
         raise InputError(f"resume is False, but {path} is there already; give another store")

@@ -75,7 +75,7 @@ def test_a_projector_that_is_off() -> None:
 
 def test_all_is_saturated() -> None:
     bright = VirtualRig(np.eye(16), (4, 4), ambient=1e6)
-    with pytest.raises(AcquisitionError, match="the response of the camera"):
+    with pytest.raises(AcquisitionError, match="every pixel is saturated under white"):
         measure(Shots(bright), geometry="aligned")
 
 

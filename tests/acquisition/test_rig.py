@@ -41,9 +41,9 @@ def as_rig(rig: Rig) -> Rig:
 @pytest.mark.parametrize(
     ("image", "bits", "levels"),
     [
-        (np.array([[0, 51, 255]], np.uint8), None, 255),
-        (np.array([[0, 819, 4095]], np.uint16), 12, 4095),
-        (np.array([[0, 13107, 65535]], np.uint16), None, 65535),
+        (np.array([[0, 51, 255]], np.uint8), None, 256),
+        (np.array([[0, 819, 4095]], np.uint16), 12, 4096),
+        (np.array([[0, 13107, 65535]], np.uint16), None, 65536),
         (np.array([[0, 0.2, 1.0]], np.float64), None, None),
         (np.array([[0, 0.2, 1.0]], np.float16), None, None),
     ],

@@ -4,30 +4,45 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl.acquisition import Calibration, FolderRig, Report, VirtualRig, acquire
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire
 from ltcl.acquisition.radiometry import Response
-from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, PhotographMissing
+from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError
 from ltcl.images import from_srgb
 from ltcl.store import BlockStore
 
 from .scanning.helpers import CLEAN, corner, dense, off, rig, unit
 
 GRID = (8, 16)
-ROOT = Path(__file__).resolve().parents[2]
 STRATEGIES = ("pixel", "hadamard", "adaptive")
+
+
+class Scanned(NamedTuple):
+    """Of `rig()`, which nobody stopped."""
+
+    T: ltcl.Transport
+    path: Path
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scanned]:
+    """The scan of each strategy, made once."""
+
+    @cache
+    def made(strategy: str) -> Scanned:
+        path = tmp_path_factory.mktemp(strategy) / "T.zarr"
+        return Scanned(acquire(rig(), geometry="aligned", strategy=strategy, store=path), path)
+
+    return made
 
 
 @pytest.mark.parametrize(("response", "bits"), [("srgb", 8), ("film", 12)])
@@ -40,9 +55,9 @@ def test_patterns_that_no_scan_has_seen(strategy: str, response: str, bits: int)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_compensated_pictures(strategy: str) -> None:
+def test_compensated_pictures(scanned: Callable[[str], Scanned], strategy: str) -> None:
     """The pattern found with the measured transport, under the true one: 30 dB at least."""
-    T, truth = acquire(rig(seed=3), geometry="aligned", strategy=strategy), corner()
+    T, truth = scanned(strategy).T, corner()
     y, x = np.mgrid[:8, :16] / 16
     desired = 0.25 + 0.1 * np.sin(7 * x + 4 * y)
     scale = unit(dense(T), truth)
@@ -119,26 +134,26 @@ def test_cells_cost_less_and_lose_no_light(tmp_path: Path) -> None:
 
 
 class Dying(VirtualRig):
-    """Fails, or ends the process, at one of its photographs."""
+    """Fails at one of its photographs."""
 
-    def __init__(self, at: int, kill: bool = False, **options: Any) -> None:
+    def __init__(self, at: int, **options: Any) -> None:
         super().__init__(corner(), GRID, bits=12, ambient=0.01, **options)
-        self._left, self._kill = at, kill
+        self._left = at
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
         self._left -= 1
         if self._left == 0:
-            if self._kill:
-                os.kill(os.getpid(), signal.SIGKILL)
             raise OSError("unplugged")
         return super().photograph(codes, seconds)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_a_rig_that_fails_again_and_again(tmp_path: Path, strategy: str) -> None:
+def test_a_rig_that_fails_again_and_again(
+    tmp_path: Path, scanned: Callable[[str], Scanned], strategy: str
+) -> None:
     """Each run gets a little further; the result is that of a run that was never stopped, to the bit."""
     options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy}
-    whole = acquire(rig(), store=tmp_path / "whole.zarr", **options)
+    whole = scanned(strategy).T
     path, failures, T = tmp_path / "T.zarr", [], whole
     for at in (100, 280, 200, 10000):  # in the calibration, in the scan, further on, not at all
         try:
@@ -153,28 +168,8 @@ def test_a_rig_that_fails_again_and_again(tmp_path: Path, strategy: str) -> None
     BlockStore.open(path).verify()
 
 
-def dying(at: int, path: str, strategy: str) -> None:
-    """An acquisition in a process of its own, ended without a chance to clean up."""
-    acquire(Dying(at, kill=True), geometry="aligned", strategy=strategy, store=path)
-
-
-@pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
-def test_killed_at_random_photographs(tmp_path: Path, strategy: str) -> None:
-    options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy}
-    whole = dense(acquire(rig(), store=tmp_path / "whole.zarr", **options))
-    rng, path = np.random.default_rng(2), tmp_path / "T.zarr"
-    for at in rng.integers(20, 450, 3):
-        code = f"from tests.acquisition.test_task import dying; dying({at}, {str(path)!r}, {strategy!r})"
-        subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False)
-        if path.exists():
-            BlockStore.open(path).verify()
-    T = acquire(rig(), store=path, **options)
-    np.testing.assert_array_equal(dense(T), whole)
-
-
-def test_a_store_that_is_done_needs_no_rig_any_more(tmp_path: Path) -> None:
-    path = tmp_path / "T.zarr"
-    T = acquire(rig(), geometry="aligned", strategy="hadamard", store=path)
+def test_a_store_that_is_done_needs_no_rig_any_more(scanned: Callable[[str], Scanned]) -> None:
+    T, path = scanned("hadamard")
     again = acquire(Dying(1), geometry="aligned", strategy="hadamard", store=path)
     np.testing.assert_array_equal(dense(again), dense(T))
     np.testing.assert_array_equal(dense(ltcl.load(path)), dense(T))
@@ -270,37 +265,6 @@ def test_a_camera_of_its_own_pixels() -> None:
     assert np.linalg.norm(scale * (found @ P) - truth @ P) < 0.25 * np.linalg.norm(truth @ P)
 
 
-def test_a_person_takes_the_photographs(tmp_path: Path) -> None:
-    """Patterns out, photographs in, in rounds; what was photographed is asked for once."""
-    line = Response(np.array([[-0.004 / 0.996, 1.0]]))
-    given: dict[str, Any] = {"strategy": "pixel", "response": line, "frames": 2, "exposures": [0.5, 8.0]}
-    scene, folder, store = rig(4, response="linear"), tmp_path / "photos", tmp_path / "T.zarr"
-    rounds = 0
-    while True:
-        person = FolderRig(folder, (4, 8), 1)
-        try:
-            T = acquire(person, geometry="aligned", store=store, **given)
-            break
-        except PhotographMissing:
-            rounds += 1
-            assert rounds < 30
-        _photograph_all(scene, folder)
-    assert off(dense(T), corner(4), (4, 8)) < 0.05
-
-
-def _photograph_all(scene: VirtualRig, folder: Path) -> None:
-    rows = (folder / "shots.csv").read_text().splitlines()[1:]
-    for row in rows:
-        _, pattern, seconds, save = row.split(",")
-        target = folder / f"{save}.png"
-        if target.exists():
-            continue
-        codes = np.asarray(cv2.imread(str(folder / pattern), cv2.IMREAD_UNCHANGED), np.float32)
-        codes /= 65535 if codes.max() > 255 else 255
-        image = scene.photograph(codes, float(seconds))
-        cv2.imwrite(str(target), (image.astype(np.uint16) * 16))
-
-
 class Swapping(VirtualRig):
     """Gives the long exposures for the short ones, from some photograph on."""
 
@@ -318,9 +282,11 @@ def test_exposures_in_the_wrong_order_are_named() -> None:
         acquire(made, geometry="aligned", strategy="pixel")
 
 
-def test_progress_is_told() -> None:
+@pytest.mark.parametrize("strategy", ["hadamard", "adaptive"])
+def test_progress_is_told(strategy: str) -> None:
+    """To the end, though a scan by cells does not know beforehand how many patterns it takes."""
     told: list[tuple[int, int]] = []
-    acquire(rig(4), geometry="aligned", strategy="hadamard", progress=lambda *n: told.append(n))
+    acquire(rig(4), geometry="aligned", strategy=strategy, progress=lambda *n: told.append(n))
     assert told[-1][0] == told[-1][1]
     assert [done for done, _ in told] == sorted(done for done, _ in told)
 

@@ -46,8 +46,8 @@ def measure(
     Parameters
     ----------
     shots : object with ``photograph(codes, seconds)``
-        Used where it has them: `exposures`, the seconds to choose from; `levels`, the largest code of an
-        integer camera; `prepare`, told of all (codes, seconds) that come next.
+        Used where it has them: `exposures`, the seconds to choose from; `levels`, how many codes an integer
+        camera has; `prepare`, told of all (codes, seconds) that come next.
     grid : (h, w)
         Of the projector; a side of 1 takes no patterns.
     phase : bool
@@ -96,7 +96,7 @@ def measure(
     patterns = [*code.patterns(), *(shift.patterns() if shift else [])]
     images = _take(shots, patterns, seconds)
     # A difference of one step of the camera tells nothing.
-    dark = max(dark, STEPS / (getattr(shots, "levels", None) or np.inf))
+    dark = max(dark, STEPS / ((getattr(shots, "levels", None) or np.inf) - 1))
     known = code.decode(images[: code.count], sigmas=sigmas, dark=dark, edges=True)
     if shift is not None:
         known = shift.decode(images[code.count :], known, sigmas=sigmas, dark=dark)
@@ -133,7 +133,7 @@ def exposure(shots: Shots, grid: tuple[int, int], seconds: float = 1 / 60) -> fl
         if change == 1.0 or nearest(seconds * change, allowed) == seconds:
             break
         seconds *= change
-    return seconds
+    return nearest(seconds, allowed)
 
 
 def nearest(seconds: float, allowed: Any) -> float:

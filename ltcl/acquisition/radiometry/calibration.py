@@ -207,6 +207,11 @@ def _solve(state: _State, seconds: np.ndarray, still: tuple[float, int] | None) 
     if still is not None:
         b = curve.design(np.array([still[0]]))[0]
         M += np.outer(b, b) * still[1] / state.noise.variance(0.0)
+    if not np.any(w > 0):
+        raise InputError(
+            "images tell no response: no pixel grows with the seconds as light does; the exposure of the "
+            "camera must be what was asked for, and the scene must be lit"
+        )
     D = curve.bends(state.theta)
     anchor = np.quantile(state.near[w > 0], [0.75])
     return curve.fit(M + _SMOOTH * D.T @ D, v, anchor, float((curve.design(anchor) @ state.theta)[0]))

@@ -8,6 +8,7 @@ B-spline never falls, so that a fit is a non-negative least squares problem in a
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 from scipy.interpolate import BSpline
 
@@ -56,7 +57,8 @@ def fit(M: np.ndarray, v: np.ndarray, anchor: np.ndarray, value: float) -> np.nd
     H, g = P.T @ M @ P, -P.T @ (M @ level + v)
     g = g - H @ np.full(SIZE - 1, _LEAST_STEP)
     scale = 1.0 / np.sqrt(np.diagonal(H))
-    values, vectors = np.linalg.eigh(H * scale * scale[:, None])
+    # NumPy's has OpenBLAS start threads for these few numbers: 0.05 ms become 20 where the cores are busy.
+    values, vectors = scipy.linalg.eigh(H * scale * scale[:, None])
     root = np.sqrt(np.maximum(values, values[-1] * 1e-14))
     steps, _ = scipy.optimize.nnls(root[:, None] * vectors.T, (vectors.T @ (g * scale)) / root, maxiter=1000)
     theta = level + P @ (steps * scale + _LEAST_STEP)

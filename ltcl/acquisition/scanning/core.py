@@ -12,12 +12,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ltcl.acquisition.scanning import thresholds
 from ltcl.acquisition.scanning.adaptive import Core
 from ltcl.acquisition.scanning.cells import Cells
 
 
-def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """The arrays of the transport of a core, and the variance of its entries in `core_variance_0`, ...
+def arrays(core: Core, mixing: np.ndarray | None = None, sigmas: float = 0.0) -> dict[str, np.ndarray]:
+    """The arrays of the transport of a core, which is completed.
+
+    A first bounce that is not above 0 by `sigmas` standard deviations is 0, so that its pixel can be masked.
 
     Examples
     --------
@@ -33,15 +36,18 @@ def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray
     core.complete()
     cells, matrices = core.cells, core.matrices()
     n = cells.grid[0] * cells.grid[1]
-    F = np.stack([diagonal(cells, C) for C in matrices])
+    own, noise = (
+        np.stack([diagonal(cells, part) for part in parts]) for parts in (matrices, core.matrices("variance"))
+    )
+    F = thresholds.light(own, noise, sigmas)
     found: dict[str, Any] = {"grid": np.array(cells.grid), "first_bounce": F}
     if mixing is not None:
         found["mixing"] = mixing
     found |= {"basis_0.name": np.array("pyramid"), "basis_0.grid": np.array(cells.grid)}
-    for c, (C, variance) in enumerate(zip(matrices, core.matrices("variance"), strict=True)):
+    for c, C in enumerate(matrices):
         R = C.copy()
         R.data[R.indices == np.repeat(np.arange(n), np.diff(R.indptr))] -= 1.0
-        found[f"columns_{c}"], found[f"core_variance_{c}"] = np.ones(n), variance.data
+        found[f"columns_{c}"] = np.ones(n)
         found |= {f"system_{c}.sign": np.array(1.0), f"system_{c}.solution_error": np.array(0.0)}
         found |= {
             f"system_{c}.R.{name}": np.asarray(part)
@@ -50,7 +56,7 @@ def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray
                 "error": 0.0,
                 "out": -1,
                 "into": 0,
-                "diagonal": F[c] - 1.0,
+                "diagonal": own[c] - 1.0,
                 "core.kind": "csr",
                 "core.error": 0.0,
                 "core.shape": np.array(R.shape, np.int64),
@@ -60,6 +66,11 @@ def arrays(core: Core, mixing: np.ndarray | None = None) -> dict[str, np.ndarray
             }.items()
         }
     return found
+
+
+def variances(core: Core) -> dict[str, np.ndarray]:
+    """The variance of the entries of a core that is complete, in `core_variance_0` and so on."""
+    return {f"core_variance_{c}": part.data for c, part in enumerate(core.matrices("variance"))}
 
 
 def diagonal(cells: Cells, C: scipy.sparse.csr_array) -> np.ndarray:

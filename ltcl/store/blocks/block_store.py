@@ -263,8 +263,9 @@ class BlockStore:
         del attributes["checksum"]
         aside.replace_document(self.path, "zarr.json", sealed.seal(attributes | parts, nodes.GROUP))
         self._final = (attributes | parts).get("final")
+        self.layout = Layout.from_json((attributes | parts).get("ltcl"))
 
-    def finalize(self, *, memory: int | None = None) -> None:
+    def finalize(self, *, memory: int | None = None, layout: Layout | None = None) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
         Ended at any moment, it goes on from there when called again. Must not run beside writers.
@@ -273,6 +274,8 @@ class BlockStore:
         ----------
         memory : int, optional
             Bytes for the entries that are turned at once; 256 MiB when not given.
+        layout : Layout, optional
+            Of the store from then on, whose extra arrays take the place of all blocks ("compressed").
 
         Raises
         ------
@@ -282,7 +285,7 @@ class BlockStore:
         if self.mode != "a":
             self._writable()
         with about(self.path):
-            finishing.finish(self, memory)
+            finishing.finish(self, memory, layout or self.layout)
 
     def verify(self) -> None:
         """Read everything and compare all checksums; the first thing that is wrong is raised as FileError."""
@@ -304,4 +307,6 @@ class BlockStore:
             raise FileError(f"{self.path}: is final; nothing is written to it any more")
 
     def _document(self) -> dict[str, Any]:
-        return sealed.unseal(nodes.read_file(self.path, "zarr.json", sealed.LARGEST), "zarr.json")
+        document = sealed.unseal(nodes.read_file(self.path, "zarr.json", sealed.LARGEST), "zarr.json")
+        layout.refuse_parts(document["attributes"])
+        return document

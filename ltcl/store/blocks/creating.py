@@ -30,6 +30,17 @@ def make(path: Path, layout: Layout, document: bytes, overwrite: bool) -> None:
         aside.flush_folder(folder)
 
 
+def check(path: Path, overwrite: bool) -> None:
+    """Refuse at once, before there is anything to keep, a place where no store can be made."""
+    with aside.refusing(path, "the store"):
+        target = _target(path)
+        _refuse_other(path, target, overwrite)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        probe = _hidden(target) if target.exists() else target
+        probe.mkdir()
+        probe.rmdir()
+
+
 @contextlib.contextmanager
 def beside(path: Path, overwrite: bool) -> Iterator[Path]:
     """The name of a folder to be made, which is renamed to `path` when the block ends well.
@@ -37,8 +48,8 @@ def beside(path: Path, overwrite: bool) -> Iterator[Path]:
     What is at `path` must be a store or an empty folder; it stays where the block fails. (A process that is
     killed between two renames leaves it under a hidden name beside.)
     """
-    target = Path(os.path.realpath(path))
-    folder, old = (target.with_name(f".{target.name[:80]}-{secrets.token_hex(6)}") for _ in range(2))
+    target = _target(path)
+    folder, old = _hidden(target), _hidden(target)
     with aside.refusing(path, "the store"):
         _refuse_other(path, target, overwrite)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -68,6 +79,18 @@ def versions() -> dict[str, str]:
     from ltcl import __version__  # here, because it is set after this module is imported
 
     return {"ltcl": __version__, "numpy": np.__version__, "scipy": scipy.__version__}
+
+
+def _target(path: Path) -> Path:
+    try:
+        return Path(os.path.realpath(path))
+    except ValueError as error:  # a name with a NUL in it
+        raise FileError(f"{path}: the store cannot be written: {error}") from None
+
+
+def _hidden(target: Path) -> Path:
+    """A new name beside it."""
+    return target.with_name(f".{target.name[:80]}-{secrets.token_hex(6)}")
 
 
 def _refuse_other(path: Path, target: Path, overwrite: bool) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ltcl.errors import FileError
 from ltcl.store.blocks import aside, nodes, sealed, turning
+from ltcl.store.blocks.layout import Layout
 
 if TYPE_CHECKING:
     from ltcl.store.blocks.block_store import BlockStore
@@ -21,19 +22,24 @@ if TYPE_CHECKING:
 _MEMORY = 1 << 28
 
 
-def finish(store: BlockStore, memory: int | None) -> None:
+def finish(store: BlockStore, memory: int | None, layout: Layout) -> None:
     """See `BlockStore.finalize`."""
     if not store.final:
-        if store.layout.orientation == "columns":
-            if store.missing("rows"):
-                refuse_missing(store, "columns")
-            turning.turn(store, _MEMORY if memory is None else memory)
-        refuse_missing(store, "rows")
-        if store.layout.kind == "blocks" and store.layout.is_square and "first_bounce" not in store.extras:
-            _find_first_bounce(store)
+        if layout.kind == "blocks":
+            _finish_blocks(store, memory)
         with aside.locked(store.path):
-            store.rewrite(final=_sums(store))
+            store.rewrite(ltcl=layout.to_json(), final=_sums(store))
     _clear(store)
+
+
+def _finish_blocks(store: BlockStore, memory: int | None) -> None:
+    if store.layout.orientation == "columns":
+        if store.missing("rows"):
+            refuse_missing(store, "columns")
+        turning.turn(store, _MEMORY if memory is None else memory)
+    refuse_missing(store, "rows")
+    if store.layout.is_square and "first_bounce" not in store.extras:
+        _find_first_bounce(store)
 
 
 def refuse_missing(store: BlockStore, orientation: str) -> None:

@@ -107,6 +107,14 @@ class Layout:
             raise FileError(f"zarr.json describes a store that makes no sense: {str(error)!a:.100}") from None
 
 
+def refuse_parts(attributes: Mapping[str, Any]) -> None:
+    """Refuse the attributes of a store in which a part that is an object is something else."""
+    for name in ("state", "provenance", "final"):
+        part = attributes.get(name, {})
+        if not isinstance(part, dict):
+            raise FileError(f"zarr.json has {name} {part!r:.40}; it must be an object")
+
+
 def rows_at_once(shape: tuple[int, int]) -> int:
     """Rows of a block unless told otherwise: 64 MiB if none of its entries were 0.
 

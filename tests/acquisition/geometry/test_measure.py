@@ -138,7 +138,7 @@ def test_a_rig_hears_what_comes_next_and_its_steps_count():
     x, y = homography((40, 50), (16, 16))
 
     class Camera(Rig):
-        levels, exposures, told = 255, (1 / 500, 1 / 60, 1 / 4), 0
+        levels, exposures, told = 256, (1 / 500, 1 / 60, 1 / 4), 0
 
         def prepare(self, shots):
             self.told += len(list(shots))

@@ -81,7 +81,7 @@ def test_a_round_trip_gives_what_the_scene_gives(tmp_path: Path, channels: int, 
     direct = Shots(VirtualRig(T, GRID, **settings))
     for x, seconds in shots:  # the last is a repeat: another photograph of the same, with other noise
         np.testing.assert_array_equal(again.photograph(x, seconds), direct.photograph(x, seconds))
-    assert again.levels == 4095
+    assert again.levels == 4096
     assert json.loads(json.dumps(again.describe()))["rig"]["shots"] == 9
 
 

@@ -239,7 +239,7 @@ def test_exposures_are_multiples_of_the_display_s_period(clock: Clock, display: 
 def test_it_is_a_rig_and_tells_plain_json(clock: Clock, display: Display) -> None:
     with Shots(LiveRig(Watcher(clock, scene(**CLEAN)), display)) as shots:
         image = shots.photograph(WHITE, SECONDS)
-        assert (image.dtype, image.shape, shots.levels) == (np.float32, GRID, 255)
+        assert (image.dtype, image.shape, shots.levels) == (np.float32, GRID, 256)
         told = json.loads(json.dumps(shots.describe()))
     assert told["rig"]["display"]["driver"] == "dummy"
     assert told["rig"]["camera"] == {"kind": "Watcher"}

@@ -245,7 +245,7 @@ def test_a_trial_tells_what_works_from_what_does_not() -> None:
 def test_it_is_a_rig_and_tells_plain_json() -> None:
     shots = Shots(MitsubaRig("trihedral", GRID, camera_grid=(5, 7), bits=12, **FAST))
     image = shots.photograph(np.ones(GRID), 1.0)
-    assert (image.shape, shots.levels, shots.camera_grid) == ((5, 7, 3), 4095, (5, 7))
+    assert (image.shape, shots.levels, shots.camera_grid) == ((5, 7, 3), 4096, (5, 7))
     told = json.loads(json.dumps(shots.describe()))["rig"]
     assert (told["kind"], told["scene"], told["variant"]) == ("mitsuba", "trihedral", "scalar_rgb")
 

@@ -128,4 +128,4 @@ def test_the_core_as_a_transport(device: Any, channels: int) -> None:
     np.testing.assert_allclose(np.asarray(made @ x).reshape(35, -1), wanted, rtol=1e-4)
     (first, *_), pixels = found.core.matrices(), np.array([0, 3, 20, 34])
     np.testing.assert_allclose(core.between(cells, first, pixels), C[0][np.ix_(pixels, pixels)])
-    assert arrays["core_variance_0"].shape == arrays["system_0.R.core.data"].shape
+    assert core.variances(found.core)["core_variance_0"].shape == arrays["system_0.R.core.data"].shape
