@@ -5,8 +5,9 @@ An edge lies where pattern and inverse are equal; between two camera pixels line
 a few hundredths of a pixel, and there the projector coordinate is known: n + 1/2. Every boundary of two
 projector columns is an edge of exactly one bit. A weighted least-squares plane `x = a + b u + c v` through
 the edges in a window, and faintly through the coordinates of the pixels themselves, gives x at the pixel.
-Where the plane leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter (folds, borders of
-objects) the whole number stays.
+Where the plane leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter, either the surface is
+no plane (folds, borders of objects), and so it goes for its neighbours, whose whole numbers stay; or the bits
+of a lone pixel are wrong, and it is dropped.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ import numpy as np
 from ltcl.acquisition.geometry.decoded import Axis, Edges
 
 LEAVES = 0.25
-ACROSS = 1.5  # edges on each side of a pixel that a window should hold
+COMPANY = 5  # side of a window
+ACROSS = 2.5  # edges on each side of a pixel that a window should hold
 LARGEST = 15  # reach of a window, in camera pixels
 STRIP = 1 << 16  # pixels of a strip of rows: its moments stay in the cache
 
 
-def refine(axis: Axis, valid: np.ndarray) -> np.ndarray:
-    """Projector coordinate (H, W) float32 of the valid pixels, to a fraction of a pixel.
+def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Projector coordinate (H, W) float32 of the valid pixels, to a fraction of a pixel, and which may stay.
 
     Parameters
     ----------
@@ -35,18 +37,39 @@ def refine(axis: Axis, valid: np.ndarray) -> np.ndarray:
         Pixels of width 2 at most that agree with their neighbours.
     """
     if axis.edges is None:
-        return axis.value
+        return axis.value, valid
+    reach = _reach(axis.edges, valid)
+    plane = _planes(axis, valid, reach)
+    fits = _fit(axis, plane) | _in_company(valid & ~_fit(axis, plane))
+    if not fits[valid].all():  # edges beside them are none
+        valid = valid & fits
+        plane = _planes(axis, valid, reach)
+    far = axis.width / 2
+    cell = np.clip(plane, axis.value - far, axis.value + far)
+    return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32), valid
+
+
+def _fit(axis: Axis, plane: np.ndarray) -> np.ndarray:
+    """Where the plane is inside the cell, or nearly so."""
+    return np.abs(plane - axis.value) <= axis.width / 2 + LEAVES
+
+
+def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
+    """The plane through the window about each pixel, at that pixel, (H, W)."""
     H, W = valid.shape
-    reach, plane = _reach(axis.edges, valid), np.empty((H, W))
-    rows = max(STRIP // W, 4 * reach)
+    plane, rows = np.empty((H, W)), max(STRIP // W, 4 * reach)
     for top in range(0, H, rows):
         first, last = max(top - reach, 0), min(top + rows + reach, H)
         part = _plane(_moments(axis, valid, slice(first, last), 2 * reach + 1))
         plane[top : top + rows] = part[top - first :][: min(rows, H - top)]
-    far = axis.width / 2
-    inside = valid & (np.abs(plane - axis.value) <= far + LEAVES)
-    cell = np.clip(plane, axis.value - far, axis.value + far)
-    return np.where(inside, cell, axis.value).astype(np.float32)
+    return plane
+
+
+def _in_company(odd: np.ndarray) -> np.ndarray:
+    """Pixels with as many like them around as a line has that passes through."""
+    size = (COMPANY, COMPANY)
+    count = cv2.boxFilter(odd.astype(np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return odd & (count > COMPANY - 0.5)
 
 
 def _reach(edges: Edges, valid: np.ndarray) -> int:
