@@ -170,8 +170,8 @@ def draw(found: list[Found], loop: rendered.Loop | None) -> Figure:
         figure, (580, 140, 380, 220), "By noise, 3 camera pixels", "electrons at full scale", ""
     )
     chosen = [one for one in found if one.size == 3.0 and one.camera == found[-1].camera]
+    electrons = [NOISES[one.noise][0] for one in chosen]
     for kind, style in zip(KINDS, ("-", "--", ":"), strict=True):
-        electrons = [NOISES[one.noise][0] for one in chosen]
         axes.plot(electrons, [one.errors[kind] for one in chosen], style, color="C1", marker="o", label=kind)
     axes.set_xscale("log")
     axes.set_xticks(electrons, [f"{count:g}" for count in electrons])

@@ -36,7 +36,7 @@ def test_a_rendered_corner_is_acquired_and_compensated(tmp_path: Path) -> None:
     assert dark.any()
     assert told.coverage[dark].max() < 0.25, told.coverage[dark]
     # At the outline of the walls a projector pixel is partly dark: those with all neighbours in view count.
-    inner = scipy.ndimage.binary_erosion(told.coverage > 0.8, np.ones((3, 3)))
+    inner = np.asarray(scipy.ndimage.binary_erosion(told.coverage > 0.8, np.ones((3, 3))), bool)
     assert inner.sum() > 30
     lit = truth.radiance(np.ones(GRID))[inner]
     unit = (white[inner] @ lit) / (white[inner] @ white[inner])

@@ -28,7 +28,8 @@ from ltcl.errors import InputError
 CAMERA = 1.54  # C: wide enough that samples of a square grid surround every place, however large they are
 PROJECTOR = 1.1  # P: a kernel as wide as a tent over the projector's pixels
 SEEN = 0.05  # of a projector pixel: less is not seen
-TOLD, HALF = 0.9, 0.5  # by least squares, of its own light; of its area, where that is not so
+TOLD = 0.9  # of its own light, by least squares
+PART, HALF = 0.15, 0.5  # of its area, where that is so (less may be an error of the map), and where it is not
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ class Resampling:
             matrix = centred(_normalised(wide, keep), found)
         else:
             coverage, told = fine.area, fine.told >= TOLD
-            keep = (coverage >= SEEN) & told | (coverage >= HALF)
+            keep = (coverage >= PART) & told | (coverage >= HALF)
             blurred = centred(_normalised(wide, keep & ~told), found)
             matrix = scipy.sparse.diags_array((keep & told).astype(float)) @ fine.weights + blurred
         matrix = scipy.sparse.csr_array(matrix, dtype=np.float32)
