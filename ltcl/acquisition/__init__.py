@@ -26,6 +26,7 @@ from ltcl.acquisition.rigs import (
     MitsubaRig,
     OpenCVCamera,
     VirtualRig,
+    camera_map,
     mitsuba_scene,
 )
 from ltcl.acquisition.scanning.report import Report
@@ -45,5 +46,6 @@ __all__ = [
     "Shots",
     "VirtualRig",
     "acquire",
+    "camera_map",
     "mitsuba_scene",
 ]

@@ -2,8 +2,8 @@
 """All that is measured once of a set-up, before its transport is scanned.
 
     exposure        white is bright at; then `exposing`
-    geometry        which projector pixel a camera pixel sees, by patterns, unless it is given
     response        of the camera, from ramps beside black at a bracket of exposures
+    geometry        which projector pixel a camera pixel sees, by patterns, unless it is given
     noise           of the camera, from the same photograph taken again and again
     black           offset of the camera, and light without the projector, at the exposures of the scan
     white           all that the projector can light, of which row sums of T are known
@@ -95,11 +95,12 @@ def measure(
     run = _Run(shots, tell or (lambda _: None))
     run.tell("exposure")
     seconds = exposure(shots, shots.grid)
+    _refuse_other(shots, geometry)
     _refuse_saturated(run, seconds)
-    run.tell("geometry")
-    R = _resampling(run, geometry, seconds)
     run.tell("response")
     response = response or _response(run, seconds)
+    run.tell("geometry")
+    R = _resampling(run, geometry, seconds, response)
     seconds = _bright(run, response, seconds)
     deep = exposing.deepest(shots, seconds, response)
     run.tell("noise")
@@ -161,24 +162,40 @@ def _refuse_saturated(run: _Run, seconds: float) -> None:
         )
 
 
-def _resampling(run: _Run, geometry: str | Correspondence, seconds: float) -> Resampling:
-    grid = run.shots.grid
-    if geometry == "graycode":
-        with exposing.telling("the geometry"):
-            return Resampling.of(measure_geometry(run.shots, grid, seconds=seconds))
-    if not isinstance(geometry, Correspondence):
-        if run.shots.camera_grid != grid:
-            raise InputError(
-                f"geometry is 'aligned', but photographs are {run.shots.camera_grid}; they must be {grid}, "
-                "the projector's pixels"
-            )
-        return Resampling.aligned(grid)
-    if (geometry.grid, geometry.camera_grid) != (grid, run.shots.camera_grid):
+class _Linear:
+    """A rig whose photographs are linear in light: a pixel that is half lit shows half of it."""
+
+    def __init__(self, shots: Shots, response: Response) -> None:
+        self._shots, self._response = shots, response
+        self.exposures, self.levels, self.prepare = shots.exposures, shots.levels, shots.prepare
+
+    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
+        return self._response.linear(self._shots.photograph(codes, seconds))
+
+
+def _refuse_other(shots: Shots, geometry: str | Correspondence) -> None:
+    """Refuse a geometry of other pixels than those of the first photograph."""
+    if geometry == "aligned" and shots.camera_grid != shots.grid:
+        raise InputError(
+            f"geometry is 'aligned', but photographs are {shots.camera_grid}; they must be {shots.grid}, "
+            "the projector's pixels"
+        )
+    if isinstance(geometry, str):
+        return
+    if (geometry.grid, geometry.camera_grid) != (shots.grid, shots.camera_grid):
         raise InputError(
             f"geometry is from {geometry.camera_grid} to {geometry.grid}; the rig is from "
-            f"{run.shots.camera_grid} to {grid}"
+            f"{shots.camera_grid} to {shots.grid}"
         )
-    return Resampling.of(geometry)
+
+
+def _resampling(run: _Run, geometry: str | Correspondence, seconds: float, response: Response) -> Resampling:
+    if not isinstance(geometry, str):
+        return Resampling.of(geometry)
+    if geometry == "aligned":
+        return Resampling.aligned(run.shots.grid)
+    with exposing.telling("the geometry"):
+        return Resampling.of(measure_geometry(_Linear(run.shots, response), run.shots.grid, seconds=seconds))
 
 
 def _ramp(grid: tuple[int, int], shift: int = 0) -> np.ndarray:

@@ -82,7 +82,7 @@ def test_all_is_saturated() -> None:
 def test_what_is_measured_is_told() -> None:
     told: list[str] = []
     measure(Shots(rig(4)), geometry="aligned", tell=told.append)
-    assert told == ["exposure", "geometry", "response", "noise", "exposures", "black", "white", "projector"]
+    assert told == ["exposure", "response", "geometry", "noise", "exposures", "black", "white", "projector"]
 
 
 def test_a_map_of_other_pixels_is_refused() -> None:

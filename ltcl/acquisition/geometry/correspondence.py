@@ -74,7 +74,8 @@ class Correspondence:
         """Decoded coordinates, less those that are not fully known or do not fit their neighbours."""
         valid = (x.width <= 2.0) & (y.width <= 2.0)
         valid &= consistent(x.value, valid) & consistent(y.value, valid)
-        return cls(refine(x, valid), refine(y, valid), np.minimum(x.confidence, y.confidence), valid, grid)
+        (column, fits), (row, also) = refine(x, valid), refine(y, valid)
+        return cls(column, row, np.minimum(x.confidence, y.confidence), fits & also, grid)
 
     @property
     def camera_grid(self) -> tuple[int, int]:

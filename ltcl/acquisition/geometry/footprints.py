@@ -40,6 +40,23 @@ def jacobian(found: Correspondence) -> tuple[np.ndarray, np.ndarray]:
     return J, known & (span <= LARGEST * np.median(span[known])) if known.any() else known
 
 
+def straddling(found: Correspondence, J: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """(H, W): 1 of pixels beside one that is not known or not next to them on the surface, 0 of others.
+
+    Such a pixel may see two surfaces, in parts that nothing tells.
+    """
+    x = np.stack([found.x, found.y], axis=-1).astype(np.float64)
+    odd = np.zeros(known.shape, bool)
+    for axis, slope in ((0, J[..., 1]), (1, J[..., 0])):
+        n = known.shape[axis]
+        mean = (slope.take(range(n - 1), axis) + slope.take(range(1, n), axis)) / 2
+        off, size = (np.linalg.norm(part, axis=-1) for part in (np.diff(x, axis=axis) - mean, mean))
+        far = ~(off <= (BREAK - 1) * size)  # NaN, too
+        none = np.zeros_like(odd.take([0], axis))
+        odd |= np.concatenate([far, none], axis) | np.concatenate([none, far], axis)
+    return (odd & known).astype(np.float64)
+
+
 def _slope(x: np.ndarray, axis: int) -> np.ndarray:
     """(H, W, 2): from the next and the previous pixel along `axis`; NaN where neither is valid."""
     step = np.diff(x, axis=axis)

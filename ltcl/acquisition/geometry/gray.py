@@ -25,6 +25,8 @@ from ltcl.errors import InputError
 
 STRIP = 1 << 19  # values of all pictures of a strip of rows: they stay in the cache
 FINE = 4  # bits of an axis whose stripes are narrow enough to light everything evenly
+DARK = 2.0  # thresholds of a difference: the range of many photographs of nothing is one
+FAINT = 0.1  # of the direct light: on an edge of narrow stripes uneven indirect light passes for a bit
 
 
 @dataclass(frozen=True)
@@ -124,11 +126,15 @@ class GrayCode:
             stack[self._fine()] if self.count > 2 else _both(stack)
         )
         threshold = np.maximum(least, sigmas * np.sqrt(2.0 * variance))
+        lit = direct > least
+        if self.high_frequency:  # neighbours may confirm faint bits, but not those of noise in the dark
+            lit = direct > DARK * threshold
+            threshold = np.maximum(threshold, FAINT * direct)
         found = classification.classify(pattern, inverse, direct, indirect, threshold, *self._light())
         split = self.bits[0]
         for plane, part in ((both[0], slice(0, split)), (both[1], slice(split, None))):
             bits = classification.Bits(found.on[part], found.certain[part], found.confidence[part])
-            plane.fill(rows, bits, direct > least)
+            plane.fill(rows, bits, lit)
             if edges and plane.bits:
                 plane.mark(rows, bits.on, np.abs(pattern[part] - inverse[part]))
 

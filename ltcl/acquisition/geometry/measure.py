@@ -10,9 +10,10 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition.geometry.correspondence import Correspondence
-from ltcl.acquisition.geometry.decoded import photographs
+from ltcl.acquisition.geometry.decoded import Axis, photographs
 from ltcl.acquisition.geometry.gray import GrayCode
 from ltcl.acquisition.geometry.phase import PhaseShift
+from ltcl.acquisition.geometry.unmixing import FINE
 from ltcl.errors import AcquisitionError
 
 SMALL = 128  # sides up to here take narrow stripes in every pattern: the wide ones would be whole walls
@@ -33,7 +34,7 @@ def measure(
     shots: Shots,
     grid: tuple[int, int],
     *,
-    phase: bool = True,
+    phase: bool | None = None,
     seconds: float | None = None,
     high_frequency: bool | None = None,
     period: float | None = None,
@@ -50,9 +51,10 @@ def measure(
         camera has; `prepare`, told of all (codes, seconds) that come next.
     grid : (h, w)
         Of the projector; a side of 1 takes no patterns.
-    phase : bool
+    phase : bool, optional
         Add phase shift to Gray code. Planes through the edges of stripes give fractions of a pixel without
-        it.
+        it, and better ones where the camera resolves the projector's pixels, in which a phase is flat; so,
+        left out, only where it does not.
     seconds : float, optional
         Exposure of every photograph; left out, a few photographs of white find one that is bright but not
         saturated.
@@ -88,24 +90,31 @@ def measure(
     small = max(grid) <= SMALL
     narrow = small if high_frequency is None else checks.flag("high_frequency", high_frequency)
     code = GrayCode(grid, narrow)
-    use_phase = checks.flag("phase", phase) and max(grid) > 1
-    shift = PhaseShift(grid, (period or (8.0 if small else 16.0),), steps) if use_phase else None
+    if phase is not None:
+        checks.flag("phase", phase)
+    small_period = period or (8.0 if small else 16.0)
+    shift = PhaseShift(grid, (small_period,), steps) if max(grid) > 1 and phase is not False else None
     if seconds is None:
         seconds = exposure(shots, grid)
     checks.number("seconds", seconds, above=0.0)
-    patterns = [*code.patterns(), *(shift.patterns() if shift else [])]
-    images = _take(shots, patterns, seconds)
     # A difference of one step of the camera tells nothing.
     dark = max(dark, STEPS / ((getattr(shots, "levels", None) or np.inf) - 1))
-    known = code.decode(images[: code.count], sigmas=sigmas, dark=dark, edges=True)
-    if shift is not None:
-        known = shift.decode(images[code.count :], known, sigmas=sigmas, dark=dark)
+    known = code.decode(_take(shots, code.patterns(), seconds), sigmas=sigmas, dark=dark, edges=True)
+    if shift is not None and (phase or not _resolved(*known, grid)):
+        known = shift.decode(_take(shots, shift.patterns(), seconds), known, sigmas=sigmas, dark=dark)
     found = Correspondence.of(*known, grid)
     if not found.valid.any():
         raise AcquisitionError(
             "shots: no camera pixel could be decoded; the patterns must be in view, sharp and above the noise"
         )
     return found
+
+
+def _resolved(x: Axis, y: Axis, grid: tuple[int, int]) -> bool:
+    """Whether camera pixels are so much smaller than the projector's that many see one alone."""
+    valid = (x.width <= 2.0) & (y.width <= 2.0)
+    places = np.rint(y.value[valid]) * grid[1] + np.rint(x.value[valid])
+    return valid.sum() * FINE**2 > len(np.unique(places))
 
 
 def _take(shots: Shots, patterns: list[np.ndarray], seconds: float) -> list[np.ndarray]:

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs on the projector's grid: every projector pixel is a weighted mean of the camera pixels near it.
 
-Camera pixel m at x_m, with footprint J_m, reaches projector pixel n with the weight
+Camera pixels that are smaller than the projector's tell these apart, by least squares (`unmixing`). Where
+they are not, camera pixel m at x_m, with footprint J_m, reaches projector pixel n with the weight
 
     w_nm = |det J_m| k(d^T Q_m^-1 d),  d = n - x_m,  Q_m = C J_m J_m^T + P I,  k(s) = (1 - s)^2 for s < 1
 
-which is an elliptical filter as wide as the two pixels together: where camera pixels are the smaller ones it
-averages them by their area, where they are the larger it interpolates. Rows are then corrected to first
-order, `w_nm (a_n + b_n . d)`, and sum to one: pictures that are constant or linear come out exactly, even
-where the samples lie on one side of n; but only as far as no weight turns negative, at the rim for instance.
+which is an elliptical filter as wide as the two pixels together: it interpolates, and what is finer than two
+projector pixels blurs. All rows sum to one and are corrected to first order (`centring`).
 """
 
 from __future__ import annotations
@@ -20,14 +19,17 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
+from ltcl.acquisition.geometry.centring import centred
 from ltcl.acquisition.geometry.correspondence import Correspondence
 from ltcl.acquisition.geometry.footprints import jacobian
+from ltcl.acquisition.geometry.unmixing import unmix
 from ltcl.errors import InputError
 
 CAMERA = 1.54  # C: wide enough that samples of a square grid surround every place, however large they are
 PROJECTOR = 1.1  # P: a kernel as wide as a tent over the projector's pixels
 SEEN = 0.05  # of a projector pixel: less is not seen
-STEEP = 1e-4  # smallest spread of the samples, in squared projector pixels, that tells a slope
+TOLD = 0.9  # of its own light, by least squares
+PART, HALF = 0.15, 0.5  # of its area, where that is so (less may be an error of the map), and where it is not
 
 
 @dataclass(frozen=True)
@@ -37,9 +39,10 @@ class Resampling:
     Attributes
     ----------
     weights : (N, M) csr_array, float32
-        Rows of projector pixels that are seen sum to 1, others are empty; no weight is negative.
+        Rows of projector pixels that are seen sum to 1, others are empty. Weights are negative only where
+        least squares take away what camera pixels show of a neighbour.
     coverage : (h, w) float32
-        What part of each projector pixel's surroundings camera pixels cover, 0 to 1.
+        What part of each projector pixel camera pixels cover, 0 to 1; with large ones, of its surroundings.
     grid, camera_grid : (h, w), (H, W)
 
     Examples
@@ -68,11 +71,20 @@ class Resampling:
         J, known = jacobian(found)
         if not known.any():
             raise InputError("found has no two valid neighbours; nothing tells the size of a camera pixel")
-        samples = _Samples.of(found, J, known)
-        weights = samples.weights(found.grid)
-        coverage = np.asarray(weights.w.sum(axis=1))
-        keep = coverage >= SEEN
-        matrix = _first_order(weights, keep)
+        wide = _Samples.of(found, J, known).weights(found.grid)
+        fine = unmix(found, J, known)
+        if fine is None:
+            coverage = np.asarray(wide.sum(axis=1))
+            keep = coverage >= SEEN
+            matrix = centred(_normalised(wide, keep), found)
+        else:
+            coverage, told = fine.area, fine.told >= TOLD
+            keep = (coverage >= PART) & told | (coverage >= HALF)
+            blurred = centred(_normalised(wide, keep & ~told), found)
+            matrix = scipy.sparse.diags_array((keep & told).astype(float)) @ fine.weights + blurred
+        matrix = scipy.sparse.csr_array(matrix, dtype=np.float32)
+        matrix.eliminate_zeros()
+        matrix.sort_indices()
         part = np.minimum(np.where(keep, coverage, 0.0), 1.0).astype(np.float32)
         return cls(matrix, part.reshape(found.grid), found.grid, found.camera_grid)
 
@@ -109,15 +121,6 @@ class Resampling:
 
 
 @dataclass(frozen=True)
-class _Weights:
-    """Pairs of projector and camera pixels, as (N, M) matrices of one pattern: w, and w d in x and y."""
-
-    w: scipy.sparse.csr_array
-    dx: np.ndarray
-    dy: np.ndarray
-
-
-@dataclass(frozen=True)
 class _Samples:
     """Camera pixels with a footprint: number, place, area, Q^-1 as a x^2 + 2 b x y + c y^2, extent."""
 
@@ -141,20 +144,16 @@ class _Samples:
         form, reach = (yy / det, -xy / det, xx / det), (np.sqrt(xx), np.sqrt(yy))
         return cls(np.flatnonzero(known), *place, area, form, reach, known.size)
 
-    def weights(self, grid: tuple[int, int]) -> _Weights:
-        """All pairs of a camera pixel and the projector pixels inside its ellipse."""
+    def weights(self, grid: tuple[int, int]) -> scipy.sparse.csr_array:
+        """w of all pairs of a camera pixel and the projector pixels inside its ellipse, (N, M)."""
         size = np.ceil(np.maximum(*self.reach) - 0.5).astype(int)  # pixels from the nearest one
         parts = []
         for far in np.unique(size):
             some = np.flatnonzero(size == far)
             offsets = range(-far, far + 1)
             parts += [self._offset(some, i, j, grid) for j in offsets for i in offsets]
-        n, m, w, dx, dy = (np.concatenate(part) for part in zip(*parts, strict=True))
-        order = np.argsort(n, kind="stable")
-        indptr = np.concatenate([[0], np.cumsum(np.bincount(n, minlength=grid[0] * grid[1]))])
-        shape = (grid[0] * grid[1], self.pixels)
-        matrix = scipy.sparse.csr_array((w[order], m[order], indptr), shape=shape)
-        return _Weights(matrix, dx[order], dy[order])
+        n, m, w = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return scipy.sparse.csr_array((w, (n, m)), shape=(grid[0] * grid[1], self.pixels))
 
     def _offset(self, some: np.ndarray, i: int, j: int, grid: tuple[int, int]) -> tuple[np.ndarray, ...]:
         """Pairs with the projector pixel i columns and j rows from the one nearest to the sample."""
@@ -167,28 +166,11 @@ class _Samples:
         good = (s < 1) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
         n = (row[good] * w + column[good]).astype(np.int64)
         value = self.area[some[good]] * (1 - s[good]) ** 2
-        return n, self.m[some[good]], value, dx[good], dy[good]
+        return n, self.m[some[good]], value
 
 
-def _first_order(weights: _Weights, keep: np.ndarray) -> scipy.sparse.csr_array:
-    """Rows that sum to one and, where no weight turns negative, put the centre of their samples on n."""
-    w, starts = weights.w, np.asarray(weights.w.indptr)
-    n = np.repeat(np.arange(len(keep)), np.diff(starts))
-    total = np.bincount(n, w.data, len(keep))
-    total = np.where(keep, total, np.inf)
-    data = w.data / total[n]
-    dx, dy = weights.dx, weights.dy
-    mx, my = (np.bincount(n, data * d, len(keep)) for d in (dx, dy))
-    xx, xy, yy = (np.bincount(n, data * p, len(keep)) for p in (dx * dx, dx * dy, dy * dy))
-    xx, xy, yy = xx - mx * mx + STEEP, xy - mx * my, yy - my * my + STEEP
-    det = np.maximum(xx * yy - xy * xy, STEEP**2)
-    # data (1 + b . (d - mean)) has the mean of d at 0 for b = -C^-1 mean, C the spread of d.
-    bx, by = -(yy * mx - xy * my) / det, -(xx * my - xy * mx) / det
-    change = bx[n] * (dx - mx[n]) + by[n] * (dy - my[n])
-    worst, some = np.zeros(len(keep)), np.flatnonzero(np.diff(starts))
-    worst[some] = np.minimum.reduceat(change, starts[some]) if len(some) else 0.0
-    data *= 1 + change / np.maximum(1.0, -worst)[n]
-    matrix = scipy.sparse.csr_array((data.astype(np.float32), w.indices, starts), shape=w.shape)
-    matrix.eliminate_zeros()
-    matrix.sort_indices()
-    return matrix
+def _normalised(weights: scipy.sparse.csr_array, keep: np.ndarray) -> scipy.sparse.csr_array:
+    """Rows to keep, which sum to one."""
+    total = np.asarray(weights.sum(axis=1))
+    scale = np.divide(1.0, total, out=np.zeros_like(total), where=keep)
+    return scipy.sparse.csr_array(scipy.sparse.diags_array(scale) @ weights)

@@ -5,8 +5,12 @@ An edge lies where pattern and inverse are equal; between two camera pixels line
 a few hundredths of a pixel, and there the projector coordinate is known: n + 1/2. Every boundary of two
 projector columns is an edge of exactly one bit. A weighted least-squares plane `x = a + b u + c v` through
 the edges in a window, and faintly through the coordinates of the pixels themselves, gives x at the pixel.
-Where the plane leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter (folds, borders of
-objects) the whole number stays.
+Where they spread about it, the window crosses a border, and one to a side or a smaller one gives the plane.
+Where that leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter (sharp folds), the whole
+number stays, if there are others around for which it is so; else the bits of the pixel are wrong, and it is
+dropped.
+
+Known limit: beside the border of an object pixels are off by some tenths, and so is light that only they see.
 """
 
 from __future__ import annotations
@@ -19,13 +23,16 @@ import numpy as np
 from ltcl.acquisition.geometry.decoded import Axis, Edges
 
 LEAVES = 0.25
-ACROSS = 1.5  # edges on each side of a pixel that a window should hold
-LARGEST = 15  # reach of a window, in camera pixels
+COMPANY = 5  # side of a window
+SPREAD = 0.2  # of edges about a plane: more is no plane; whole numbers of pixels alone add 0.06
+EDGES = 8  # that tell a plane on one side
+ACROSS = 2.5  # edges on each side of a pixel that a window should hold
+SMALLEST, LARGEST = 2, 15  # reach of a window, in camera pixels
 STRIP = 1 << 16  # pixels of a strip of rows: its moments stay in the cache
 
 
-def refine(axis: Axis, valid: np.ndarray) -> np.ndarray:
-    """Projector coordinate (H, W) float32 of the valid pixels, to a fraction of a pixel.
+def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Projector coordinate (H, W) float32 of the valid pixels, to a fraction of a pixel, and which may stay.
 
     Parameters
     ----------
@@ -35,18 +42,74 @@ def refine(axis: Axis, valid: np.ndarray) -> np.ndarray:
         Pixels of width 2 at most that agree with their neighbours.
     """
     if axis.edges is None:
-        return axis.value
+        return axis.value, valid
+    reach = _reach(axis.edges, valid)
+    planes = _planes(axis, valid, reach)
+    fits = _fit(axis, planes[0]) | _in_company(valid & ~_fit(axis, planes[0]))
+    if not fits[valid].all():  # edges beside them are none
+        valid = valid & fits
+        planes = _planes(axis, valid, reach)
+    plane = _at_pixels(axis, valid, planes, reach)
+    far = axis.width / 2
+    cell = np.clip(plane, axis.value - far, axis.value + far)
+    return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32), valid
+
+
+def _fit(axis: Axis, plane: np.ndarray) -> np.ndarray:
+    """Where the plane is inside the cell, or nearly so."""
+    return np.abs(plane - axis.value) <= axis.width / 2 + LEAVES
+
+
+def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
+    """Planes through the window about each pixel: value there, slopes b and c, spread about it; (4, H, W)."""
     H, W = valid.shape
-    reach, plane = _reach(axis.edges, valid), np.empty((H, W))
-    rows = max(STRIP // W, 4 * reach)
+    planes, rows = np.empty((4, H, W)), max(STRIP // W, 4 * reach)
     for top in range(0, H, rows):
         first, last = max(top - reach, 0), min(top + rows + reach, H)
         part = _plane(_moments(axis, valid, slice(first, last), 2 * reach + 1))
-        plane[top : top + rows] = part[top - first :][: min(rows, H - top)]
-    far = axis.width / 2
-    inside = valid & (np.abs(plane - axis.value) <= far + LEAVES)
-    cell = np.clip(plane, axis.value - far, axis.value + far)
-    return np.where(inside, cell, axis.value).astype(np.float32)
+        planes[:, top : top + rows] = part[:, top - first :][:, : min(rows, H - top)]
+    return planes
+
+
+def _at_pixels(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) -> np.ndarray:
+    """Value of the plane of each pixel, (H, W).
+
+    Where a window crosses the border of an object, which shows as spread, windows to the sides are tried
+    (Kuwahara et al. 1976), and then smaller ones.
+    """
+    value = planes[0].copy()
+    v, u = np.nonzero(valid & (planes[3] > SPREAD))
+    while len(v):
+        value[v, u], spread = _best(axis, planes, reach, v, u)
+        if reach <= SMALLEST:
+            break
+        v, u = v[spread > SPREAD], u[spread > SPREAD]
+        reach = max(reach // 2, SMALLEST)
+        planes = _planes(axis, valid, reach)
+    return value
+
+
+def _best(
+    axis: Axis, planes: np.ndarray, reach: int, v: np.ndarray, u: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values at pixels (v, u) of that window around or beside each which spreads least, and its spread."""
+    value, b, c, spread = planes
+    H, W = value.shape
+    cell, far = axis.value[v, u], axis.width[v, u] / 2 + LEAVES
+    best, least = value[v, u], np.full(len(v), np.inf)
+    for j, i in ((j, i) for j in (0, -reach, reach) for i in (0, -reach, reach)):
+        row, column = np.clip(v + j, 0, H - 1), np.clip(u + i, 0, W - 1)
+        there = value[row, column] - b[row, column] * (column - u) - c[row, column] * (row - v)
+        better = (spread[row, column] < least) & (np.abs(there - cell) <= far)
+        best, least = np.where(better, there, best), np.where(better, spread[row, column], least)
+    return best, least
+
+
+def _in_company(odd: np.ndarray) -> np.ndarray:
+    """Pixels with as many like them around as a line has that passes through."""
+    size = (COMPANY, COMPANY)
+    count = cv2.boxFilter(odd.astype(np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return odd & (count > COMPANY - 0.5)
 
 
 def _reach(edges: Edges, valid: np.ndarray) -> int:
@@ -56,11 +119,12 @@ def _reach(edges: Edges, valid: np.ndarray) -> int:
 
 
 def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np.ndarray]:
-    """Sums over the window about each pixel of w, w u, w v, w x, w u u, w u v, w v v, w u x and w v x."""
+    """Sums over the window about each pixel of w, w u, w v, w x, w uu, w uv, w vv, w ux, w vx and w xx."""
     total: list[np.ndarray] = []
     for w, u, v, x in _observations(axis, valid, rows):
         wu, wv = w * u, w * v
-        moments = [w, wu, wv, w * x, wu * u, wu * v, wv * v, wu * x, wv * x]
+        wx = w * x
+        moments = [w, wu, wv, wx, wu * u, wu * v, wv * v, wu * x, wv * x, wx * x]
         total = [a + b for a, b in zip(total, moments, strict=True)] if total else moments
     size = (window, window)
     return [cv2.boxFilter(m, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT) for m in total]
@@ -88,16 +152,17 @@ def _observations(axis: Axis, valid: np.ndarray, rows: slice) -> Iterator[tuple[
 
 
 def _plane(sums: list[np.ndarray]) -> np.ndarray:
-    """Value of the weighted least-squares plane at each pixel, from its nine moments."""
+    """Weighted least-squares planes from their ten moments: value at the pixel, b, c, spread; (4, H, W)."""
     H, W = sums[0].shape
     v, u = np.mgrid[:H, :W]
-    n, U, V, X, UU, UV, VV, UX, VX = sums
+    n, U, V, X, UU, UV, VV, UX, VX, XX = sums
     n = np.maximum(n, 1e-6)  # no valid pixel near
     mean_u, mean_v, mean_x = U / n, V / n, X / n
     uu, uv, vv = UU / n - mean_u**2, UV / n - mean_u * mean_v, VV / n - mean_v**2
-    ux, vx = UX / n - mean_u * mean_x, VX / n - mean_v * mean_x
+    ux, vx, xx = UX / n - mean_u * mean_x, VX / n - mean_v * mean_x, XX / n - mean_x**2
     # A little more spread than there is: edges on one line tell the slope across it only.
     uu, vv = uu + 1e-3, vv + 1e-3
     det = np.maximum(uu * vv - uv**2, 1e-9)
     b, c = (ux * vv - vx * uv) / det, (vx * uu - ux * uv) / det
-    return mean_x + b * (u - mean_u) + c * (v - mean_v)
+    spread = np.where(n >= EDGES, np.sqrt(np.maximum(xx - b * ux - c * vx, 0.0)), np.inf)
+    return np.stack([mean_x + b * (u - mean_u) + c * (v - mean_v), b, c, spread])

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Set-ups of a projector and a camera, each an `ltcl.acquisition.Rig`.
 
-virtual     VirtualRig: photographs of a known T, made by sensor (noise, saturation, levels) and curves
+virtual     VirtualRig: photographs of a known T, made by sensor (noise, saturation, levels) and curves;
+            camera_map is what a camera that is not aligned sees
 mitsuba     MitsubaRig: photographs of a scene that Mitsuba 3 renders; mitsuba_scenes has corners and a room,
             mitsuba_loading puts the pattern in
 folder      FolderRig: patterns and a shooting list out, photographs in; shooting_list keeps the numbers,
@@ -13,6 +14,7 @@ extras      what only some of these need, imported when they do
 
 from __future__ import annotations
 
+from ltcl.acquisition.rigs.camera_map import camera_map
 from ltcl.acquisition.rigs.cameras import Camera, OpenCVCamera
 from ltcl.acquisition.rigs.display import Display
 from ltcl.acquisition.rigs.folder import FolderRig
@@ -31,5 +33,6 @@ __all__ = [
     "MitsubaRig",
     "OpenCVCamera",
     "VirtualRig",
+    "camera_map",
     "mitsuba_scene",
 ]

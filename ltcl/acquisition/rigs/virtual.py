@@ -10,6 +10,7 @@ With codes x (h, w[, 3]) in [0, 1], N = h w projector pixels, and channels c, d:
 
 and `sensor` makes codes of v: photons, read noise, saturation, response, black offset, levels. Light is
 linear throughout; its unit is that of T, so a T whose rows sum to 1 gives 1 per second at full white.
+Radiance is even on each pixel of T; C averages it over what each camera pixel covers.
 Known limit: no blur, no light that falls on the camera outside T.
 """
 
@@ -45,7 +46,8 @@ class VirtualRig:
     camera_grid : (H, W), optional
         Of the photographs; needed where that is not `grid`.
     camera_map : (H W, M) matrix, optional
-        C: what each camera pixel sees of the M pixels of T; without it M = H W and C = I.
+        C: what each camera pixel sees of the M pixels of T, by area, such as `camera_map` makes it from a
+        function; without it M = H W and C = I.
     response : str, function or 3 of them
         Camera, linear value to code: "linear", "srgb", "gamma2.2", "film" (see `curves`), or a function that
         rises within [0, 1] and takes arrays of any shape.

@@ -57,7 +57,7 @@ def test_grids_of_every_shape(grid):
 def test_projector_pixels_smaller_than_camera_pixels():
     grid = (300, 400)
     x, y = homography(CAMERA, grid)
-    for phase in (False, True):
+    for phase in (False, True, None):
         found = measure(Rig(x, y, grid, noise=0.003), grid, phase=phase, seconds=1 / 60)
         assert found.decoded > 0.99
         assert rms(found, x, y) < 0.15
@@ -147,7 +147,8 @@ def test_a_rig_hears_what_comes_next_and_its_steps_count():
             assert seconds in self.exposures
             return super().photograph(codes, seconds)
 
-    rig = Camera(x, y, (16, 16), bits=8, noise=0.002)
-    assert measure(rig, (16, 16)).decoded > 0.9
-    assert rig.told == 2 * 8 + 2 + 2 * 6
-    assert rig.taken == rig.told + 1  # white, to find the exposure
+    for phase, shots in ((None, 0), (False, 0), (True, 2 * 6)):
+        rig = Camera(x, y, (16, 16), bits=8, noise=0.002)
+        assert measure(rig, (16, 16), phase=phase).decoded > 0.9
+        assert rig.told == 2 * 8 + 2 + shots  # a camera that resolves the projector's pixels needs no phase
+        assert rig.taken == rig.told + 1  # white, to find the exposure

@@ -12,8 +12,9 @@ from ltcl.acquisition.geometry.resample import CAMERA, PROJECTOR
 from ltcl.errors import InputError
 from tests.acquisition.geometry.scenes import MAPS, homography
 
-# Camera pixels as large as the projector's, a third, three times, and narrow ones.
-SIZES = [((64, 80), (64, 80)), ((64, 80), (200, 260)), ((120, 160), (40, 52)), ((40, 40), (40, 200))]
+# Camera pixels as large as the projector's, three times, narrow ones; and a third, which are unmixed.
+LARGE = [((64, 80), (56, 70)), ((120, 160), (40, 52)), ((40, 40), (34, 200))]
+SIZES = [*LARGE, ((64, 80), (200, 260))]
 
 
 def known(x: np.ndarray, y: np.ndarray, grid: tuple[int, int], valid=None) -> Correspondence:
@@ -32,10 +33,15 @@ def case(request):
     return Resampling.of(known(x, y, grid)), x, y, np.mgrid[: grid[0], : grid[1]][::-1].astype(float)
 
 
-def test_constants_stay_and_weights_are_means(case):
+@pytest.mark.parametrize(("grid", "camera"), LARGE)
+@pytest.mark.parametrize("name", MAPS)
+def test_large_camera_pixels_are_averaged(grid, camera, name):
+    assert Resampling.of(known(*MAPS[name](camera, grid), grid)).weights.data.min() >= 0
+
+
+def test_constants_stay(case):
     R, x, _, _ = case
     W = R.weights
-    assert W.data.min() >= 0
     np.testing.assert_allclose(W.sum(axis=1)[R.seen.ravel()], 1.0, rtol=0, atol=1e-6)
     assert W[~R.seen.ravel()].nnz == 0
     np.testing.assert_allclose(R.apply(np.full(x.shape, 7.5))[R.seen], 7.5, rtol=2e-6)

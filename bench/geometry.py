@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A camera that is not aligned with the projector: how well T comes out, by size of its pixels and noise.
+
+A corner of 16 x 16 projector pixels, each wall 16 x 8, of which the exact transport is known. A virtual
+camera sees it askance; its pixels integrate over their area, straddle projector pixels, and miss two or three
+of these at a corner of the picture. Which pixel sees which is found by Gray code, the camera's response from
+photographs, and T is scanned pixel by pixel. Then T p is compared for held patterns of noise, of stripes and
+of smooth light, in the camera's own unit (its last code), on all pixels that are not masked.
+
+With Mitsuba 3 a rendered corner is acquired from a camera beside the projector, and a picture on it is
+compensated. Where the photographs of a real set-up lie beside the checkout, their Gray code is decoded.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import _board as board
+import _figures as figures
+import _rendered as rendered
+from _figures import Claim
+from _harness import Options, options
+from acquire import corner, held
+from ltcl.acquisition import VirtualRig, acquire, camera_map
+from ltcl.images import to_srgb
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+N = 16
+SIZES, CLAIMED = (1.5, 2.0, 3.0, 4.0), (3.0, 4.0)
+CAMERAS = {"srgb, 8 bits": ("srgb", 8), "film, 12 bits": ("film", 12)}
+NOISES = {"10000 electrons": (10000.0, 0.0005), "2000": (2000.0, 0.002), "500": (500.0, 0.005)}
+KINDS = {"noise": slice(0, 2), "stripes": slice(2, 3), "smooth": slice(3, 6)}
+LIMIT, RENDERED = 0.02, 0.04
+
+
+@dataclass(frozen=True)
+class Found:
+    """Largest relative error of T p of each kind of pattern, and projector pixels that are masked."""
+
+    size: float
+    camera: str
+    noise: str
+    errors: dict[str, float]
+    masked: int
+
+    @property
+    def worst(self) -> float:
+        """Of all kinds."""
+        return max(self.errors.values())
+
+
+def askance(size: float) -> tuple[Any, tuple[int, int]]:
+    """Places on the projector's grid of a camera with `size` pixels to one, in perspective and turned."""
+    H = W = int(np.ceil(1.12 * size * N))
+
+    def place(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        a, b = (u + 0.5) / W, (v + 0.5) / H
+        d = 1 + 0.15 * a - 0.09 * b
+        return N * (1.123 * a + 0.054 * b - 0.043) / d - 0.9, N * (1.145 * b - 0.042 * a - 0.053) / d - 0.5
+
+    return place, (H, W)
+
+
+def measured(given: Options, truth: np.ndarray, size: float, camera: str, noise: str) -> Found:
+    """Acquire and compare."""
+    place, grid = askance(size)
+    (response, bits), (electrons, read) = CAMERAS[camera], NOISES[noise]
+    C = camera_map(place, grid, (N, N), points=16)
+    common: dict[str, Any] = {"response": response, "bits": bits, "gain": electrons, "read": read}
+    rig = VirtualRig(truth, (N, N), camera_grid=grid, camera_map=C, ambient=0.01, seed=2, **common)
+    with TemporaryDirectory() as folder:
+        T = acquire(rig, strategy="pixel", store=Path(folder) / "T.zarr", device=given.device)
+        P, seen = held(N), ~T.masked
+        ours = np.asarray(T @ P.T.reshape(-1, N, N), np.float64).reshape(P.shape[1], -1).T[seen]
+        white = np.asarray(T @ np.ones((N, N)), np.float64).ravel()[seen]
+    theirs = truth.sum(axis=1)[seen]
+    wanted = (truth @ P)[seen]
+    off = np.linalg.norm((white @ theirs) / (white @ white) * ours - wanted, axis=0)
+    relative = off / np.linalg.norm(wanted, axis=0)
+    errors = {name: float(relative[part].max()) for name, part in KINDS.items()}
+    return Found(size, camera, noise, errors, int(np.count_nonzero(~seen)))
+
+
+def virtual(given: Options) -> list[Found]:
+    """All sizes with the least noise, and more noise with three camera pixels to a projector pixel."""
+    truth, quiet = corner(N), next(iter(NOISES))
+    cameras = list(CAMERAS)[:1] if given.smoke else list(CAMERAS)
+    sizes = CLAIMED[:1] if given.smoke else SIZES
+    found = [measured(given, truth, size, camera, quiet) for camera in cameras for size in sizes]
+    louder = () if given.smoke else list(NOISES)[1:]
+    return found + [measured(given, truth, 3.0, cameras[-1], noise) for noise in louder]
+
+
+def claims(found: list[Found], loop: rendered.Loop | None) -> list[Claim]:
+    """What has to hold."""
+    listed = [
+        Claim(
+            f"T p of held patterns, {one.size:g} camera pixels to a side, {one.camera}",
+            ", ".join(f"{kind} {error:.2%}" for kind, error in one.errors.items()),
+            "at most 2 %",
+            one.worst <= LIMIT,
+        )
+        for one in found
+        if one.size in CLAIMED and one.noise == next(iter(NOISES))
+    ]
+    if loop is not None:
+        before, after = loop.decibels
+        listed += [
+            Claim(
+                "T p on a rendered corner, against renders from the projector's place",
+                f"{loop.errors.max():.2%}",
+                "at most 4 %",
+                float(loop.errors.max()) <= RENDERED,
+            ),
+            Claim(
+                "a picture compensated on it comes nearer to what was asked for",
+                f"{before:.1f} dB, then {after:.1f} dB",
+                "10 dB more",
+                after >= before + 10,
+            ),
+        ]
+    return listed
+
+
+def facts(found: list[Found], loop: rendered.Loop | None) -> dict[str, Any]:
+    """A line for each acquisition, and the real photographs."""
+    told: dict[str, Any] = {"projector pixels": N * N}
+    for one in found:
+        parts = ", ".join(f"{kind} {error:.2%}" for kind, error in one.errors.items())
+        name = f"{one.size:g} camera pixels, {one.camera}, {one.noise}"
+        told[name] = f"{parts}; {one.masked} pixels masked"
+    if loop is None:
+        told["rendered corner"] = "left out, mitsuba is not installed"
+    else:
+        told["rendered corner"] = f"{loop.pattern.shape}, {loop.photographs} photographs of the scan"
+    return told | board.facts()
+
+
+def draw(found: list[Found], loop: rendered.Loop | None) -> Figure:
+    """Errors against the size of camera pixels and against noise; the rendered corner below."""
+    figure = figures.page(
+        430 if loop is None else 720,
+        "A camera that is not aligned with the projector",
+        "Above: largest error of T p over held patterns, of a corner with 16 x 16 projector pixels",
+        "seen askance. Below: a rendered corner, by a camera half a wall beside the projector.",
+    )
+    quiet = next(iter(NOISES))
+    axes = figures.graph(
+        figure, (80, 140, 400, 220), "By size", "camera pixels to a projector pixel's side", ""
+    )
+    for camera in CAMERAS:
+        chosen = [one for one in found if one.camera == camera and one.noise == quiet]
+        for kind, style in zip(KINDS, ("-", "--", ":"), strict=True):
+            values = [one.errors[kind] for one in chosen]
+            colour = f"C{list(CAMERAS).index(camera)}"
+            label = f"{camera}, {kind}"
+            axes.plot([one.size for one in chosen], values, style, color=colour, marker="o", label=label)
+    _percent(axes)
+    axes.legend(frameon=False, labelcolor=figures.FAINT, fontsize=8.5)
+    axes = figures.graph(
+        figure, (580, 140, 380, 220), "By noise, 3 camera pixels", "electrons at full scale", ""
+    )
+    chosen = [one for one in found if one.size == 3.0 and one.camera == found[-1].camera]
+    electrons = [NOISES[one.noise][0] for one in chosen]
+    for kind, style in zip(KINDS, ("-", "--", ":"), strict=True):
+        axes.plot(electrons, [one.errors[kind] for one in chosen], style, color="C1", marker="o", label=kind)
+    axes.set_xscale("log")
+    axes.set_xticks(electrons, [f"{count:g}" for count in electrons])
+    axes.minorticks_off()
+    _percent(axes)
+    if loop is not None:
+        _pictures(figure, loop)
+    return figure
+
+
+def _percent(axes: Axes) -> None:
+    """Errors in per cent, and a line at the limit."""
+    ticks = [0.002, 0.005, 0.01, 0.02, 0.05, 0.1]
+    axes.set_yticks(ticks, [f"{100 * tick:g} %" for tick in ticks])
+    axes.minorticks_off()
+    axes.axhline(LIMIT, color=figures.FAINT, lw=1)
+
+
+def _pictures(figure: Figure, loop: rendered.Loop) -> None:
+    """What was asked for, what the projector then sends, and the wall before and after."""
+    before, after = loop.decibels
+    listed = [
+        (loop.desired, "asked for", "on the projector's pixels"),
+        (loop.pattern, "pattern", "what the projector sends"),
+        (loop.before, "before", f"the picture itself sent: {before:.1f} dB"),
+        (loop.after, "after", f"the pattern sent: {after:.1f} dB"),
+    ]
+    lefts, width = figures.columns(len(listed))
+    for left, (image, label, note) in zip(lefts, listed, strict=True):
+        shown = to_srgb(np.clip(image / max(float(image.max()), 1e-9), 0, 1))
+        figures.picture(figure, (left, 480, width), np.repeat(shown[..., None], 3, -1), label, note)
+
+
+def main() -> None:
+    """Run the bench."""
+    given = options(__doc__ or "")
+    found, loop = virtual(given), None
+    if importlib.util.find_spec("mitsuba") is not None:
+        n = 12 if given.smoke else 24
+        patterns = held(n).T.reshape(-1, n, n)[:, : 3 * n // 4].astype(np.float32)
+        loop = rendered.loop(n, 16 if given.smoke else 32, patterns, given.device)
+    title = "A camera that is not aligned with the projector"
+    figures.conclude(given, title, claims(found, loop), facts(found, loop), lambda: draw(found, loop))
+
+
+if __name__ == "__main__":
+    main()
