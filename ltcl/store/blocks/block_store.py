@@ -23,6 +23,7 @@ from ltcl.files import as_path
 from ltcl.store.blocks import aside, creating, entries, extras, finishing, layout, nodes, sealed, verifying
 from ltcl.store.blocks.entries import Block
 from ltcl.store.blocks.layout import Layout
+from ltcl.store.blocks.turning import Change
 from ltcl.store.refusals import about
 
 _GROUPS = {"rows": "channel", "columns": "columns"}
@@ -264,7 +265,7 @@ class BlockStore:
         aside.replace_document(self.path, "zarr.json", sealed.seal(attributes | parts, nodes.GROUP))
         self._final = (attributes | parts).get("final")
 
-    def finalize(self, *, memory: int | None = None) -> None:
+    def finalize(self, *, memory: int | None = None, change: Change | None = None) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
         Ended at any moment, it goes on from there when called again. Must not run beside writers.
@@ -273,6 +274,9 @@ class BlockStore:
         ----------
         memory : int, optional
             Bytes for the entries that are turned at once; 256 MiB when not given.
+        change : function, optional
+            Of channel, first row, rows (rows, N) and the variance of their entries: what is committed of the
+            two, wherever columns are turned. The same in every call.
 
         Raises
         ------
@@ -282,7 +286,7 @@ class BlockStore:
         if self.mode != "a":
             self._writable()
         with about(self.path):
-            finishing.finish(self, memory)
+            finishing.finish(self, memory, change)
 
     def verify(self) -> None:
         """Read everything and compare all checksums; the first thing that is wrong is raised as FileError."""

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 _MEMORY = 1 << 28
 
 
-def finish(store: BlockStore, memory: int | None) -> None:
+def finish(store: BlockStore, memory: int | None, change: turning.Change | None = None) -> None:
     """See `BlockStore.finalize`."""
     if not store.final:
         if store.layout.orientation == "columns":
             if store.missing("rows"):
                 refuse_missing(store, "columns")
-            turning.turn(store, _MEMORY if memory is None else memory)
+            turning.turn(store, _MEMORY if memory is None else memory, change)
         refuse_missing(store, "rows")
         if store.layout.kind == "blocks" and store.layout.is_square and "first_bounce" not in store.extras:
             _find_first_bounce(store)
