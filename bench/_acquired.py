@@ -35,12 +35,12 @@ def draw(costs: list[Cost]) -> Figure:
     figure = figures.page(
         440,
         "What it takes to measure a transport",
-        "A corner of n x n pixels, film-like camera of 12 bits; dashed what the plan said before the scan.",
+        "A corner of n x n pixels, film-like camera of 12 bits; dashed what plans said. Computing includes the camera.",
     )
     parts: list[tuple[str, Callable[[Cost], float], Callable[[Cost], float] | None]] = [
         ("photographs", lambda one: one.photographs, lambda one: one.planned),
         ("hours of exposure", lambda one: one.exposure / 3600, lambda one: one.planned_exposure / 3600),
-        ("seconds of computing, camera simulated", lambda one: one.seconds, None),
+        ("seconds of computing", lambda one: one.seconds, None),
     ]
     for place, (title, taken, planned) in enumerate(parts):
         axes = figures.graph(figure, (70 + 320 * place, 140, 260, 230), title, "pixels", "")

@@ -11,8 +11,8 @@ bounces (eq. 27), with F = diag(T) and D = diag(E) F^-1, X = S^-1 = F T^-1 is of
 one product with E, which need not be formed, and one solve a bounce. The unit of light is in neither: bounces
 do not depend on it.
 
-Known limit: noise only. The response of the camera is taken for true; `Report.beside_white` shows where that
-is wrong. Cells of an adaptive scan are as smooth as it left them.
+Known limit: the response of the camera is taken for true; `Report.beside_white` shows where it is not. Light
+that an adaptive scan leaves smooth is estimated by what a coarser one would lose of it.
 """
 
 from __future__ import annotations

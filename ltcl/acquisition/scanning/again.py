@@ -8,9 +8,10 @@ never kept, but its products with some columns and its diagonal, which is all th
     E W, (N, k) for W (N, k),    diag(E)
 
 So errors that are in many entries alike are drawn as they are, which variances of entries do not tell: of the
-ambient light that is subtracted from all pictures, and of sums of entries, which scans know better.
+ambient light that is subtracted from all pictures, and of sums of entries, which scans know better. What
+cells of an adaptive scan leave smooth is no noise; it is taken to be what twice the threshold would lose more.
 
-Not drawn: what thresholds drop, and what `Calibration` takes for true: response, black offset, projector.
+Not drawn: what `thresholds` drop, and what `Calibration` takes for true: response, black offset, projector.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Seen
 from ltcl.store import BlockStore, StoredRows
 
 _TABLE = 4096  # radiances that variances are tabulated at
+_COARSER = 2.0  # times the threshold: loses as much again as the threshold has, in proportion to it
 
 
 class Errors(NamedTuple):
@@ -136,38 +138,49 @@ def _columns(
 
 
 class _Simulated(Retaken):
-    """A camera that looks at what a core says (`adaptive.Source`)."""
+    """A camera that looks at what a core says (`adaptive.Source`); without noise where `rng` is None."""
 
-    def __init__(self, calibration: Calibration, found: core.Stored, rng: np.random.Generator) -> None:
+    def __init__(self, calibration: Calibration, found: core.Stored, rng: np.random.Generator | None) -> None:
         super().__init__(calibration)
-        self._found, self._rng, self._error = found, rng, self.dark(rng)
-        white = found.product(np.ones(self.grid)) + self.brighter(rng) - self._error
+        self._found, self._rng = found, rng
+        self._error = np.zeros(self.ambient.shape) if rng is None else self.dark(rng)
+        own = 0.0 if rng is None else self.brighter(rng)
+        white = found.product(np.ones(self.grid)) + own - self._error
         self.white = Picture(np.where(self.seen, white, 0.0), self.white.variance)
 
     def announce(self, patterns: Iterable[np.ndarray]) -> None:
         """Nobody has to prepare anything."""
 
     def take(self, patterns: list[np.ndarray]) -> list[Picture]:
-        """With noise."""
+        """As the camera sees them."""
         return [self._picture(self._found.product(pattern)) for pattern in patterns]
 
     def _picture(self, light: np.ndarray) -> Picture:
         v = np.stack([self.variance(part, c) for c, part in enumerate(light)])
-        value = light + np.sqrt(v) * self._rng.standard_normal(v.shape) - self._error
+        noise = 0.0 if self._rng is None else np.sqrt(v) * self._rng.standard_normal(v.shape)
+        value = light + noise - self._error
         return Picture(np.where(self.seen, value, 0.0), np.where(self.seen, v, UNKNOWN))
 
 
 def _of_cells(store: BlockStore, W: list[np.ndarray], draws: int, rng: np.random.Generator) -> list[Errors]:
-    """Every scan chooses its cells anew."""
+    """Every scan chooses its cells anew; to which comes, with either sign, what cells leave smooth."""
     told, found, settings = Calibration.of(store), core.Stored.of(store), store.attributes["settings"]
-    drawn = []
-    for _ in range(draws):
+
+    def scanned(rng: np.random.Generator | None, coarser: float = 1.0) -> list[Errors]:
         camera = _Simulated(told, found, rng)
-        scan = adaptive.scan(camera, camera, settings["threshold"], settings["sigmas"])
+        scan = adaptive.scan(camera, camera, coarser * settings["threshold"], settings["sigmas"])
         other = core.Stored(found.cells, scan.core.matrices())
-        drawn.append([_difference(other, found, c, w) for c, w in enumerate(W)])
+        return [_difference(other, found, c, w) for c, w in enumerate(W)]
+
+    smooth = scanned(None, _COARSER)
+    drawn = [scanned(rng) for _ in range(draws)]
+    sign = rng.choice([-1.0, 1.0], draws)
     return [
-        Errors(*(np.stack(part) for part in zip(*each, strict=True))) for each in zip(*drawn, strict=True)
+        Errors(
+            np.stack([one[c].product for one in drawn]) + sign[:, None, None] * smooth[c].product,
+            np.stack([one[c].diagonal for one in drawn]) + sign[:, None] * smooth[c].diagonal,
+        )
+        for c in range(len(W))
     ]
 
 
