@@ -35,7 +35,7 @@ def draw(costs: list[Cost]) -> Figure:
     figure = figures.page(
         440,
         "What it takes to measure a transport",
-        "A corner of n x n pixels, film-like camera of 12 bits; dashed what plans said. Computing includes the camera.",
+        "A corner of n x n pixels, a camera of 12 bits. Dashed: what plans said.",
     )
     parts: list[tuple[str, Callable[[Cost], float], Callable[[Cost], float] | None]] = [
         ("photographs", lambda one: one.photographs, lambda one: one.planned),

@@ -46,7 +46,10 @@ TILES, DRAWS = 8, 16
 
 @dataclass(frozen=True)
 class Found:
-    """One acquisition. `bounces`: error over forecast of bounces 0 to 3; `inside`: within 3 deviations."""
+    """One acquisition. `bounces`: error over forecast of bounces 0 to 3; `inside`: within 3 deviations.
+
+    `far` is the error of far light row by row, `weak` that of all of it, which noise hardly changes.
+    """
 
     name: str
     strategy: str
@@ -55,6 +58,7 @@ class Found:
     sums: float
     beside_white: float
     far: float
+    weak: float
     decibels: float
     bounces: list[float]
     inside: float
@@ -131,7 +135,7 @@ def measured(truth: Truth, camera: str, strategy: str, device: Device, draws: in
         ratios, inside = of_bounces(path, T, truth, draws)
         return Found(
             name, strategy, cost, apart(unit * shown(T, P), truth.seen(P)), sums, report.beside_white,
-            far(T, truth, unit), compensated(T, truth, unit), ratios, inside,
+            *far(T, truth, unit), compensated(T, truth, unit), ratios, inside,
         )  # fmt: skip
 
 
@@ -148,15 +152,15 @@ def rows(T: ltcl.Transport, truth: Truth) -> tuple[np.ndarray, float]:
     return unit, float(np.max(np.abs(unit * ours / theirs - 1)))
 
 
-def far(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> float:
-    """Error of the light from far tiles, relative to that light."""
+def far(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> tuple[float, float]:
+    """Error of the light from far tiles, relative to that light: row by row, and of all rows together."""
     n, side = truth.n, truth.n // TILES
-    tile = (np.arange(n) // side)[:, None] * TILES + np.arange(n) // side
-    P = np.repeat((tile.ravel()[:, None] == np.arange(TILES**2))[..., None], truth.channels, axis=-1)
-    (y, x), (v, u) = (np.divmod(part, TILES) for part in (tile.ravel()[:, None], np.arange(TILES**2)))
+    tile = ((np.arange(n) // side)[:, None] * TILES + np.arange(n) // side).ravel()[:, None]
+    P = np.repeat((tile == np.arange(TILES**2))[..., None], truth.channels, axis=-1)
+    (y, x), (v, u) = (np.divmod(part, TILES) for part in (tile, np.arange(TILES**2)))
     beyond = (np.maximum(abs(y - v), abs(x - u)) > 1)[..., None]
     ours, theirs = (np.sum(beyond * seen, axis=1) for seen in (unit * shown(T, P), truth.seen(P)))
-    return apart(ours, theirs)
+    return apart(ours, theirs), float(np.max(np.abs(ours.sum(axis=0) / theirs.sum(axis=0) - 1)))
 
 
 def of_bounces(path: Path, T: ltcl.Transport, truth: Truth, draws: int) -> tuple[list[float], float]:
@@ -196,7 +200,7 @@ def claims(found: list[Found]) -> list[Claim]:
         listed += [
             Claim(f"{one.name}: T p of held patterns", f"{one.held:.2%}", "at most 2 %", one.held <= 0.02),
             Claim(f"{one.name}: row sum furthest off", f"{one.sums:.2%}", "at most 2 %", one.sums <= 0.02),
-            Claim(f"{one.name}: far light", f"{one.far:.2%} off", "at most 5 %", one.far <= 0.05),
+            Claim(f"{one.name}: far light, all", f"{one.weak:.2%} off", "at most 2 %", one.weak <= 0.02),
             Claim(f"{one.name}: compensated", f"{one.decibels:.1f} dB", "at least 30", one.decibels >= 30),
             Claim(
                 f"{one.name}: bounces 1 to 3, error over forecast",
@@ -242,6 +246,7 @@ def main() -> None:
     for one in [*found, *mixed]:
         facts[f"{one.name}, seconds"] = one.cost.seconds
         facts[f"{one.name}, photographs"] = one.cost.photographs
+        facts[f"{one.name}, far light row by row"] = one.far
         facts[f"{one.name}, direct part, error over forecast"] = one.bounces[0]
         if one.strategy != "adaptive":
             facts[f"{one.name}, columns beside white before they added up to it"] = one.beside_white

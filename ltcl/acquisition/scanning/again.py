@@ -9,7 +9,7 @@ never kept, but its products with some columns and its diagonal, which is all th
 
 So errors that are in many entries alike are drawn as they are, which variances of entries do not tell: of the
 ambient light that is subtracted from all pictures, and of sums of entries, which scans know better. What
-cells of an adaptive scan leave smooth is no noise; it is taken to be what twice the threshold would lose more.
+cells of an adaptive scan leave smooth is no noise; it is taken for what twice the threshold would lose more.
 
 Not drawn: what `thresholds` drop, and what `Calibration` takes for true: response, black offset, projector.
 """
