@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from matplotlib.ticker import FuncFormatter, LogLocator
+
 import _figures as figures
 
 if TYPE_CHECKING:
@@ -14,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _NAMES = {"adaptive": "adaptive", "hadamard": "S-matrices", "pixel": "one at a time"}
-_COLOURS = {"adaptive": "#c0392b", "hadamard": "#2a7f9e", "pixel": "#5b5b5b"}
+_COLOURS = {"adaptive": "#c0392b", "hadamard": "#2a7f9e", "pixel": "#e0b34c"}
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ def draw(costs: list[Cost]) -> Figure:
         sides = sorted({round(one.pixels**0.5) for one in costs})
         axes.set_xscale("log")
         axes.set_xticks([n * n for n in sides], [f"{n}\u00b2" for n in sides])
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
         axes.minorticks_off()
         if place == 0:
             axes.legend(frameon=False, labelcolor=figures.FAINT, fontsize=9.5)
@@ -60,6 +64,8 @@ def _line(
 ) -> None:
     strategy, pixels = costs[0].strategy, [one.pixels for one in costs]
     colour = _COLOURS[strategy]
-    axes.plot(pixels, [taken(one) for one in costs], "o-", ms=4, color=colour, label=_NAMES[strategy])
+    width = 4 if strategy == "hadamard" else 1.5  # it lies below another line
+    taken_of = [taken(one) for one in costs]
+    axes.plot(pixels, taken_of, "o-", ms=4, lw=width, color=colour, label=_NAMES[strategy])
     if planned is not None:
         axes.plot(pixels, [planned(one) for one in costs], "--", lw=1, color=colour)
