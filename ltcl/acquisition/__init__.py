@@ -9,6 +9,7 @@
     calibration, measuring, exposing    all that is measured once of a set-up, and for how many seconds
     scanning/   which pixels are lit when, and T from the pictures; plan before, report after
     task, run   acquire: all of it, into a store, stopped and resumed
+    forecasting how far pictures and bounces are off by the noise of the scan
 
 Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
 """
@@ -16,6 +17,7 @@ Codes in [0, 1] are what a projector is fed and what a camera gives; they are no
 from __future__ import annotations
 
 from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.forecasting import Forecast, forecast_bounces, forecast_picture
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.rigs import (
@@ -37,6 +39,7 @@ __all__ = [
     "Correspondence",
     "Display",
     "FolderRig",
+    "Forecast",
     "GPhoto2Camera",
     "LiveRig",
     "MitsubaRig",
@@ -47,5 +50,7 @@ __all__ = [
     "VirtualRig",
     "acquire",
     "camera_map",
+    "forecast_bounces",
+    "forecast_picture",
     "mitsuba_scene",
 ]

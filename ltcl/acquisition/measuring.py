@@ -114,8 +114,9 @@ def measure(
     offset, ambient = _black(run, response, noise, chosen, frames)
     sensor = (response, noise, offset)
     run.tell("white")
-    white = run.merged(run.white, exposing.offered(shots, [seconds / 2, seconds]), *sensor, _AGAIN)
-    white = white - ambient
+    # The longest is for what is dim beside the brightest, and told by the scan at that exposure.
+    times = exposing.offered(shots, [seconds / 2, seconds, chosen[-1]])
+    white = run.merged(run.white, times, *sensor, _AGAIN) - ambient
     run.tell("projector")
     light, M = _projector(run, seconds, *sensor)
     return Calibration(chosen, response, noise, offset, ambient, white, light, M, R)

@@ -13,16 +13,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ltcl.acquisition import measuring
 from ltcl.acquisition.calibration import PREFIX, Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.scanning import adaptive, columns, core, plan
+from ltcl.acquisition.scanning import adaptive, balance, columns, core, plan
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.columns import Code
 from ltcl.acquisition.scanning.log import Log
-from ltcl.acquisition.scanning.pictures import Pictures
+from ltcl.acquisition.scanning.pictures import Picture, Pictures
 from ltcl.errors import FileError, InputError
 from ltcl.store import BlockStore, zarr_folder
 from ltcl.store.blocks import creating
@@ -172,9 +174,21 @@ def scan(run: Run, progress: Progress) -> None:
         progress(done, total)
 
     columns.scan(run.pictures, run.code, run.store, run.wanted.sigmas, tell)
-    columns.keep_first_bounce(run.store, run.wanted.sigmas)
-    run.store.update(patterns=total)
-    run.store.finalize()
+    _finish(run, total)
+
+
+def _finish(run: Run, patterns: int) -> None:
+    """Columns as rows that add up to white; what they added up to before is kept for the report."""
+    store, white = run.store, run.pictures.white
+    columns.keep_mask(store, run.wanted.sigmas)
+    store.extra(balance.SUMS, np.stack([balance.sums(store, c) for c in range(run.pictures.channels)]))
+    store.update(patterns=patterns)
+
+    def add_up(c: int, first: int, matrix: Any, variance: Any) -> tuple[Any, Any]:
+        here = slice(first, first + matrix.shape[0])
+        return balance.rows(matrix, variance, Picture(white.value[c, here], white.variance[c, here]))
+
+    store.finalize(change=add_up)
 
 
 def _scan_cells(run: Run, progress: Progress) -> None:

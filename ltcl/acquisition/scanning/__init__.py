@@ -5,10 +5,12 @@ pictures           a calibrated rig as a camera on the pixels of the scan
 block              blocks of projector pixels as pixels of a coarser scan
 pixel, hadamard    how the pixels of a batch are lit, and its columns found
 columns            batches of columns into a store
+balance            columns that add up to white
 thresholds         which entries are light, which noise; sums are tested
 adaptive           cells of a quad-tree (cells), those lit together that do not conflict (colouring)
 log                pictures in the order in which a scan asked for them, in a store
 core               what an adaptive scan found, as a compressed transport
+again              the error of T, drawn: the scan again, in numbers
 plan, report       what a scan takes, before; what came of it, after
 """
 

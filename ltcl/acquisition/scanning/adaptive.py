@@ -28,7 +28,7 @@ import scipy.sparse
 
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.colouring import colour
-from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Pictures
+from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Seen
 from ltcl.acquisition.scanning.pixel import all_but_one
 
 AT_ONCE = 16  # patterns of a batch
@@ -126,7 +126,7 @@ def most_patterns(cells: Cells) -> int:
     return max(sum(whole), AT_ONCE)
 
 
-def scan(pictures: Pictures, source: Source, threshold: float, sigmas: float) -> Scan:
+def scan(pictures: Seen, source: Source, threshold: float, sigmas: float) -> Scan:
     """Find the core of T, the white picture of the calibration being its root.
 
     Parameters
@@ -164,7 +164,7 @@ def _much(entries: Entries, least: np.ndarray, sigmas: float) -> np.ndarray:
 
 
 def _divide(
-    found: Core, level: int, parents: Entries, pictures: Pictures, source: Source
+    found: Core, level: int, parents: Entries, pictures: Seen, source: Source
 ) -> tuple[Level, Entries]:
     """The entries of the children of all parents, by cell."""
     numbers, starts, place = np.unique(parents.cell, return_index=True, return_inverse=True)
@@ -190,7 +190,7 @@ def _measured(
     place: np.ndarray,
     kids: np.ndarray,
     groups: list[tuple[int, np.ndarray]],
-    pictures: Pictures,
+    pictures: Seen,
     source: Source,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Energy and variance (4, channels, entries) of children; `place`: the parent of each entry."""
@@ -223,7 +223,7 @@ def _own(
     stored: list[scipy.sparse.csr_array],
     pixels: np.ndarray,
     found: Core,
-    pictures: Pictures,
+    pictures: Seen,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of a picture, at the pixels that are active, the light of the cell that each is active in."""
     beside = np.zeros((found.channels, len(pixels)))

@@ -7,6 +7,7 @@ first bounce stands beside it. Loaded, `Transport` divides the columns by F when
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import scipy.sparse
 from ltcl.acquisition.scanning import thresholds
 from ltcl.acquisition.scanning.adaptive import Core
 from ltcl.acquisition.scanning.cells import Cells
+from ltcl.store import BlockStore
 
 
 def arrays(core: Core, mixing: np.ndarray | None = None, sigmas: float = 0.0) -> dict[str, np.ndarray]:
@@ -71,6 +73,40 @@ def arrays(core: Core, mixing: np.ndarray | None = None, sigmas: float = 0.0) ->
 def variances(core: Core) -> dict[str, np.ndarray]:
     """The variance of the entries of a core that is complete, in `core_variance_0` and so on."""
     return {f"core_variance_{c}": part.data for c, part in enumerate(core.matrices("variance"))}
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """C of each channel, (M, cells), and the variance of its entries, as a store has them.
+
+    Examples
+    --------
+    >>> C = scipy.sparse.csr_array([[0.5, 0.0, 0.1], [0.0, 0.5, 0.1]])
+    >>> Stored(Cells((1, 2)), [C]).product(np.array([[1.0, 0.0]]))
+    array([[0.6, 0.1]])
+    """
+
+    cells: Cells
+    matrices: list[scipy.sparse.csr_array]
+    variances: list[scipy.sparse.csr_array] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, store: BlockStore) -> Stored:
+        """Of a store of `arrays`."""
+        cells, parts = Cells(store.layout.grid), ([], [])
+        for c in range(store.layout.channels):
+            names = [f"system_{c}.R.core.{name}" for name in ("data", "indices", "indptr")]
+            data, indices, indptr = (np.array(store.extra(name)) for name in names)
+            shape = (len(indptr) - 1, cells.offsets[-1])
+            data[indices == np.repeat(np.arange(shape[0]), np.diff(indptr))] += 1.0  # R = C W - I
+            for part, values in zip(parts, (data, store.extra(f"core_variance_{c}")), strict=True):
+                part.append(scipy.sparse.csr_array((np.array(values), indices, indptr), shape=shape))
+        return cls(cells, *parts)
+
+    def product(self, pattern: np.ndarray) -> np.ndarray:
+        """T p of a pattern (h, w), (channels, M)."""
+        sums = self.cells.sums(pattern)
+        return np.stack([C @ sums for C in self.matrices])
 
 
 def diagonal(cells: Cells, C: scipy.sparse.csr_array) -> np.ndarray:

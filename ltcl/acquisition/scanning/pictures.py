@@ -8,7 +8,7 @@ blocks of the scan, less the ambient light, in units of the light that all chann
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ltcl.acquisition.exposing import telling
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.scanning.block import Blocks
+from ltcl.store import BlockStore
 
 UNKNOWN = np.float32(1e12)
 """The variance of a value of which nothing is known."""
@@ -30,13 +31,15 @@ class Picture(NamedTuple):
     variance: np.ndarray
 
 
-class Pictures:
-    """A rig that was calibrated, as a camera on the pixels of the scan.
+class Seen:
+    """What a calibration tells of the pixels of the scan.
 
     Attributes
     ----------
+    calibration : Calibration
     grid : (h, w)
         Of the scan: M = N = h w.
+    channels : 1 or 3
     ambient : (channels, M)
         Variance of what is subtracted from each picture, the same in all.
     white : Picture
@@ -45,16 +48,51 @@ class Pictures:
         Pixels that the camera sees.
     """
 
-    def __init__(self, shots: Shots, calibration: Calibration, side: int = 1) -> None:
-        self.shots, self.calibration = shots, calibration
-        self.blocks = Blocks(shots.grid, side)
-        self.grid, self.channels = self.blocks.grid, shots.channels
+    def __init__(self, calibration: Calibration, side: int = 1) -> None:
+        self.calibration, self.channels = calibration, len(calibration.offset)
+        self.blocks = Blocks(calibration.resampling.grid, side)
+        self.grid = self.blocks.grid
         self._scale = calibration.light.astype(np.float32)[:, None]
         self.seen = self.blocks.sum(calibration.resampling.seen.astype(np.float32)).ravel() > 0
         self._dark = self._on_grid(calibration.ambient)
         self.ambient = np.where(self._dark.variance < UNKNOWN, self._dark.variance, 0.0) / self._scale**2
         white = self._on_grid(calibration.white)
         self.white = Picture(white.value / self._scale, white.variance / self._scale**2)
+
+    @classmethod
+    def of(cls, store: BlockStore) -> Self:
+        """Of a store that `ltcl.acquire` made."""
+        told = store.attributes
+        return cls(Calibration.of(store), told["settings"]["block"] if told["strategy"] == "block" else 1)
+
+    def _on_grid(self, light: Radiance) -> Picture:
+        """Means over the blocks of the scan, as far as they are seen and valid."""
+        R, n = self.calibration.resampling, self.channels
+        known = light.valid.astype(np.float32)
+        value = R.apply(np.where(light.valid, light.value, 0.0))
+        variance = R.variance(np.where(light.valid, light.variance, 0.0))
+        if light.valid.all():
+            weight = R.seen.astype(np.float32)[..., None]
+        else:
+            weight = R.apply(known).reshape(*R.grid, n)
+        good = weight >= _SEEN
+        part = np.where(good, 1.0 / np.maximum(weight, _SEEN), 0.0)
+        value = self.blocks.sum(value.reshape(*R.grid, n) * part)
+        variance = self.blocks.sum(variance.reshape(*R.grid, n) * part**2)
+        count = self.blocks.sum(np.broadcast_to(good, (*R.grid, n)).astype(np.float32))
+        told = np.moveaxis(count, -1, 0).reshape(n, -1)
+        value, variance = (np.moveaxis(part, -1, 0).reshape(n, -1) for part in (value, variance))
+        pixels = np.maximum(told, 1.0)
+        variance = np.where(told > 0, variance / pixels**2, UNKNOWN)
+        return Picture((value / pixels).astype(np.float32), variance.astype(np.float32))
+
+
+class Pictures(Seen):
+    """A rig that was calibrated, as a camera on the pixels of the scan."""
+
+    def __init__(self, shots: Shots, calibration: Calibration, side: int = 1) -> None:
+        super().__init__(calibration, side)
+        self.shots = shots
 
     def announce(self, patterns: Iterable[np.ndarray]) -> None:
         """Tell the rig of patterns that will be asked for, so that a person can photograph all in one go."""
@@ -84,24 +122,3 @@ class Pictures:
         known = (variance < UNKNOWN) & (self._dark.variance < UNKNOWN)
         value = np.where(known, lit.value - self._dark.value, np.float32(0.0)) / self._scale
         return Picture(value, np.where(known, variance, UNKNOWN).astype(np.float32))
-
-    def _on_grid(self, light: Radiance) -> Picture:
-        """Means over the blocks of the scan, as far as they are seen and valid."""
-        R, n = self.calibration.resampling, self.channels
-        known = light.valid.astype(np.float32)
-        value = R.apply(np.where(light.valid, light.value, 0.0))
-        variance = R.variance(np.where(light.valid, light.variance, 0.0))
-        if light.valid.all():
-            weight = R.seen.astype(np.float32)[..., None]
-        else:
-            weight = R.apply(known).reshape(*R.grid, n)
-        good = weight >= _SEEN
-        part = np.where(good, 1.0 / np.maximum(weight, _SEEN), 0.0)
-        value = self.blocks.sum(value.reshape(*R.grid, n) * part)
-        variance = self.blocks.sum(variance.reshape(*R.grid, n) * part**2)
-        count = self.blocks.sum(np.broadcast_to(good, (*R.grid, n)).astype(np.float32))
-        told = np.moveaxis(count, -1, 0).reshape(n, -1)
-        value, variance = (np.moveaxis(part, -1, 0).reshape(n, -1) for part in (value, variance))
-        pixels = np.maximum(told, 1.0)
-        variance = np.where(told > 0, variance / pixels**2, UNKNOWN)
-        return Picture((value / pixels).astype(np.float32), variance.astype(np.float32))

@@ -12,8 +12,9 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import reciprocity
-from ltcl.acquisition.scanning import core
+from ltcl.acquisition.scanning import balance, core
 from ltcl.acquisition.scanning.cells import Cells
+from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Seen
 from ltcl.errors import FileError
 from ltcl.store import BlockStore, StoredRows
 
@@ -46,6 +47,9 @@ class Report:
         Part of them that no photograph tells, such as pixels that all exposures saturate; they are 0.
     noise_direct, noise_sum : float
         Median relative standard deviation of the first bounce, and of what white shows.
+    beside_white : float
+        Root mean square of what a scan by columns had added up to beside white, relative to white: noise,
+        thresholds, and all that is wrong with the response. NaN of an adaptive scan, which begins with white.
     defect : float
         How far T is from reciprocal, of the worst channel (`ltcl.reciprocity`); NaN where it is not told.
     levels : list of dict
@@ -77,6 +81,7 @@ class Report:
     unknown: float
     noise_direct: float
     noise_sum: float
+    beside_white: float
     defect: float
     levels: list[dict[str, int]]
 
@@ -125,7 +130,8 @@ class Report:
             + ", ".join(f"{t:.3g} s" for t in self.exposures),
             f"seen {self.coverage:.1%}, masked {self.masked:.2%}, saturated {self.saturated:.2%}",
             f"{self.entries} entries kept, {self.unknown:.2%} of them not told by any photograph",
-            f"noise of the first bounce {self.noise_direct:.2%}, of what white shows {self.noise_sum:.2%}",
+            f"noise of the first bounce {self.noise_direct:.2%}, of what white shows {self.noise_sum:.2%}"
+            + ("" if np.isnan(self.beside_white) else f"; columns were {self.beside_white:.2%} beside it"),
             "reciprocity not told" if np.isnan(self.defect) else f"reciprocity defect {self.defect:.2g}",
         ]
         lines += [
@@ -137,8 +143,8 @@ class Report:
 
 
 def _of_blocks(store: BlockStore) -> dict[str, Any]:
-    """By rows: every entry has its own variance."""
-    F = np.asarray(store.extra("first_bounce"))
+    """By rows: every entry has its own variance, and the sum that of white as well."""
+    F, white = np.asarray(store.extra("first_bounce")), Seen.of(store).white
     direct, sums, entries, unknown, defects = [], [], 0, 0, []
     for c in range(store.layout.channels):
         for b in range(store.layout.blocks()):
@@ -148,9 +154,17 @@ def _of_blocks(store: BlockStore) -> dict[str, Any]:
             entries, unknown = entries + T.nnz, unknown + int(np.isnan(variance).sum())
             V = scipy.sparse.csr_array((np.nan_to_num(variance), T.indices, T.indptr), shape=T.shape)
             direct.append(_relative(V.diagonal(start), F[c, start:stop]))
-            sums.append(_relative(V.sum(axis=1), T.sum(axis=1)))
+            own, u = V.sum(axis=1), white.variance[c, start:stop]
+            sums.append(_relative(own * u / np.maximum(own + u, 1e-300), T.sum(axis=1)))
         defects.append(_defect(StoredRows(store, c), F[c]))
-    return _noise(direct, sums, entries, unknown, F, max(defects))
+    beside = _beside(np.asarray(store.extra(balance.SUMS)), white)
+    return _noise(direct, sums, entries, unknown, F, max(defects)) | {"beside_white": beside}
+
+
+def _beside(sums: np.ndarray, white: Picture) -> float:
+    known = white.variance < 1e-3 * UNKNOWN
+    light = np.sum(white.value[known] ** 2, dtype=np.float64)
+    return float(np.sqrt(np.sum((sums - white.value)[known] ** 2) / light)) if light > 0 else float("nan")
 
 
 def _of_cells(store: BlockStore) -> dict[str, Any]:
@@ -159,12 +173,8 @@ def _of_cells(store: BlockStore) -> dict[str, Any]:
     areas = np.concatenate([cells.areas(level) for level in range(cells.top + 1)])
     pixels = np.sort(np.random.default_rng(0).permutation(len(F[0]))[:_SAMPLE])
     direct, sums, entries, defects = [], [], 0, []
-    for c in range(store.layout.channels):
-        names = [f"system_{c}.R.core.{name}" for name in ("data", "indices", "indptr")]
-        data, indices, indptr = (np.array(store.extra(name)) for name in names)
-        data[indices == np.repeat(np.arange(len(F[c])), np.diff(indptr))] += 1.0  # R = C W - I
-        shape, variance = (len(F[c]), cells.offsets[-1]), np.array(store.extra(f"core_variance_{c}"))
-        C, V = (scipy.sparse.csr_array((part, indices, indptr), shape=shape) for part in (data, variance))
+    stored = core.Stored.of(store)
+    for c, (C, V) in enumerate(zip(stored.matrices, stored.variances, strict=True)):
         entries += C.nnz
         direct.append(_relative(core.diagonal(cells, V), F[c]))
         sums.append(_relative(V @ areas**2, C @ areas))
@@ -181,6 +191,7 @@ def _noise(
         "unknown": unknown / max(entries, 1),
         "noise_direct": _median(direct),
         "noise_sum": _median(sums),
+        "beside_white": float("nan"),
         "defect": defect,
     }
 

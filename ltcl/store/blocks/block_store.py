@@ -23,6 +23,7 @@ from ltcl.files import as_path
 from ltcl.store.blocks import aside, creating, entries, extras, finishing, layout, nodes, sealed, verifying
 from ltcl.store.blocks.entries import Block
 from ltcl.store.blocks.layout import Layout
+from ltcl.store.blocks.turning import Change
 from ltcl.store.refusals import about
 
 _GROUPS = {"rows": "channel", "columns": "columns"}
@@ -265,7 +266,9 @@ class BlockStore:
         self._final = (attributes | parts).get("final")
         self.layout = Layout.from_json((attributes | parts).get("ltcl"))
 
-    def finalize(self, *, memory: int | None = None, layout: Layout | None = None) -> None:
+    def finalize(
+        self, *, memory: int | None = None, layout: Layout | None = None, change: Change | None = None
+    ) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
         Ended at any moment, it goes on from there when called again. Must not run beside writers.
@@ -276,6 +279,9 @@ class BlockStore:
             Bytes for the entries that are turned at once; 256 MiB when not given.
         layout : Layout, optional
             Of the store from then on, whose extra arrays take the place of all blocks ("compressed").
+        change : function, optional
+            Of channel, first row, rows (rows, N) and the variance of their entries: what is committed of the
+            two, wherever columns are turned. The same in every call.
 
         Raises
         ------
@@ -285,7 +291,7 @@ class BlockStore:
         if self.mode != "a":
             self._writable()
         with about(self.path):
-            finishing.finish(self, memory, layout or self.layout)
+            finishing.finish(self, memory, layout or self.layout, change)
 
     def verify(self) -> None:
         """Read everything and compare all checksums; the first thing that is wrong is raised as FileError."""

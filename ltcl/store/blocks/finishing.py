@@ -22,21 +22,23 @@ if TYPE_CHECKING:
 _MEMORY = 1 << 28
 
 
-def finish(store: BlockStore, memory: int | None, layout: Layout) -> None:
+def finish(
+    store: BlockStore, memory: int | None, layout: Layout, change: turning.Change | None = None
+) -> None:
     """See `BlockStore.finalize`."""
     if not store.final:
         if layout.kind == "blocks":
-            _finish_blocks(store, memory)
+            _finish_blocks(store, memory, change)
         with aside.locked(store.path):
             store.rewrite(ltcl=layout.to_json(), final=_sums(store))
     _clear(store)
 
 
-def _finish_blocks(store: BlockStore, memory: int | None) -> None:
+def _finish_blocks(store: BlockStore, memory: int | None, change: turning.Change | None) -> None:
     if store.layout.orientation == "columns":
         if store.missing("rows"):
             refuse_missing(store, "columns")
-        turning.turn(store, _MEMORY if memory is None else memory)
+        turning.turn(store, _MEMORY if memory is None else memory, change)
     refuse_missing(store, "rows")
     if store.layout.is_square and "first_bounce" not in store.extras:
         _find_first_bounce(store)
@@ -56,14 +58,15 @@ def _listed(missing: Sequence[tuple[int, int]]) -> str:
 
 
 def _find_first_bounce(store: BlockStore) -> None:
-    """The diagonal of T, and which projector pixels have none."""
+    """The diagonal of T, and which projector pixels have none, unless the store says so already."""
     F = np.zeros((store.layout.channels, store.layout.shape[1]))
     for channel in range(store.layout.channels):
         for block in range(store.layout.blocks()):
             start, stop = store.layout.span(block)
             F[channel, start:stop] = store.block(channel, block, "rows").matrix.diagonal(start)
-    if "masked" not in store.extras:  # of a run that was killed between the two
+    if "masked" not in store.extras:
         store.extra("masked", np.asarray((F <= 0).any(axis=0)))
+    F[:, np.asarray(store.extra("masked"))] = 0.0
     store.extra("first_bounce", F)
 
 

@@ -7,8 +7,8 @@ columns, in one pass each: columns ascend, so a stable sort by row leaves every 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -18,6 +18,8 @@ from ltcl import checks
 if TYPE_CHECKING:
     from ltcl.store.blocks.block_store import BlockStore
 
+Change = Callable[[int, int, Any, Any], tuple[Any, Any]]
+"""Of channel, first row, rows and the variance of their entries: what is committed of these."""
 _PER_ENTRY = 64  # bytes: places, values and variance, as gathered, joined and sorted
 
 
@@ -28,15 +30,15 @@ class _Entries(NamedTuple):
     variance: np.ndarray | None
 
 
-def turn(store: BlockStore, memory: int) -> None:
-    """Commit every block of rows that is not there yet."""
+def turn(store: BlockStore, memory: int, change: Change | None = None) -> None:
+    """Commit every block of rows that is not there yet, changed where that is asked for."""
     checks.count("memory", memory, least=_PER_ENTRY)
     for channel in range(store.layout.channels):
         missing = [block for c, block in store.missing("rows") if c == channel]
         if missing:
             counts = _entries_of_rows(store, channel)
             for first, last in _batches(store, missing, counts, memory // _PER_ENTRY):
-                _turn(store, channel, first, last)
+                _turn(store, channel, first, last, change)
 
 
 def _entries_of_rows(store: BlockStore, channel: int) -> np.ndarray:
@@ -62,7 +64,7 @@ def _batches(
     yield missing[first], missing[-1]
 
 
-def _turn(store: BlockStore, channel: int, first: int, last: int) -> None:
+def _turn(store: BlockStore, channel: int, first: int, last: int, change: Change | None) -> None:
     start, stop = store.layout.span(first)[0], store.layout.span(last)[1]
     parts = [_between(store, channel, block, start, stop) for block in range(store.layout.blocks("columns"))]
     row = np.concatenate([part.row for part in parts])
@@ -75,8 +77,11 @@ def _turn(store: BlockStore, channel: int, first: int, last: int) -> None:
         top, bottom = (place - start for place in store.layout.span(block))
         here = order[ends[top] : ends[bottom]]
         parts_of = (value[here], column[here], ends[top : bottom + 1] - ends[top])
-        matrix = scipy.sparse.csr_array(parts_of, shape=store.layout.block_shape(block))
-        store.put(channel, block, matrix, None if variance is None else variance[here], "rows")
+        matrix: Any = scipy.sparse.csr_array(parts_of, shape=store.layout.block_shape(block))
+        some = None if variance is None else variance[here]
+        if change is not None:
+            matrix, some = change(channel, start + top, matrix, some)
+        store.put(channel, block, matrix, some, "rows")
 
 
 def _between(store: BlockStore, channel: int, block: int, start: int, stop: int) -> _Entries:

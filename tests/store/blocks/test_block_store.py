@@ -49,6 +49,34 @@ def test_columns_turn_the_same_with_any_memory(tmp_path: Path, memory: int) -> N
     assert not list((tmp_path / "T.zarr" / "columns_0").glob("block*"))
 
 
+@pytest.mark.parametrize("memory", [64, 1 << 20])
+def test_rows_are_changed_once_before_they_are_committed(tmp_path: Path, memory: int) -> None:
+    """Even where the change failed half way, and all is asked for again."""
+    store = fill(
+        make(tmp_path / "T.zarr", orientation="columns", channels=3), with_variance=True, final=False
+    )
+    left = [7]
+
+    def change(channel: int, first: int, matrix: Any, spread: Any) -> tuple[Any, Any]:
+        left[0] -= 1
+        if left[0] == 0:
+            raise OSError("no more")
+        more = 1.0 + channel + np.arange(first, first + matrix.shape[0])
+        return scipy.sparse.diags_array(more) @ matrix, 2.0 * spread
+
+    with pytest.raises(OSError, match="no more"):
+        store.finalize(memory=memory, change=change)
+    assert not store.final
+    store.finalize(memory=memory, change=change)
+    for c in range(3):
+        T = transport(channel=c)
+        np.testing.assert_allclose(whole(store, c), (1.0 + c + np.arange(10))[:, None] * T.toarray())
+        for block in range(4):
+            start, stop = store.layout.span(block)
+            np.testing.assert_array_equal(store.variance(c, block), 2.0 * variance(T)[start:stop].data)
+    store.verify()
+
+
 def test_variance_of_some_columns_only_is_unknown_elsewhere(tmp_path: Path) -> None:
     store = make(tmp_path / "T.zarr", orientation="columns")
     T = transport()
