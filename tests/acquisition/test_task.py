@@ -230,12 +230,15 @@ def askance(u: Any, v: Any) -> tuple[Any, Any]:
     return (a + 0.1 * b) / d - 0.4, (b - 0.05 * a) / d + 0.3
 
 
-@pytest.mark.parametrize(("response", "bits"), [("srgb", 8), ("film", 12)])
-def test_a_camera_of_its_own_pixels(tmp_path: Path, response: str, bits: int) -> None:
+@pytest.mark.parametrize(
+    ("response", "bits", "strategy"),
+    [("srgb", 8, "pixel"), ("film", 12, "hadamard"), ("srgb", 8, "adaptive")],
+)
+def test_a_camera_of_its_own_pixels(tmp_path: Path, response: str, bits: int, strategy: str) -> None:
     """Found by Gray code. It does not see all pixels: these are masked, and the others are right."""
     C, path = camera_map(askance, (27, 50), GRID), tmp_path / "T.zarr"
     made = rig(camera_grid=(27, 50), camera_map=C, response=response, bits=bits)
-    T = acquire(made, strategy="pixel", store=path)
+    T = acquire(made, strategy=strategy, store=path)
     area = np.asarray(C.sum(axis=0))
     seen = ~T.masked
     assert seen[area > 3].all()
