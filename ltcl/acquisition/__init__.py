@@ -9,6 +9,10 @@
     calibration, measuring, exposing    all that is measured once of a set-up, and for how many seconds
     scanning/   which pixels are lit when, and T from the pictures; plan before, report after
     task, run   acquire: all of it, into a store, stopped and resumed
+    finishing   finalize: the transport of a store whose photographs are all there
+    setup       Setup: codes for a pattern, and the ambient light, on the pixels of a transport
+    held        how far a transport is from a scene that is known
+    project     Project: an acquisition as a folder with an acquisition.toml; project_rigs makes its rig
 
 Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
 """
@@ -16,7 +20,9 @@ Codes in [0, 1] are what a projector is fed and what a camera gives; they are no
 from __future__ import annotations
 
 from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.finishing import finalize
 from ltcl.acquisition.geometry import Correspondence
+from ltcl.acquisition.project import Project
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.rigs import (
     Display,
@@ -29,6 +35,7 @@ from ltcl.acquisition.rigs import (
     mitsuba_scene,
 )
 from ltcl.acquisition.scanning.report import Report
+from ltcl.acquisition.setup import Setup
 from ltcl.acquisition.task import acquire
 
 __all__ = [
@@ -40,10 +47,13 @@ __all__ = [
     "LiveRig",
     "MitsubaRig",
     "OpenCVCamera",
+    "Project",
     "Report",
     "Rig",
+    "Setup",
     "Shots",
     "VirtualRig",
     "acquire",
+    "finalize",
     "mitsuba_scene",
 ]
