@@ -9,8 +9,8 @@
     strategy = "auto"
 
 Keys are the arguments of `VirtualRig` and the other rigs (`project_rigs` makes them), and of `ltcl.acquire`;
-"none" stands for None. The transport comes to transport.zarr beside it, and a folder rig keeps its patterns and
-photographs there, too. Nothing is opened before it is asked for, least of all a camera.
+"none" stands for None. The transport comes to transport.zarr beside it, and a folder rig keeps its patterns
+and photographs there, too. Nothing is opened before it is asked for, least of all a camera.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from ltcl.acquisition.scanning.plan import Light
 from ltcl.acquisition.task import acquire
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
+from ltcl.store import BlockStore
 
 FILE, STORE = "acquisition.toml", "transport.zarr"
 _LARGEST = 1 << 20  # bytes of a file that somebody wrote by hand
@@ -106,6 +108,8 @@ class Project:
         project_rigs.check_keys(path, "acquire", given, acquire, _OURS)
         if "response" in given:
             given["response"] = _response(path, given["response"])
+        if not isinstance(given.get("exposures", []), (list, NoneType)):
+            raise InputTypeError(f"{path}: [acquire] exposures is {given['exposures']!r}; it must be a list")
         return cls(folder, tables, given)
 
     @property
@@ -123,6 +127,14 @@ class Project:
         """Of the rig."""
         return self.tables.kind
 
+    @property
+    def state(self) -> str:
+        """Of the store: "new" until a whole calibration is in it, then "begun", at last "final"."""
+        if not self.store.exists():
+            return "new"
+        found = BlockStore.open(self.store)
+        return "final" if found.final else "begun" if "strategy" in found.attributes else "new"
+
     @contextlib.contextmanager
     def rig(self) -> Iterator[Any]:
         """The rig, which is closed at the end.
@@ -135,7 +147,12 @@ class Project:
             A file that the rig needs; a camera, a display or a package that is not there.
         """
         with self.naming("rig"):
-            made = project_rigs.make(self.folder, self.tables)
+            try:
+                made = project_rigs.make(self.folder, self.tables)
+            except LtclError:
+                raise
+            except (TypeError, ValueError) as error:  # where a class takes what it is given for a list
+                raise InputTypeError(f"holds a value of an unusable type: {error}") from error
         with Shots(made):
             yield made
 
@@ -144,16 +161,10 @@ class Project:
         """Refusals of values begin with the file and the table that they stand in."""
         try:
             yield
-        except (FileError, AcquisitionError):
+        except FileError:  # begins with a file
             raise
         except (InputError, InputTypeError) as error:
             raise type(error)(f"{self.path}: [{table}] {error}") from None
-        except LtclError:
-            raise
-        except (TypeError, ValueError) as error:  # a rig that is given what is no number, no list
-            raise InputTypeError(
-                f"{self.path}: [{table}] holds a value of an unusable type: {error}"
-            ) from error
 
     def outlook(self) -> Outlook:
         """Pixels, channels and guesses of the rest, for a plan before the first photograph.
@@ -167,7 +178,7 @@ class Project:
         """
         with self.naming("rig"):
             grid, channels = project_rigs.pixels(self.folder, self.tables)
-            checks.grid("projector_grid", grid)
+            grid = checks.grid("projector_grid", grid)
             noise, ambient = project_rigs.guessed(self.tables)
         light = Light() if ambient is None else Light(ambient=ambient)
         with self.naming("acquire"):

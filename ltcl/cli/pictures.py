@@ -86,6 +86,17 @@ def write(
     return {"exr": f"{name}.exr", "png": f"{name}.png", "png_scale": scale}
 
 
+def write_pattern(folder: Path, name: str, light: np.ndarray, white: float, setup: Any) -> dict[str, Any]:
+    """As `write`; but where the projector was measured, by `setup`, ``name.png`` has the codes to feed it."""
+    from ltcl import images
+
+    if setup is None:
+        return write(folder, name, light, white)
+    images.write(folder / f"{name}.exr", light)
+    images.write(folder / f"{name}.png", setup.codes(light), encoding="linear")
+    return {"exr": f"{name}.exr", "png": f"{name}.png", "png_scale": 1.0}
+
+
 def brightness(picture: np.ndarray) -> float:
     """The value to be shown as white: all but the brightest thousandth stay below; 1 for black pictures."""
     value = float(np.quantile(picture, 0.999, method="higher"))

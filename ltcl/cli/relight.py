@@ -17,7 +17,7 @@ def run(
     out: options.Out,
     grid: options.Grid = None,
     camera_grid: options.CameraGrid = None,
-    on_dark: options.OnDark = "raise",
+    on_dark: options.OnDark = "auto",
     resize: options.Resize = False,
     encoding: options.Encoding = "auto",
     device: options.Device = None,

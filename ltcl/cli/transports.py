@@ -37,6 +37,7 @@ def load(
         As `store.load`; or S is needed, and T maps to another number of pixels.
     """
     opened = open_device(device)
+    options["on_dark"] = _on_dark(path, options.get("on_dark", "raise"))
     try:
         T = store.load(path, device=opened, **options)
     except FileError as error:
@@ -47,6 +48,21 @@ def load(
     if dark and needs != "T":  # relighting needs no first bounce
         console.note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
     return T
+
+
+def _on_dark(path: Path, asked: str) -> str:
+    if asked != "auto":
+        return asked
+    return "raise" if setup_of(path) is None else "mask"
+
+
+def setup_of(path: Path) -> Any:
+    """The `ltcl.acquisition.Setup` in a store that `ltcl.acquire` made; None of any other file."""
+    if not path.is_dir():
+        return None
+    from ltcl.acquisition import setup
+
+    return setup.Setup.of(path) if setup.has_calibration(path) else None
 
 
 def load_inverse(path: Path | None, T: Transport) -> Inverse | None:
@@ -66,6 +82,7 @@ def load_exact(path: Path | None, T: Transport, **options: Any) -> Transport | N
     """
     if path is None:
         return None
+    options["on_dark"] = _on_dark(path, options.get("on_dark", "raise"))
     exact = store.load(path, device=T.device, **options)
     if exact.is_square and (exact.grid, exact.channels) == (T.grid, T.channels):
         exact = _with_first_bounce(exact, T)
