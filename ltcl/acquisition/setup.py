@@ -105,10 +105,25 @@ class Setup:
         """
         light = checks.finite("pattern", checks.real("pattern", pattern)).astype(np.float32)
         checks.shape("pattern", light, self.grid, (*self.grid, 3))
-        response = self.calibration.projector
-        if light.ndim == 2 and response.channels == 3:
-            light = np.repeat(light[..., None], 3, axis=-1)
-        return self.blocks.enlarged(response.codes(np.clip(light, 0.0, 1.0)))
+        fed = self.calibration.projector.codes(np.clip(self._of_each_channel(light), 0.0, 1.0))
+        return self.blocks.enlarged(fed)
+
+    def light(self, codes: Any) -> np.ndarray:
+        """The light of codes (h, w) or (h, w, 3) in [0, 1] that the projector is fed, relative to its white.
+
+        Raises
+        ------
+        InputError
+            Another shape.
+        """
+        fed = checks.finite("codes", checks.real("codes", codes)).astype(np.float32)
+        checks.shape("codes", fed, self.grid, (*self.grid, 3))
+        return self.calibration.projector.linear(self._of_each_channel(fed))
+
+    def _of_each_channel(self, picture: np.ndarray) -> np.ndarray:
+        if picture.ndim == 2 and self.calibration.projector.channels == 3:
+            return np.repeat(picture[..., None], 3, axis=-1)
+        return picture
 
     def resampled(self, picture: Any) -> np.ndarray:
         """A picture on the camera's pixels, (H, W[, 3]), as it is on those of the transport, (h, w[, 3])."""

@@ -38,6 +38,15 @@ _LOSS = Annotated[
         show_default=False,
     ),
 ]
+_CALIBRATION = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="STORE",
+        help="Of 'ltcl acquire': the transport.zarr that TRANSPORT was made of, where that does not keep how "
+        "projector and ambient light were measured.",
+        show_default=False,
+    ),
+]
 _WEIGHTS = Annotated[
     Path | None,
     typer.Option(
@@ -136,6 +145,7 @@ def run(
     high: _HIGH = 1.0,
     clamp: _CLAMP = False,
     background: _BACKGROUND = None,
+    calibration: _CALIBRATION = None,
     weights: _WEIGHTS = None,
     resize: options.Resize = False,
     encoding: options.Encoding = "auto",
@@ -161,7 +171,7 @@ def run(
     Of a folder or a video of frames, writes the numbered patterns and frames.json batch by batch, with one
     gain for all; Ctrl-C keeps what is done, for --resume.
     """
-    setup = transports.setup_of(transport)
+    setup = transports.setup_of(transport, calibration)
     sought: Any = ("auto" if setup else 1.0) if gain is None else gain
     _check(sought, loss)
     _check_measured(setup, low, high)
@@ -178,6 +188,7 @@ def run(
         first_bounce=first_bounce,
         on_dark=on_dark,
     )
+    transports.refuse_other(setup, calibration, T)
     known = transports.load_inverse(inverse, T)
     judge = transports.load_exact(exact, T, grid=grid, on_dark=on_dark)
     reader = pictures.Reader(T.camera_grid, "the camera", encoding, resize)
@@ -204,6 +215,7 @@ def run(
         high=high,
         clamp=clamp,
         background="measured" if background is None and setup is not None else background,
+        calibration=calibration,
         weights=weights,
         resize=resize,
         encoding=encoding,

@@ -80,6 +80,7 @@ def run(
         "solution_error": C.error,
         "compression": C.compression,
     }
+    transports.note_lost(file, out)
     if json:
         console.answer(text)
     else:

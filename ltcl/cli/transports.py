@@ -56,13 +56,38 @@ def _on_dark(path: Path, asked: str) -> str:
     return "raise" if setup_of(path) is None else "mask"
 
 
-def setup_of(path: Path) -> Any:
-    """The `ltcl.acquisition.Setup` in a store that `ltcl.acquire` made; None of any other file."""
-    if not path.is_dir():
+def setup_of(path: Path, calibration: Path | None = None) -> Any:
+    """The `ltcl.acquisition.Setup` in a store that `ltcl.acquire` made; None of any other file.
+
+    Raises
+    ------
+    FileError
+        `calibration`, which is preferred, is no such store.
+    """
+    if calibration is None and not path.is_dir():
         return None
     from ltcl.acquisition import setup
 
+    if calibration is not None:
+        return setup.Setup.of(calibration)
     return setup.Setup.of(path) if setup.has_calibration(path) else None
+
+
+def refuse_other(setup: Any, calibration: Path | None, T: Transport) -> None:
+    """Refuse the calibration of other pixels than those of T."""
+    if setup is not None and (setup.grid, setup.channels) != (T.grid, T.channels):
+        raise InputError(
+            f"{calibration}: is of {setup.grid} pixels and {setup.channels} channel(s); TRANSPORT has "
+            f"{T.grid} and {T.channels}"
+        )
+
+
+def note_lost(source: Path, target: Path) -> None:
+    """Say what a copy of a measured transport does not keep."""
+    if setup_of(source) is not None:
+        console.note(
+            f"{target}: does not keep how the projector was measured; give compensate --calibration {source}"
+        )
 
 
 def load_inverse(path: Path | None, T: Transport) -> Inverse | None:

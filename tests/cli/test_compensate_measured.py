@@ -173,6 +173,44 @@ def test_what_the_camera_does_not_see_stays_dark(program: Program, tmp_path: Pat
     program("compensate", tmp_path / "T.zarr", tmp_path / "grey.exr", *arguments).refused("--on-dark mask")
 
 
+def test_a_copy_is_told_where_its_calibration_is(
+    program: Program, store: Path, picture: Path, tmp_path: Path
+) -> None:
+    small = tmp_path / "small.npz"
+    outcome = program("compress", store, "--out", small)
+    assert f"give compensate --calibration {store}" in outcome.err
+    assert f"give compensate --calibration {store}" in program("convert", store, tmp_path / "T.npz").err
+    for source in (small, tmp_path / "T.npz"):
+        arguments = ["--calibration", store, "--rtol", "0.02", "--out", tmp_path / "out"]
+        outcome = program("compensate", source, picture, *arguments)
+        assert outcome.code == 0, outcome.err
+        assert off(fed(tmp_path / "out" / "waves_pattern.png"), linear(), rig_of()) < 0.03
+    other = _saved(tmp_path)
+    arguments = ["--calibration", store, "--out", tmp_path / "no"]
+    program("compensate", other, picture, *arguments).refused(
+        "is of (6, 12) pixels and 1", "TRANSPORT has (4, 8)"
+    )
+    arguments = ["--calibration", tmp_path / "none.zarr", "--out", tmp_path / "no"]
+    program("compensate", small, picture, *arguments).refused("none.zarr: no such folder")
+
+
+def test_codes_of_a_pattern_are_relit_as_its_light(
+    program: Program, store: Path, picture: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    assert program("compensate", store, picture, "--out", out).code == 0
+    shown = []
+    for extension in ("exr", "png"):
+        assert (
+            program("relight", store, out / f"waves_pattern.{extension}", "--out", tmp_path / extension).code
+            == 0
+        )
+        shown.append(images.read(tmp_path / extension / "waves_pattern_relit.exr"))
+    np.testing.assert_allclose(shown[1], shown[0], rtol=0.02)
+    ambient = Setup.of(store).ambient
+    np.testing.assert_allclose(shown[0] + ambient, images.read(out / "waves_appearance.exr"), rtol=1e-4)
+
+
 def test_other_transports_are_as_before(program: Program, tmp_path: Path) -> None:
     assert main(["convert", str(_saved(tmp_path)), str(tmp_path / "T.zarr")]) == 0
     images.write(tmp_path / "grey.exr", np.full((4, 8), 0.3))
