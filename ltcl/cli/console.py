@@ -185,7 +185,7 @@ class Frames:
         self._what, self._settling = what, settling
         self._is_terminal = console.is_terminal
         self._before, self._begun, self._first, self._said = 0, 0.0, 0.0, 0.0
-        self._made = time.monotonic()
+        self._heard: float | None = None
         columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"))
         self._bar = Progress(*columns, console=console, transient=True, disable=not self._is_terminal)
         self._task = self._bar.add_task("", total=None, text="")
@@ -202,7 +202,9 @@ class Frames:
     def at(self, text: str) -> None:
         """Say what is being done before there is anything to count."""
         self._bar.update(self._task, text=text)
-        if not self._is_terminal and time.monotonic() >= self._made + _PATIENCE:
+        now = time.monotonic()
+        self._heard = now if self._heard is None else self._heard
+        if not self._is_terminal and now >= self._heard + _PATIENCE:
             note(text)
 
     def __call__(self, done: int, total: int | None) -> None:
