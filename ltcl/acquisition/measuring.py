@@ -201,7 +201,8 @@ def _bright(run: _Run, response: Response, seconds: float) -> float:
 def _noise(run: _Run, response: Response, seconds: float, deep: float) -> NoiseModel:
     ramp = _ramp(run.shots.grid)
     scenes = ((ramp, seconds), (run.black, seconds), (run.black, deep))
-    bursts = [run.take([(codes, t)] * _BURST) for codes, t in scenes]
+    run.shots.prepare([shot for shot in scenes for _ in range(_BURST)])
+    bursts = [run.take([shot] * _BURST) for shot in scenes]
     with exposing.telling("the noise of the camera"):
         found = estimate(bursts, response=response, levels=run.levels)
     return replace(found, read=max(found.read, _QUIETEST))

@@ -50,8 +50,11 @@ def tell(project: Project, device: Any, json: bool, out: Path | None = None) -> 
     """Print the report of what is finished, with pictures into `out` where that is given."""
     from ltcl.acquisition import Report
 
-    found = Report.of(project.store)
-    off = _off(project, device) if project.kind == "virtual" else None
+    with console.Steps(2) as steps:
+        steps.item("entries and noise")
+        found = Report.of(project.store)
+        steps.item("how far it is from the truth")
+        off = _off(project, device) if project.kind == "virtual" else None
     told = {"folder": project.folder, "store": project.store, **jsonlib.loads(found.to_json())}
     if off is not None:
         told["off"] = off

@@ -53,7 +53,15 @@ def load(
 def _on_dark(path: Path, asked: str) -> str:
     if asked != "auto":
         return asked
-    return "raise" if setup_of(path) is None else "mask"
+    return "mask" if _is_measured(path) else "raise"
+
+
+def _is_measured(path: Path) -> bool:
+    if not path.is_dir():
+        return False
+    from ltcl.acquisition.setup import has_calibration
+
+    return has_calibration(path)
 
 
 def setup_of(path: Path, calibration: Path | None = None) -> Any:
@@ -64,13 +72,11 @@ def setup_of(path: Path, calibration: Path | None = None) -> Any:
     FileError
         `calibration`, which is preferred, is no such store.
     """
-    if calibration is None and not path.is_dir():
+    if calibration is None and not _is_measured(path):
         return None
-    from ltcl.acquisition import setup
+    from ltcl.acquisition import Setup
 
-    if calibration is not None:
-        return setup.Setup.of(calibration)
-    return setup.Setup.of(path) if setup.has_calibration(path) else None
+    return Setup.of(path if calibration is None else calibration)
 
 
 def refuse_other(setup: Any, calibration: Path | None, T: Transport) -> None:
@@ -84,7 +90,7 @@ def refuse_other(setup: Any, calibration: Path | None, T: Transport) -> None:
 
 def note_lost(source: Path, target: Path) -> None:
     """Say what a copy of a measured transport does not keep."""
-    if setup_of(source) is not None:
+    if _is_measured(source):
         console.note(
             f"{target}: does not keep how the projector was measured; give compensate --calibration {source}"
         )
