@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How far T p is from what a known scene shows, for patterns p that no scan has lit.
 
-Patterns of 0 and 1 are the same in codes and in light, whatever the projector's response. With c the
-noiseless pictures of the scene less that under black, on the pixels of T,
+Patterns of 0 and 1 are the same in codes and in light, whatever the projector's response. With c the scene
+under p less that under black, on the pixels of T, without noise,
 
     off = ||s T p - c|| / ||c||,    s = <T p, c> / ||T p||^2
 
@@ -24,8 +24,9 @@ def off(rig: Any, T: Transport, setup: Setup, count: int = 4) -> tuple[float, ..
 
     Parameters
     ----------
-    rig : VirtualRig or MitsubaRig
-        What was photographed: a rig with `radiance(codes)`.
+    rig : VirtualRig
+        What was photographed, best without its camera_map: on the projector's pixels. Else pictures of its
+        camera are resampled, and what these cannot tell apart is not told.
     T : Transport
         As it was found.
     setup : Setup
@@ -46,13 +47,14 @@ def off(rig: Any, T: Transport, setup: Setup, count: int = 4) -> tuple[float, ..
     rng = np.random.default_rng(0)
     dark = rig.radiance(np.zeros(setup.blocks.pixels))
     seen = ~T.masked
+    on_grid = setup.mean if rig.camera_grid == rig.projector_grid else setup.resampled
     found, wanted = [], []
     for _ in range(count):
         p = (rng.random(T.grid) < 0.5).astype(np.float32)
         picture = rig.radiance(setup.blocks.enlarged(p)) - dark
         light = p if T.channels == 1 else np.repeat(p[..., None], 3, axis=-1)
         found.append(np.asarray(T @ light, np.float64).reshape(-1, T.channels)[seen])
-        wanted.append(setup.resampled(picture).astype(np.float64).reshape(-1, T.channels)[seen])
+        wanted.append(on_grid(picture).astype(np.float64).reshape(-1, T.channels)[seen])
     ours, theirs = np.concatenate(found), np.concatenate(wanted)
     return tuple(_relative(ours[:, c], theirs[:, c]) for c in range(T.channels))
 

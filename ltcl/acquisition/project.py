@@ -19,7 +19,7 @@ import contextlib
 import os
 import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -39,6 +39,7 @@ from ltcl.files import as_path, input_file
 from ltcl.store import BlockStore
 
 FILE, STORE = "acquisition.toml", "transport.zarr"
+_CAMERA = ("camera_map", "camera_grid")
 _LARGEST = 1 << 20  # bytes of a file that somebody wrote by hand
 _OURS = ("rig", "store", "resume", "progress", "device")  # of `acquire`, not for the file
 
@@ -155,6 +156,11 @@ class Project:
                 raise InputTypeError(f"holds a value of an unusable type: {error}") from error
         with Shots(made):
             yield made
+
+    def aligned(self) -> Project:
+        """The same, but what a virtual rig photographs is seen on the pixels that its transport has."""
+        kept = {key: value for key, value in self.tables.rig.items() if key not in _CAMERA}
+        return replace(self, tables=replace(self.tables, rig=kept))
 
     @contextlib.contextmanager
     def naming(self, table: str) -> Iterator[None]:

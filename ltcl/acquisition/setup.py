@@ -127,15 +127,16 @@ class Setup:
 
     def resampled(self, picture: Any) -> np.ndarray:
         """A picture on the camera's pixels, (H, W[, 3]), as it is on those of the transport, (h, w[, 3])."""
-        return self._mean(self.calibration.resampling.apply(picture))
+        return self.mean(self.calibration.resampling.apply(picture))
 
     def _on_grid(self, light: Radiance) -> np.ndarray:
         R = self.calibration.resampling
         weight = R.apply(light.valid.astype(np.float32))
         value = R.apply(np.where(light.valid, light.value, 0.0))
-        return self._mean(np.where(weight >= _SEEN, value / np.maximum(weight, _SEEN), 0.0))
+        return self.mean(np.where(weight >= _SEEN, value / np.maximum(weight, _SEEN), 0.0))
 
-    def _mean(self, picture: np.ndarray) -> np.ndarray:
+    def mean(self, picture: np.ndarray) -> np.ndarray:
+        """A picture on the projector's pixels, (h, w[, 3]), as its means over those of the transport."""
         if self.blocks.side == 1:
             return picture.astype(np.float32)
         count = self.blocks.sum(np.ones_like(picture))

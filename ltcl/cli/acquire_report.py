@@ -75,7 +75,7 @@ def _off(project: Project, device: Any) -> tuple[float, ...]:
     from ltcl.acquisition import Setup, held
 
     T = store.load(project.store, on_dark="mask", device=device)
-    with project.rig() as rig:
+    with project.aligned().rig() as rig:
         return held.off(rig, T, Setup.of(project.store))
 
 

@@ -89,6 +89,20 @@ def test_photographs_become_a_transport(program: Program, scan: Path) -> None:
     assert (again.code, again.err) == (0, f"ltcl: {scan / 'transport.zarr'}: is finished already\n")
 
 
+def test_a_camera_of_its_own_pixels(program: Program, tmp_path: Path) -> None:
+    """Compared with the truth on the projector's pixels, not with what this camera tells apart."""
+    arguments = ["--size", "6", "--camera-grid", "18x36", "--strategy", "hadamard"]
+    assert program("simulate", "dihedral", *arguments, "--out", tmp_path).code == 0
+    told = program("acquire", "run", tmp_path, "--json").json
+    T, truth = ltcl.load(tmp_path / "transport.zarr", on_dark="mask"), ltcl.load(tmp_path / "truth.npz")
+    p = (np.random.default_rng(5).random((6, 12)) < 0.5).astype(np.float32)
+    seen = ~T.masked.reshape(6, 12)
+    found, wanted = np.asarray(T @ p)[seen], np.asarray(truth @ p)[seen]
+    scale = np.vdot(found, wanted) / np.vdot(found, found)
+    off = np.linalg.norm(scale * found - wanted) / np.linalg.norm(wanted)
+    assert told["off"][0] == pytest.approx(off, rel=0.5)
+
+
 def test_plans_before_and_after_the_calibration(program: Program, scan: Path, acquired: Path) -> None:
     before, after = (program("acquire", "plan", one, "--json").json for one in (scan, acquired))
     assert (before["measured"], after["measured"]) == (False, True)
