@@ -97,6 +97,8 @@ class Project:
             A table or a key that is unknown, or one that is missing.
         """
         folder = as_path(folder)
+        if folder.exists() and not folder.is_dir():
+            raise FileError(f"{folder}: is a file; an acquisition is a folder with an {FILE}")
         path = folder / FILE
         found = _parsed(path)
         for name, value in found.items():
@@ -184,7 +186,6 @@ class Project:
         """
         with self.naming("rig"):
             grid, channels = project_rigs.pixels(self.folder, self.tables)
-            grid = checks.grid("projector_grid", grid)
             noise, ambient = project_rigs.guessed(self.tables)
         light = Light() if ambient is None else Light(ambient=ambient)
         with self.naming("acquire"):
@@ -216,7 +217,7 @@ class _Unseen:
 
 
 def _parsed(path: Path) -> dict[str, Any]:
-    if not path.exists() and (path.parent.is_dir() or not path.parent.exists()):
+    if not path.exists():
         raise FileError(
             f"{path}: no such file; 'ltcl simulate' makes one, or write one with [rig] and its kind: "
             "virtual, mitsuba, folder or live"

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from ltcl import checks
 from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.rigs import (
     Display,
@@ -126,31 +127,33 @@ def make(folder: Path, tables: Tables) -> Any:
     return made
 
 
-def pixels(folder: Path, tables: Tables) -> tuple[Any, int]:
+def pixels(folder: Path, tables: Tables) -> tuple[tuple[int, int], int]:
     """Projector's grid and number of channels, from the file of a virtual rig or as they are stated."""
     if tables.kind == "virtual":
         record = scene_of(folder, tables)
-        return _grid(folder, tables.rig, record), len(_matrices(record))
+        return checks.grid("grid", _grid(folder, tables.rig, record)), len(_matrices(record))
     if tables.kind == "live":
         camera = _CAMERAS[tables.camera["kind"]]
-        return tables.display["grid"], tables.camera.get("channels", _parameters(camera)["channels"].default)
+        grid = checks.grid("display.grid", tables.display["grid"])
+        return grid, tables.camera.get("channels", _parameters(camera)["channels"].default)
     channels = tables.rig.get("channels", _parameters(_RIGS[tables.kind][0])["channels"].default)
-    return tables.rig["projector_grid"], channels
+    return checks.grid("projector_grid", tables.rig["projector_grid"]), channels
 
 
 def guessed(tables: Tables) -> tuple[NoiseModel, float | None]:
     """Noise as the tables tell it, and ambient light where they do."""
     if tables.kind not in ("virtual", "mitsuba"):
-        bits = tables.rig.get("camera_bits")
-        return NoiseModel(levels=0 if bits is None else 1 << int(bits)), None
+        return NoiseModel(levels=_levels("camera_bits", tables.rig.get("camera_bits"))), None
     told = {name: p.default for name, p in _parameters(_RIGS[tables.kind][0]).items()} | tables.rig
-    levels = 0 if told["bits"] == "float" else 1 << int(told["bits"])
-    electrons = _NOISELESS if told["gain"] is None else float(told["gain"])
+    electrons = _NOISELESS if told["gain"] is None else checks.number("gain", told["gain"], above=0.0)
+    read = checks.number("read", told["read"], least=0.0)
     ambient = told.get("ambient")
-    return (
-        NoiseModel(electrons=electrons, read=float(told["read"]), levels=levels),
-        None if ambient is None else float(np.mean(ambient)),
-    )
+    noise = NoiseModel(electrons=electrons, read=read, levels=_levels("bits", told["bits"]))
+    return noise, None if ambient is None else float(np.mean(checks.real("ambient", ambient)))
+
+
+def _levels(name: str, bits: Any) -> int:
+    return 0 if bits in (None, "float") else 1 << checks.count(name, bits, least=8, most=16)
 
 
 def scene_of(folder: Path, tables: Tables) -> Record | Parts:

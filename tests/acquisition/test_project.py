@@ -173,8 +173,19 @@ def test_values_are_refused_by_the_rig(folder: Path, line: str, error: type[Exce
         pass
 
 
+@pytest.mark.parametrize(
+    "line", ["bits = 'x'", "gain = 'much'", "read = -1.0", "ambient = 'dim'", "grid = 4"]
+)
+def test_what_a_plan_needs_is_refused_by_it(folder: Path, line: str) -> None:
+    with pytest.raises((InputError, InputTypeError), match=rf"acquisition\.toml: \[rig\] {line.split()[0]}"):
+        Project.open(written(folder, VIRTUAL + line)).outlook()
+
+
 def test_files_that_are_missing_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"acquisition\.toml: no such file; 'ltcl simulate' makes one"):
         Project.open(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("text")
+    with pytest.raises(FileError, match="file: is a file; an acquisition is a folder with an acquisition"):
+        Project.open(tmp_path / "file")
     with pytest.raises(FileError, match=r"truth\.npz: no such file"):
         Project.open(written(tmp_path, VIRTUAL)).outlook()

@@ -121,7 +121,7 @@ def test_no_acquisition_is_overwritten(program: Program, tmp_path: Path) -> None
 
 
 def test_mitsuba_renders_what_is_photographed(program: Program, tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba")
+    pytest.importorskip("mitsuba", reason='mitsuba is not installed: pip install "ltcl[rig]"')
     told = program("simulate", "mitsuba:dihedral", "--grid", "6x8", "--out", tmp_path / "m", "--json").json
     assert (told["channels"], told["projector_grid"], told["camera_grid"]) == (1, [6, 8], [6, 8])
     assert not (tmp_path / "m" / "truth.npz").exists()
