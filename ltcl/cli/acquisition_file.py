@@ -63,8 +63,9 @@ _TAIL = """\
 def text(rig: dict[str, Any], acquire: dict[str, Any]) -> str:
     """All of the file.
 
-    >>> text({"kind": "virtual", "bits": 12}, {"strategy": "auto"}).splitlines()[4:7]  # doctest: +ELLIPSIS
-    ['[rig]', 'kind = "virtual"                 # ...', 'bits = 12                        # ...']
+    >>> made = text({"kind": "virtual", "bits": 12}, {"strategy": "auto"})
+    >>> made.splitlines()[5]
+    'kind = "virtual"                   # virtual, mitsuba, folder or live'
     """
     more = _VIRTUAL if rig["kind"] == "virtual" else ""
     return f"{_HEAD}[rig]\n{_lines(rig)}{more}\n[acquire]\n{_lines(acquire)}{_TAIL}"

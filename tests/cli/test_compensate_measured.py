@@ -146,6 +146,10 @@ def test_frames_and_videos_hold_codes(program: Program, store: Path, tmp_path: P
         images.write(frames / f"{number}.exr", linear() - np.float32(shift))
     arguments = ["--video", tmp_path / "out.mkv", "--format"]
     assert program("compensate", store, frames, "--out", tmp_path / "png", *arguments, "png").code == 0
+    again = program(
+        "compensate", store, frames, "--out", tmp_path / "png", *arguments, "png", "--resume", "--json"
+    )
+    assert (again.code, again.json["solved"]) == (0, 0)
     codes = fed(tmp_path / "png" / "pattern_000001.png")
     assert off(codes, linear(), rig_of()) < 0.015
     videos = [next(iter(open_frames(tmp_path / "out.mkv", encoding="linear"))).picture()]
