@@ -24,13 +24,13 @@ def block(pattern: str) -> str:
 
 def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
+    names: dict[str, Any] = {}
     exec(block(r"```python\n(.*?)```"), names)  # noqa: S102 - our own README
     assert Path("corner.png").is_file()
     assert "0.0% of the pattern clipped" in capsys.readouterr().out
     few_pixels, from_photographs = re.findall(r"```py\n(.*?)```", README, re.DOTALL)
     exec(few_pixels, names)  # noqa: S102
-    few: Any = names["few"]
+    few = names["few"]
     assert (few.standard_error <= 1e-3).all()
     commands = block(r"on the files these lines have made:\s+```\n(.*?)```").splitlines()
     assert len(commands) > 5
@@ -39,7 +39,7 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     for command in block(r"tells what else could stand there:\s+```sh\n(.*?)```").splitlines():
         _run(command, capsys)
     exec(from_photographs, names)  # noqa: S102
-    rig: Any = names["rig"]
+    rig = names["rig"]
     seen, wanted = (rig.radiance(names["setup"].codes(names["c"].pattern)), names["wanted"])
     scale = np.vdot(seen, wanted) / np.vdot(seen, seen)
     assert np.linalg.norm(scale * seen - wanted) < 0.02 * np.linalg.norm(wanted)
