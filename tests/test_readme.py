@@ -8,6 +8,9 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from ltcl.acquisition import Project
 from ltcl.cli.main import main
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
@@ -21,16 +24,38 @@ def block(pattern: str) -> str:
 
 def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
+    names: dict[str, Any] = {}
     exec(block(r"```python\n(.*?)```"), names)  # noqa: S102 - our own README
     assert Path("corner.png").is_file()
     assert "0.0% of the pattern clipped" in capsys.readouterr().out
-    exec(block(r"```py\n(.*?)```"), names)  # noqa: S102
-    few: Any = names["few"]
+    few_pixels, from_photographs = re.findall(r"```py\n(.*?)```", README, re.DOTALL)
+    exec(few_pixels, names)  # noqa: S102
+    few = names["few"]
     assert (few.standard_error <= 1e-3).all()
     commands = block(r"on the files these lines have made:\s+```\n(.*?)```").splitlines()
     assert len(commands) > 5
     for command in commands:
-        program, *arguments = shlex.split(command, comments=True)
-        assert program == "ltcl"
-        assert main(arguments) == 0, capsys.readouterr().err
+        _run(command, capsys)
+    for command in block(r"tells what else could stand there:\s+```sh\n(.*?)```").splitlines():
+        _run(command, capsys)
+    exec(from_photographs, names)  # noqa: S102
+    rig = names["rig"]
+    seen, wanted = (rig.radiance(names["setup"].codes(names["c"].pattern)), names["wanted"])
+    scale = np.vdot(seen, wanted) / np.vdot(seen, seen)
+    assert np.linalg.norm(scale * seen - wanted) < 0.02 * np.linalg.norm(wanted)
+
+
+def _run(command, capsys):
+    program, *arguments = shlex.split(command, comments=True)
+    assert program == "ltcl"
+    assert main(arguments) == 0, capsys.readouterr().err
+
+
+def test_the_rigs_of_the_readme_are_ones(tmp_path):
+    kinds = []
+    for text in re.findall(r"```toml\n(.*?)```", README, re.DOTALL):
+        (tmp_path / "acquisition.toml").write_text(text)
+        project = Project.open(tmp_path)
+        assert project.outlook().grid == (48, 64)
+        kinds.append(project.kind)
+    assert kinds == ["folder", "live"]

@@ -10,6 +10,10 @@
     scanning/   which pixels are lit when, and T from the pictures; plan before, report after
     task, run   acquire: all of it, into a store, stopped and resumed
     forecasting how far pictures and bounces are off by the noise of the scan
+    finishing   finalize: the transport of a store whose photographs are all there
+    setup       Setup: codes for a pattern, and the ambient light, on the pixels of a transport
+    held        how far a transport is from a scene that is known
+    project     Project: an acquisition as a folder with an acquisition.toml; project_rigs makes its rig
 
 Codes in [0, 1] are what a projector is fed and what a camera gives; they are not linear in light.
 """
@@ -17,8 +21,10 @@ Codes in [0, 1] are what a projector is fed and what a camera gives; they are no
 from __future__ import annotations
 
 from ltcl.acquisition.calibration import Calibration
+from ltcl.acquisition.finishing import finalize
 from ltcl.acquisition.forecasting import Forecast, forecast_bounces, forecast_picture
 from ltcl.acquisition.geometry import Correspondence
+from ltcl.acquisition.project import Project
 from ltcl.acquisition.rig import Rig, Shots
 from ltcl.acquisition.rigs import (
     Display,
@@ -32,6 +38,7 @@ from ltcl.acquisition.rigs import (
     mitsuba_scene,
 )
 from ltcl.acquisition.scanning.report import Report
+from ltcl.acquisition.setup import Setup
 from ltcl.acquisition.task import acquire
 
 __all__ = [
@@ -44,12 +51,15 @@ __all__ = [
     "LiveRig",
     "MitsubaRig",
     "OpenCVCamera",
+    "Project",
     "Report",
     "Rig",
+    "Setup",
     "Shots",
     "VirtualRig",
     "acquire",
     "camera_map",
+    "finalize",
     "forecast_bounces",
     "forecast_picture",
     "mitsuba_scene",

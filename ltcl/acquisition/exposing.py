@@ -85,3 +85,14 @@ def for_scan(shots: Shots, white: float, deep: float, noise: NoiseModel) -> tupl
     between = [math.sqrt(white * deep)] if 0 < noise.levels < _FINE else []
     short, *longer = offered(shots, [white, *between, deep])
     return (*[short] * min(again, _MOST), *longer)
+
+
+def guess(lit: float, ambient: float) -> tuple[float, float]:
+    """Seconds for white and the longest, where nothing but these two radiances is known.
+
+    >>> guess(0.7, 0.01)
+    (1.0, 30.0)
+    """
+    white = WHITE / lit
+    most = DEEPEST * white
+    return white, min(most, _AMBIENT / ambient) if ambient > 0 else most

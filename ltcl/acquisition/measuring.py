@@ -229,7 +229,8 @@ def _bright(run: _Run, response: Response, seconds: float) -> float:
 def _noise(run: _Run, response: Response, seconds: float, deep: float) -> NoiseModel:
     ramp = _ramp(run.shots.grid)
     scenes = ((ramp, seconds), (run.black, seconds), (run.black, deep))
-    bursts = [run.take([(codes, t)] * _BURST) for codes, t in scenes]
+    run.shots.prepare([shot for shot in scenes for _ in range(_BURST)])
+    bursts = [run.take([shot] * _BURST) for shot in scenes]
     with exposing.telling("the noise of the camera"):
         found = estimate(bursts, response=response, levels=run.shots.levels)
     return replace(found, read=max(found.read, _QUIETEST))
@@ -254,12 +255,13 @@ def _projector(
     """Response of each channel of the projector, and the mixing of colours."""
     times = exposing.offered(run.shots, [seconds, 4.0 * seconds])
     codes, colours = np.linspace(0.0, 1.0, _CODES), run.shots.channels
-    pictures = []
+    shown = []
     for d in range(colours):
         unit = np.ones(1, np.float32) if colours == 1 else np.eye(3, dtype=np.float32)[d]
         fed = [np.float32(c) * run.white[..., None] * unit for c in codes]
-        shown = [part[..., 0] if colours == 1 else part for part in fed]
-        pictures.append([run.merged(part, times, response, noise, offset) for part in shown])
+        shown.append([part[..., 0] if colours == 1 else part for part in fed])
+    run.shots.prepare((part, t) for parts in shown for part in parts for t in times)
+    pictures = [[run.merged(part, times, response, noise, offset) for part in parts] for parts in shown]
     with exposing.telling("the projector"):
         if colours == 1:
             return projector.measure(codes, pictures[0]), None

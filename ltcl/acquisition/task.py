@@ -86,7 +86,8 @@ def acquire(
     Transport
         On the projector's pixels (blocks of them, of "block"), for light relative to white less black. Its
         unit is that of the camera: linear sensor value a second. Pixels without a first bounce are masked.
-        `ltcl.acquisition.Calibration.of(store)` has the codes that the projector is fed for linear light.
+        `ltcl.acquisition.Setup.of(store)` has the codes that the projector is fed for linear light, and the
+        ambient light on these pixels.
 
     Raises
     ------

@@ -20,6 +20,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ltcl import checks, layout
 from ltcl.batch import identity, manifest
 from ltcl.batch.manifest import Manifest
@@ -55,6 +57,7 @@ def compensate_frames(
     gain: float | str = 1.0,
     loss: float | None = None,
     progress: Callable[[int, int | None], object] | None = None,
+    codes: Callable[[np.ndarray], np.ndarray] | None = None,
     **options: Any,
 ) -> CompensatedFrames:
     """Find the patterns under which a scene shows the frames of a film.
@@ -95,6 +98,9 @@ def compensate_frames(
     progress : callable(done, total), optional
         Called after every batch with the number of frames done, of earlier runs, too; total is None where the
         source does not tell.
+    codes : callable(pattern), optional
+        What the projector is fed for a pattern of light, (h, w) or (h, w, 3), such as
+        `ltcl.acquisition.Setup.codes`: .png and video then hold these codes, and not sRGB.
     **options
         Of `ltcl.compensate`: bounds, method, rtol, exact, and so on; background and weights are one picture.
 
@@ -138,9 +144,10 @@ def compensate_frames(
         as_path(out),
         resume,
         {"gain": gain, "loss": loss, "batch": checks.count("batch", batch), "format": format}
-        | {"appearance": appearance, "encoding": encoding, "resize": resize, **options},
+        | {"appearance": appearance, "encoding": encoding, "resize": resize, "codes": codes, **options},
     )
-    output = Output(kept.path.parent, format, bounds[1] if bounds[1] > 0 else 1.0, appearance)
+    white = bounds[1] if bounds[1] > 0 else 1.0
+    output = Output(kept.path.parent, format, white, appearance, codes)
     output.sweep()
     run = Run(T, Reader(opened, T.camera_grid, resize, limit), output, kept, batch, options)
     with staying(kept):

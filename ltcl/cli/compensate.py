@@ -21,11 +21,13 @@ def _gain(text: str) -> float | str:
 
 
 _GAIN = Annotated[
-    str,
+    str | None,
     typer.Option(
         parser=_gain,
         metavar="FACTOR",
-        help="Match FACTOR times the picture; auto: the largest that the projector reaches.",
+        help="Match FACTOR times the picture; auto: the largest that the projector reaches. Default: 1, but "
+        "auto with a TRANSPORT of 'ltcl acquire', whose light has the camera's own unit.",
+        show_default=False,
     ),
 ]
 _LOSS = Annotated[
@@ -33,6 +35,15 @@ _LOSS = Annotated[
     typer.Option(
         metavar="FRACTION",
         help="Error that --gain auto may cost. Default: none if possible, else RTOL or 1.1 times the least.",
+        show_default=False,
+    ),
+]
+_CALIBRATION = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="STORE",
+        help="Of 'ltcl acquire': the transport.zarr that TRANSPORT was made of, where that does not keep how "
+        "projector and ambient light were measured.",
         show_default=False,
     ),
 ]
@@ -55,7 +66,8 @@ _BACKGROUND = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Picture of the scene under the light that the projector cannot take away.",
+        help="Picture of the scene under the light that the projector cannot take away. Default: what "
+        "'ltcl acquire' measured of it, else none.",
         show_default=False,
     ),
 ]
@@ -126,13 +138,14 @@ def run(
     samples: options.Samples = None,
     seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
-    on_dark: options.OnDark = "raise",
-    gain: _GAIN = "1",
+    on_dark: options.OnDark = "auto",
+    gain: _GAIN = None,
     loss: _LOSS = None,
     low: _LOW = 0.0,
     high: _HIGH = 1.0,
     clamp: _CLAMP = False,
     background: _BACKGROUND = None,
+    calibration: _CALIBRATION = None,
     weights: _WEIGHTS = None,
     resize: options.Resize = False,
     encoding: options.Encoding = "auto",
@@ -152,10 +165,16 @@ def run(
     reach, exactly as .exr and for the eye as .png, and compensate.json. What is out of reach is grey where
     nothing is, orange where the scene stays too dark and blue where it stays too bright.
 
+    With a TRANSPORT of 'ltcl acquire' pattern .png and video hold the codes that its projector is fed, by the
+    measured response; else they are sRGB. Its ambient light is the background, and the gain is auto.
+
     Of a folder or a video of frames, writes the numbered patterns and frames.json batch by batch, with one
     gain for all; Ctrl-C keeps what is done, for --resume.
     """
-    _check(gain, loss)
+    setup = transports.setup_of(transport, calibration)
+    sought: Any = ("auto" if setup else 1.0) if gain is None else gain
+    _check(sought, loss)
+    _check_measured(setup, low, high)
     drawn = options.sampling(method, samples, seed)
     film = {"batch": batch, "resume": resume, "frames": frames, "video": video, "fps": fps}
     film |= {"format": format, "appearance": appearance}
@@ -169,11 +188,14 @@ def run(
         first_bounce=first_bounce,
         on_dark=on_dark,
     )
+    transports.refuse_other(setup, calibration, T)
     known = transports.load_inverse(inverse, T)
     judge = transports.load_exact(exact, T, grid=grid, on_dark=on_dark)
     reader = pictures.Reader(T.camera_grid, "the camera", encoding, resize)
     desired = {} if source else reader.read_all(picture)
     dark, counts = (None if file is None else reader.read(file) for file in (background, weights))
+    if dark is None and setup is not None:
+        dark = setup.ambient
     text = transports.heading(
         "compensate",
         transport,
@@ -187,23 +209,26 @@ def run(
         **drawn,
         first_bounce=first_bounce,
         on_dark=on_dark,
-        gain=gain,
+        gain=sought,
         loss=loss,
         low=low,
         high=high,
         clamp=clamp,
-        background=background,
+        background="measured" if background is None and setup is not None else background,
+        calibration=calibration,
         weights=weights,
         resize=resize,
         encoding=encoding,
         device=device,
     )
-    settings: dict[str, Any] = {"bounds": (low, high), "gain": gain, "loss": loss, "method": method}
+    text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
+    settings: dict[str, Any] = {"bounds": (low, high), "gain": sought, "loss": loss, "method": method}
     settings |= {"rtol": rtol, **drawn, "background": dark, "weights": counts}
     settings |= {"inverse": known, "exact": judge, "clamp": clamp}
-    told = transports.caveat("errors are", T, exact)
+    told = [transports.caveat("errors are", T, exact), *_measured(setup, background)]
+    told = "\n".join(filter(None, told))
     if source:
-        settings |= {"resize": resize, "encoding": encoding}
+        settings |= {"resize": resize, "encoding": encoding, "codes": setup and setup.codes}
         done = compensate_frames.run(T, source, out, {**film, **settings})
         if json:
             console.answer({"folder": out, **text, **compensate_frames.entry(source, done)})
@@ -211,11 +236,29 @@ def run(
             compensate_frames.show(done, told, gain == "auto")
         return
     names = {"background": background, "weights": weights}
-    entries = compensate_pictures.run(T, picture, desired, out, text, names, settings)
+    entries = compensate_pictures.run(T, picture, desired, out, text, names, settings, setup)
     if json:
         console.answer({"folder": out, **text})
     else:
-        compensate_pictures.show(out, entries, told, advise=gain != "auto")
+        compensate_pictures.show(out, entries, told, advise=sought != "auto")
+
+
+def _check_measured(setup: Any, low: float, high: float) -> None:
+    """The light of a projector that was measured is relative to its black and its white."""
+    for name, bound in (("--low", low), ("--high", high)):
+        if setup is not None and not 0.0 <= bound <= 1.0:
+            raise InputError(
+                f"{name} is {bound:g}; it must be from 0 to 1, the black and the white of the projector that "
+                "'ltcl acquire' measured"
+            )
+
+
+def _measured(setup: Any, background: Path | None) -> list[str]:
+    """What the calibration in the transport was used for, in words."""
+    if setup is None:
+        return []
+    used = "; the background is the ambient light that was measured" if background is None else ""
+    return [f"pattern .png holds the codes to feed to the measured projector as they are{used}"]
 
 
 def _check(gain: float | str, loss: float | None) -> None:

@@ -29,6 +29,7 @@ def run(
     text: dict[str, Any],
     names: dict[str, Path | None],
     settings: dict[str, Any],
+    setup: Any = None,
 ) -> list[dict[str, Any]]:
     """Fill the folder `out` with the results of all pictures; returns what the report says of each.
 
@@ -42,6 +43,8 @@ def run(
         Files of other arguments of `compensate`, for refusals.
     settings
         Of `compensate`.
+    setup : ltcl.acquisition.Setup, optional
+        That T was measured with: patterns are written as its projector is fed.
     """
     from ltcl.compensation import compensate
 
@@ -54,8 +57,8 @@ def run(
             with _named({"desired": file, "gain": file, **names}):
                 done = compensate(T, wanted, callback=steps.solve(settings["rtol"]), **settings)
             entries.append(
-                {"file": str(file), **_entry(T, done, low, high), **_under(done, dark)}
-                | _write(folder, name, done, high)
+                {"file": str(file), "high": high, **_entry(T, done, low, high), **_under(done, dark)}
+                | _write(folder, name, done, high, setup)
             )
     return entries
 
@@ -103,11 +106,12 @@ def _under(done: Compensation, dark: np.ndarray | None) -> dict[str, float]:
     return {"under_background": float(np.mean(target <= dark * np.float32(1 + 1e-6)))}
 
 
-def _write(folder: Path, name: str, done: Compensation, high: float) -> dict[str, Any]:
+def _write(folder: Path, name: str, done: Compensation, high: float, setup: Any) -> dict[str, Any]:
+    white = high if high > 0 else 1.0
     # Appearance / gain compares with the picture that was asked for, whatever the units of T.
     missing, shown = done.out_of_reach, _diverging(done.out_of_reach / done.gain) * done.gain
     return {
-        "pattern": pictures.write(folder, f"{name}_pattern", done.pattern, high if high > 0 else 1.0),
+        "pattern": pictures.write_pattern(folder, f"{name}_pattern", done.pattern, white, setup),
         "appearance": pictures.write(folder, f"{name}_appearance", done.appearance, done.gain),
         "out_of_reach": pictures.write(folder, f"{name}_out_of_reach", missing, done.gain, shown),
     }
@@ -170,7 +174,7 @@ def _advise(entry: dict[str, Any]) -> None:
             "there from the rest of the picture; brighten its dark parts"
         )
     if entry["asks_above"] > _MANY and entry["brightest"] > 0:
-        high = entry["pattern"]["png_scale"]
+        high = entry["high"]
         gain = entry["gain"] * high / entry["brightest"]
         console.note(
             f"{entry['file']}: the pattern needs light of {entry['brightest']:.3g}, "

@@ -60,7 +60,7 @@ def run(
     basis: _Basis = None,
     grid: options.Grid = None,
     first_bounce: options.FirstBounce = None,
-    on_dark: options.OnDark = "raise",
+    on_dark: options.OnDark = "auto",
     device: options.Device = None,
     json: options.Json = False,
 ) -> None:
@@ -89,6 +89,7 @@ def run(
         "solution_error": C.error,
         "compression": C.compression,
     }
+    transports.note_lost(file, out)
     if json:
         console.answer(text)
     else:

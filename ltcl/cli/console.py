@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any
 
@@ -168,13 +170,22 @@ class Frames:
 
     On a terminal a bar with frames a second and the time left; elsewhere the same as a line now and then. The
     first call tells how many were done before.
+
+    Parameters
+    ----------
+    what : str
+        The name of the things that are counted, if not frames.
+    settling : float
+        Seconds within which all that is done was done before: earlier runs are told piece by piece.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, what: str = "frames", settling: float = 0.0) -> None:
         console = Console(stderr=True)
         self.done = 0
+        self._what, self._settling = what, settling
         self._is_terminal = console.is_terminal
-        self._before, self._begun, self._said = 0, 0.0, 0.0
+        self._before, self._begun, self._first, self._said = 0, 0.0, 0.0, 0.0
+        self._heard: float | None = None
         columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[text]}"))
         self._bar = Progress(*columns, console=console, transient=True, disable=not self._is_terminal)
         self._task = self._bar.add_task("", total=None, text="")
@@ -188,18 +199,52 @@ class Frames:
         if self._is_terminal:
             self._bar.stop()
 
+    def at(self, text: str) -> None:
+        """Say what is being done before there is anything to count."""
+        self._bar.update(self._task, text=text)
+        now = time.monotonic()
+        self._heard = now if self._heard is None else self._heard
+        if not self._is_terminal and now >= self._heard + _PATIENCE:
+            note(text)
+
     def __call__(self, done: int, total: int | None) -> None:
         """Note that so many frames are done."""
         now = time.monotonic()
         if not self._begun:
-            self._before, self._begun = done, now
+            self._before, self._begun, self._first = done, now, now
             self._said = now + _PATIENCE - _AGAIN
+        elif now < self._first + self._settling:
+            self._before, self._begun = done, now
         self.done = done
         text = _pace(done - self._before, now - self._begun, None if total is None else total - done)
         self._bar.update(self._task, completed=done, total=total, text=text)
         if not self._is_terminal and now >= self._said + _AGAIN:
             self._said = now
-            note(f"{done}{'' if total is None else f' of {total}'} frames, {text}".rstrip(", "))
+            note(f"{done}{'' if total is None else f' of {total}'} {self._what}, {text}".rstrip(", "))
+
+
+@contextmanager
+def hearing(name: str, tell: Callable[[str], None]) -> Iterator[None]:
+    """What the part `name` of the library logs of its progress is told."""
+    logger, handler = logging.getLogger(name), _Heard(tell)
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+        logger.removeHandler(handler)
+
+
+class _Heard(logging.Handler):
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        super().__init__(logging.INFO)
+        self._tell = tell
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno == logging.INFO:  # warnings are said anyway
+            self._tell(record.getMessage())
 
 
 def _pace(done: int, seconds: float, left: int | None) -> str:

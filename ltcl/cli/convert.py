@@ -33,6 +33,7 @@ def run(
         record = _with_grids(record, grid, camera_grid)
         facts = info.describe(target, record)  # refuses what could not be loaded again
     formats.write(target, record)
+    transports.note_lost(source, target)
     if record.grid is None:
         console.note(f"{target}: does not tell the grid; give --grid HxW here, or wherever you use it")
     elif rows != columns and record.camera_grid is None:

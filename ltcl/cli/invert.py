@@ -33,7 +33,7 @@ def run(
     basis: _Basis = None,
     grid: options.Grid = None,
     first_bounce: options.FirstBounce = None,
-    on_dark: options.OnDark = "raise",
+    on_dark: options.OnDark = "auto",
     device: options.Device = None,
     json: options.Json = False,
 ) -> None:

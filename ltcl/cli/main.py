@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 
 from ltcl import __version__
 from ltcl.cli import (
+    acquire,
     analyze,
     compensate,
     compress,
@@ -29,6 +30,7 @@ from ltcl.cli import (
     invert,
     relight,
     separate,
+    simulate,
 )
 from ltcl.errors import LtclError
 
@@ -168,6 +170,7 @@ for command in (
     devices,
     doctor,
     demo,
+    simulate,
     info,
     analyze,
     convert,
@@ -178,6 +181,7 @@ for command in (
     relight,
 ):
     app.command(command.__name__.rpartition(".")[2])(command.run)
+app.add_typer(acquire.app, name="acquire")
 
 
 def _show_version(wanted: bool) -> None:

@@ -13,14 +13,16 @@ from ltcl.errors import InputError
 from ltcl.solvers.methods import METHODS, SAMPLED
 
 
-def _grid(text: str) -> tuple[int, int]:
+def grid(text: str) -> tuple[int, int]:
+    """Height x width."""
     found = re.fullmatch(r"\s*(\d+)\s*[xX,]\s*(\d+)\s*", text)
-    if found is None or 0 in (grid := (int(found[1]), int(found[2]))):
+    if found is None or 0 in (size := (int(found[1]), int(found[2]))):
         raise typer.BadParameter(f"{text!r} is no grid; write height x width, for instance 48x64")
-    return grid
+    return size
 
 
-def _folder(text: str) -> Path:
+def folder(text: str) -> Path:
+    """A name that is not empty."""
     if not text.strip():
         raise typer.BadParameter("the name is empty; write . for this folder")
     return Path(text)
@@ -84,10 +86,13 @@ Out = Annotated[
     typer.Option(
         "--out",
         "-o",
-        parser=_folder,
+        parser=folder,
         metavar="DIR",
         help="Folder for the results; filled only on success.",
     ),
+]
+Acquisition = Annotated[
+    Path, typer.Argument(metavar="DIR", help="Folder with an acquisition.toml; 'ltcl simulate' makes one.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Device = Annotated[
@@ -144,7 +149,7 @@ Seed = Annotated[
 Grid = Annotated[
     tuple | None,
     typer.Option(
-        parser=_grid,
+        parser=grid,
         metavar="HxW",
         help="Projector pixels, height x width, where the file does not tell.",
         show_default=False,
@@ -153,7 +158,7 @@ Grid = Annotated[
 CameraGrid = Annotated[
     tuple | None,
     typer.Option(
-        parser=_grid, metavar="HxW", help="Camera pixels, if not those of the projector.", show_default=False
+        parser=grid, metavar="HxW", help="Camera pixels, if not those of the projector.", show_default=False
     ),
 ]
 FirstBounce = Annotated[
@@ -165,8 +170,11 @@ FirstBounce = Annotated[
     ),
 ]
 OnDark = Annotated[
-    Literal["raise", "mask"],
-    typer.Option(help="Projector pixels without direct light: refuse, or leave unlit."),
+    Literal["auto", "raise", "mask"],
+    typer.Option(
+        help="Projector pixels without direct light: refuse, or leave unlit; auto: refuse, but leave "
+        "unlit with a transport of 'ltcl acquire', which knows what the camera does not see."
+    ),
 ]
 Resize = Annotated[
     bool,

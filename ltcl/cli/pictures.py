@@ -18,12 +18,16 @@ Grid = tuple[int, int]
 
 @dataclass(frozen=True)
 class Reader:
-    """How picture files become linear pictures on a `grid`: what they hold, whether to scale them."""
+    """How picture files become linear pictures on a `grid`: what they hold, whether to scale them.
+
+    Those of integers are codes for the projector of a `setup`, where there is one and nothing else is said.
+    """
 
     grid: Grid
     whose: str
     encoding: Literal["auto", "srgb", "linear"]
     resize: bool
+    setup: Any = None
 
     def read(self, path: Path) -> np.ndarray:
         """The picture in `path`, linear float32, (h, w) or (h, w, 3) on the grid.
@@ -35,11 +39,12 @@ class Reader:
         """
         from ltcl import images
 
-        picture = images.read(path, encoding=self.encoding)
+        setup = self.setup if self.encoding == "auto" and self.setup and _holds_integers(path) else None
+        picture = images.read(path, encoding="linear" if setup else self.encoding)
+        if self.resize and picture.shape[:2] != self.grid:
+            picture = images.resize(picture, self.grid)
         if picture.shape[:2] == self.grid:
-            return picture
-        if self.resize:
-            return images.resize(picture, self.grid)
+            return setup.light(picture) if setup else picture
         has, wants = ("{} x {}".format(*size) for size in (picture.shape[:2], self.grid))
         raise InputError(
             f"{path}: is {has} pixels, but {self.whose} has {wants}; give --resize to scale the picture"
@@ -48,6 +53,12 @@ class Reader:
     def read_all(self, paths: Sequence[Path]) -> dict[str, np.ndarray]:
         """All pictures by the name that their results get; a bad one is known before the first solve."""
         return {name: self.read(path) for name, path in names(paths).items()}
+
+
+def _holds_integers(path: Path) -> bool:
+    from ltcl import images
+
+    return images.read_codes(path).dtype.kind == "u"
 
 
 def names(paths: Sequence[Path]) -> dict[str, Path]:
@@ -84,6 +95,17 @@ def write(
     images.write(folder / f"{name}.exr", picture)
     images.write(folder / f"{name}.png", (picture if shown is None else shown) / scale)
     return {"exr": f"{name}.exr", "png": f"{name}.png", "png_scale": scale}
+
+
+def write_pattern(folder: Path, name: str, light: np.ndarray, white: float, setup: Any) -> dict[str, Any]:
+    """As `write`; but where the projector was measured, by `setup`, ``name.png`` has the codes to feed it."""
+    from ltcl import images
+
+    if setup is None:
+        return write(folder, name, light, white)
+    images.write(folder / f"{name}.exr", light)
+    images.write(folder / f"{name}.png", setup.codes(light), encoding="linear")
+    return {"exr": f"{name}.exr", "png": f"{name}.png", "png_scale": 1.0}
 
 
 def brightness(picture: np.ndarray) -> float:

@@ -17,7 +17,7 @@ def run(
     out: options.Out,
     grid: options.Grid = None,
     camera_grid: options.CameraGrid = None,
-    on_dark: options.OnDark = "raise",
+    on_dark: options.OnDark = "auto",
     resize: options.Resize = False,
     encoding: options.Encoding = "auto",
     device: options.Device = None,
@@ -25,13 +25,17 @@ def run(
 ) -> None:
     """Show what the camera will see when PATTERN is projected.
 
+    With a TRANSPORT of 'ltcl acquire' a PATTERN of integers, as .png, holds the codes that its projector is
+    fed, and what is shown is what it adds to the ambient light.
+
     Writes each picture exactly as .exr and for the eye as .png, at its own brightness, which
     relight.json tells.
     """
     from ltcl.relighting import relight
 
     T = transports.load(transport, device, needs="T", grid=grid, camera_grid=camera_grid, on_dark=on_dark)
-    patterns = pictures.Reader(T.grid, "the projector", encoding, resize).read_all(pattern)
+    setup = transports.setup_of(transport)
+    patterns = pictures.Reader(T.grid, "the projector", encoding, resize, setup).read_all(pattern)
     text = transports.heading(
         "relight",
         transport,

@@ -38,7 +38,7 @@ def run(
     samples: options.Samples = None,
     seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
-    on_dark: options.OnDark = "raise",
+    on_dark: options.OnDark = "auto",
     resize: options.Resize = False,
     encoding: options.Encoding = "auto",
     device: options.Device = None,

@@ -37,6 +37,7 @@ def load(
         As `store.load`; or S is needed, and T maps to another number of pixels.
     """
     opened = open_device(device)
+    options["on_dark"] = _on_dark(path, options.get("on_dark", "raise"))
     try:
         T = store.load(path, device=opened, **options)
     except FileError as error:
@@ -47,6 +48,52 @@ def load(
     if dark and needs != "T":  # relighting needs no first bounce
         console.note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
     return T
+
+
+def _on_dark(path: Path, asked: str) -> str:
+    if asked != "auto":
+        return asked
+    return "mask" if _is_measured(path) else "raise"
+
+
+def _is_measured(path: Path) -> bool:
+    if not path.is_dir():
+        return False
+    from ltcl.acquisition.setup import has_calibration
+
+    return has_calibration(path)
+
+
+def setup_of(path: Path, calibration: Path | None = None) -> Any:
+    """The `ltcl.acquisition.Setup` in a store that `ltcl.acquire` made; None of any other file.
+
+    Raises
+    ------
+    FileError
+        `calibration`, which is preferred, is no such store.
+    """
+    if calibration is None and not _is_measured(path):
+        return None
+    from ltcl.acquisition import Setup
+
+    return Setup.of(path if calibration is None else calibration)
+
+
+def refuse_other(setup: Any, calibration: Path | None, T: Transport) -> None:
+    """Refuse the calibration of other pixels than those of T."""
+    if setup is not None and (setup.grid, setup.channels) != (T.grid, T.channels):
+        raise InputError(
+            f"{calibration}: is of {setup.grid} pixels and {setup.channels} channel(s); TRANSPORT has "
+            f"{T.grid} and {T.channels}"
+        )
+
+
+def note_lost(source: Path, target: Path) -> None:
+    """Say what a copy of a measured transport does not keep."""
+    if _is_measured(source):
+        console.note(
+            f"{target}: does not keep how the projector was measured; give compensate --calibration {source}"
+        )
 
 
 def load_inverse(path: Path | None, T: Transport) -> Inverse | None:
@@ -66,6 +113,7 @@ def load_exact(path: Path | None, T: Transport, **options: Any) -> Transport | N
     """
     if path is None:
         return None
+    options["on_dark"] = _on_dark(path, options.get("on_dark", "raise"))
     exact = store.load(path, device=T.device, **options)
     if exact.is_square and (exact.grid, exact.channels) == (T.grid, T.channels):
         exact = _with_first_bounce(exact, T)

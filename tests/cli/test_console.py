@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import logging
 
 import numpy as np
 import pytest
@@ -62,6 +63,34 @@ def test_without_a_terminal_long_runs_say_where_they_are(
         steps.item("a.png")
         steps.item("b.png")
     assert capsys.readouterr().err == "ltcl: 1/2 a.png\nltcl: 2/2 b.png\n"
+
+
+def test_what_earlier_runs_have_done_is_no_pace(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([0.0, 0.5, 10.0, 20.0])
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    progress = console.Frames("patterns", settling=1.0)
+    for done in (100, 200, 210, 220):
+        progress(done, 300)
+    assert capsys.readouterr().err.splitlines() == [
+        "ltcl: 210 of 300 patterns, 1.1 a second, 0:01:25 left",
+        "ltcl: 220 of 300 patterns, 1.0 a second, 0:01:18 left",
+    ]
+
+
+def test_stages_are_told_and_warnings_are_not(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "_PATIENCE", -1.0)
+    logger = logging.getLogger("ltcl.acquisition.run")
+    with console.Frames("patterns") as progress, console.hearing("ltcl.acquisition", progress.at):
+        logger.info("calibration: %s", "noise")
+        logger.warning("a warning")
+    logger.info("afterwards")
+    lines = capsys.readouterr().err.splitlines()
+    assert "ltcl: calibration: noise" in lines
+    assert not any("afterwards" in line or line == "ltcl: a warning" for line in lines)
 
 
 def test_bar_follows_the_digits_gained() -> None:

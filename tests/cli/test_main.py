@@ -16,7 +16,7 @@ from ltcl.cli.main import as_options
 from .conftest import Program
 
 COMMANDS = [
-    *("devices", "doctor", "demo", "info", "analyze"),
+    *("devices", "doctor", "demo", "simulate", "info", "analyze"),
     *("convert", "compress", "invert", "compensate", "separate", "relight"),
 ]
 
