@@ -172,9 +172,8 @@ def scan(run: Run, progress: Progress) -> None:
         progress(done, total)
 
     columns.scan(run.pictures, run.code, run.store, run.wanted.sigmas, tell)
-    columns.keep_first_bounce(run.store, run.wanted.sigmas)
     run.store.update(patterns=total)
-    run.store.finalize()
+    run.store.finalize(sigmas=run.wanted.sigmas)
 
 
 def _scan_cells(run: Run, progress: Progress) -> None:

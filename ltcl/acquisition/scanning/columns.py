@@ -88,26 +88,6 @@ def scan(
         tell(code.count(stop - start))
 
 
-def keep_first_bounce(store: BlockStore, sigmas: float) -> None:
-    """Commit the diagonal of T, of columns that are all there: 0 where it is not light, but noise.
-
-    A pixel whose own light is not told is one that S = T F^-1 must do without: 1 / F would be anything.
-    """
-    if "first_bounce" in store.extras:  # of a run that was killed behind it
-        return
-    F = np.zeros((store.layout.channels, store.layout.shape[0]))
-    for c in range(store.layout.channels):
-        for block in range(store.layout.blocks("columns")):
-            start, stop = store.layout.span(block, "columns")
-            matrix, variance = store.block(c, block, "columns")
-            assert variance is not None  # noqa: S101 - `_batch` writes it with every block
-            V = scipy.sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
-            F[c, start:stop] = thresholds.light(matrix.diagonal(start), V.diagonal(start), sigmas)
-    if "masked" not in store.extras:
-        store.extra("masked", np.asarray((F <= 0).any(axis=0)))
-    store.extra("first_bounce", F)
-
-
 def _batch(pictures: Pictures, code: Code, store: BlockStore, block: int, sigmas: float) -> None:
     start, stop = store.layout.span(block, "columns")
     taken = pictures.take(_lit(pictures.grid, code, store, block))

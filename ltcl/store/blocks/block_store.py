@@ -265,7 +265,9 @@ class BlockStore:
         self._final = (attributes | parts).get("final")
         self.layout = Layout.from_json((attributes | parts).get("ltcl"))
 
-    def finalize(self, *, memory: int | None = None, layout: Layout | None = None) -> None:
+    def finalize(
+        self, *, memory: int | None = None, sigmas: float = 0.0, layout: Layout | None = None
+    ) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
         Ended at any moment, it goes on from there when called again. Must not run beside writers.
@@ -274,6 +276,8 @@ class BlockStore:
         ----------
         memory : int, optional
             Bytes for the entries that are turned at once; 256 MiB when not given.
+        sigmas : float
+            Standard deviations by which the diagonal has to be above 0 to be a first bounce.
         layout : Layout, optional
             Of the store from then on, whose extra arrays take the place of all blocks ("compressed").
 
@@ -285,7 +289,7 @@ class BlockStore:
         if self.mode != "a":
             self._writable()
         with about(self.path):
-            finishing.finish(self, memory, layout or self.layout)
+            finishing.finish(self, memory, sigmas, layout or self.layout)
 
     def verify(self) -> None:
         """Read everything and compare all checksums; the first thing that is wrong is raised as FileError."""
