@@ -102,3 +102,14 @@ def refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, maskable:
         f"first_bounce is zero or negative at {len(pixels)} of {dark.shape[1]} pixels (row, column): "
         f"{listed}{more}; it must be positive; {advice}"
     )
+
+
+def certain(F: np.ndarray, variance: np.ndarray, sigmas: float) -> np.ndarray:
+    """`F` where it is above 0 by so many standard deviations, else 0: a pixel to be masked.
+
+    With noise for F, S = T F^-1 would be anything. What has a variance of NaN is not certain.
+
+    >>> certain(np.array([4.0, 2.0, -4.0, 4.0]), np.array([1.0, 1.0, 1.0, np.nan]), 3.0).tolist()
+    [4.0, 0.0, 0.0, 0.0]
+    """
+    return np.where(sigmas * np.sqrt(variance) < F, F, 0.0)

@@ -180,15 +180,15 @@ def scan(run: Run, progress: Progress) -> None:
 def _finish(run: Run, patterns: int) -> None:
     """Columns as rows that add up to white; what they added up to before is kept for the report."""
     store, white = run.store, run.pictures.white
-    columns.keep_mask(store, run.wanted.sigmas)
-    store.extra(balance.SUMS, np.stack([balance.sums(store, c) for c in range(run.pictures.channels)]))
+    if balance.SUMS not in store.extras:  # of a run that was killed behind it
+        store.extra(balance.SUMS, np.stack([balance.sums(store, c) for c in range(run.pictures.channels)]))
     store.update(patterns=patterns)
 
     def add_up(c: int, first: int, matrix: Any, variance: Any) -> tuple[Any, Any]:
         here = slice(first, first + matrix.shape[0])
         return balance.rows(matrix, variance, Picture(white.value[c, here], white.variance[c, here]))
 
-    store.finalize(change=add_up)
+    store.finalize(sigmas=run.wanted.sigmas, change=add_up)
 
 
 def _scan_cells(run: Run, progress: Progress) -> None:

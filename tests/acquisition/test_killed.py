@@ -21,7 +21,7 @@ from ltcl.store import BlockStore
 from .stopping import MADE, Moment, Nursery, Told
 
 KILLS = 25  # of each strategy
-LEAST = {"calibrating": 2, "scanning": 4, "storing": 4, "finalizing": 3}
+LEAST = {"calibrating": 3, "scanning": 3, "storing": 3, "finalizing": 3}
 _BEGUN = ("scanning", "storing", "finalizing")
 _REACH = {
     "calibrating": 1.0,
@@ -65,10 +65,9 @@ def whole(nursery: Nursery, folder: Path, strategy: str) -> Whole:
 
 
 def draw(rng: np.random.Generator, begun: bool, events: dict[str, int], so_far: Mapping[str, int]) -> Moment:
-    """A moment in one of the stages that are to come, most likely in one with few kills so far."""
-    stages = _BEGUN if begun else ("calibrating", *_BEGUN)
-    few = np.array([1.0 / (1 + so_far.get(stage, 0)) ** 2 for stage in stages])
-    stage = str(rng.choice(stages, p=few / few.sum()))
+    """A moment in one of the stages that are to come: that with the fewest kills so far."""
+    stages = rng.permutation(_BEGUN if begun else ("calibrating", *_BEGUN)).tolist()
+    stage = min(stages, key=lambda stage: so_far.get(stage, 0))
     how = str(rng.choice(["before", "inside", "behind", "outside"]))
     last = max(1, int(_REACH[stage] * events[stage]))
     return Moment(stage, int(rng.integers(1, last + 1)), how, float(rng.uniform(0, 0.02)))

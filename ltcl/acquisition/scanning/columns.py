@@ -88,25 +88,6 @@ def scan(
         tell(code.count(stop - start))
 
 
-def keep_mask(store: BlockStore, sigmas: float) -> None:
-    """Commit which pixels have no light of their own above noise, of columns that are all there.
-
-    A pixel whose own light is not told is one that S = T F^-1 must do without: 1 / F would be anything.
-    """
-    if "masked" in store.extras:  # of a run that was killed behind it
-        return
-    dark = np.zeros(store.layout.shape[0], bool)
-    for c in range(store.layout.channels):
-        for block in range(store.layout.blocks("columns")):
-            start, stop = store.layout.span(block, "columns")
-            matrix, variance = store.block(c, block, "columns")
-            assert variance is not None  # noqa: S101 - `_batch` writes it with every block
-            V = scipy.sparse.csr_array((variance, matrix.indices, matrix.indptr), shape=matrix.shape)
-            own = thresholds.light(matrix.diagonal(start), V.diagonal(start), sigmas)
-            dark[start:stop] |= own <= 0
-    store.extra("masked", dark)
-
-
 def _batch(pictures: Pictures, code: Code, store: BlockStore, block: int, sigmas: float) -> None:
     start, stop = store.layout.span(block, "columns")
     taken = pictures.take(_lit(pictures.grid, code, store, block))

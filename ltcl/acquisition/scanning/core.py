@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl.acquisition.scanning import thresholds
+from ltcl import first_bounces
 from ltcl.acquisition.scanning.adaptive import Core
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.store import BlockStore
@@ -41,7 +41,7 @@ def arrays(core: Core, mixing: np.ndarray | None = None, sigmas: float = 0.0) ->
     own, noise = (
         np.stack([diagonal(cells, part) for part in parts]) for parts in (matrices, core.matrices("variance"))
     )
-    F = thresholds.light(own, noise, sigmas)
+    F = first_bounces.certain(own, noise, sigmas)
     found: dict[str, Any] = {"grid": np.array(cells.grid), "first_bounce": F}
     if mixing is not None:
         found["mixing"] = mixing

@@ -49,15 +49,6 @@ def keep(value: np.ndarray, variance: np.ndarray, grid: tuple[int, int], sigmas:
     return kept
 
 
-def light(value: np.ndarray, variance: np.ndarray, sigmas: float) -> np.ndarray:
-    """`value` where it is above 0 by so many standard deviations, else 0; 0 where its variance is NaN.
-
-    >>> light(np.array([4.0, 2.0, -4.0, 4.0]), np.array([1.0, 1.0, 1.0, np.nan]), 3.0).tolist()
-    [4.0, 0.0, 0.0, 0.0]
-    """
-    return np.where((value > 0) & (value**2 > sigmas**2 * variance), value, 0.0)
-
-
 def _sides(grid: tuple[int, int]) -> list[int]:
     """4, 16, ... and the longer side of the grid."""
     most = max(grid)

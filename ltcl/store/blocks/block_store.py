@@ -267,7 +267,12 @@ class BlockStore:
         self.layout = Layout.from_json((attributes | parts).get("ltcl"))
 
     def finalize(
-        self, *, memory: int | None = None, layout: Layout | None = None, change: Change | None = None
+        self,
+        *,
+        memory: int | None = None,
+        sigmas: float = 0.0,
+        layout: Layout | None = None,
+        change: Change | None = None,
     ) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
@@ -277,6 +282,8 @@ class BlockStore:
         ----------
         memory : int, optional
             Bytes for the entries that are turned at once; 256 MiB when not given.
+        sigmas : float
+            Standard deviations by which the diagonal has to be above 0 to be a first bounce.
         layout : Layout, optional
             Of the store from then on, whose extra arrays take the place of all blocks ("compressed").
         change : function, optional
@@ -291,7 +298,7 @@ class BlockStore:
         if self.mode != "a":
             self._writable()
         with about(self.path):
-            finishing.finish(self, memory, layout or self.layout, change)
+            finishing.finish(self, memory, sigmas, layout or self.layout, change)
 
     def verify(self) -> None:
         """Read everything and compare all checksums; the first thing that is wrong is raised as FileError."""

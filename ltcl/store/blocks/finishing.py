@@ -11,7 +11,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse
 
+from ltcl import first_bounces
 from ltcl.errors import FileError
 from ltcl.store.blocks import aside, nodes, sealed, turning
 from ltcl.store.blocks.layout import Layout
@@ -23,25 +25,31 @@ _MEMORY = 1 << 28
 
 
 def finish(
-    store: BlockStore, memory: int | None, layout: Layout, change: turning.Change | None = None
+    store: BlockStore,
+    memory: int | None,
+    sigmas: float,
+    layout: Layout,
+    change: turning.Change | None = None,
 ) -> None:
     """See `BlockStore.finalize`."""
     if not store.final:
         if layout.kind == "blocks":
-            _finish_blocks(store, memory, change)
+            _finish_blocks(store, memory, sigmas, change)
         with aside.locked(store.path):
             store.rewrite(ltcl=layout.to_json(), final=_sums(store))
     _clear(store)
 
 
-def _finish_blocks(store: BlockStore, memory: int | None, change: turning.Change | None) -> None:
+def _finish_blocks(
+    store: BlockStore, memory: int | None, sigmas: float, change: turning.Change | None
+) -> None:
     if store.layout.orientation == "columns":
         if store.missing("rows"):
             refuse_missing(store, "columns")
         turning.turn(store, _MEMORY if memory is None else memory, change)
     refuse_missing(store, "rows")
     if store.layout.is_square and "first_bounce" not in store.extras:
-        _find_first_bounce(store)
+        _find_first_bounce(store, sigmas)
 
 
 def refuse_missing(store: BlockStore, orientation: str) -> None:
@@ -57,16 +65,19 @@ def _listed(missing: Sequence[tuple[int, int]]) -> str:
     return f"{len(missing)} block(s) (channel, block) {named}{more}"
 
 
-def _find_first_bounce(store: BlockStore) -> None:
-    """The diagonal of T, and which projector pixels have none, unless the store says so already."""
+def _find_first_bounce(store: BlockStore, sigmas: float) -> None:
+    """The diagonal of T, and which projector pixels have none."""
     F = np.zeros((store.layout.channels, store.layout.shape[1]))
     for channel in range(store.layout.channels):
         for block in range(store.layout.blocks()):
             start, stop = store.layout.span(block)
-            F[channel, start:stop] = store.block(channel, block, "rows").matrix.diagonal(start)
-    if "masked" not in store.extras:
+            T, variance = store.block(channel, block, "rows")
+            F[channel, start:stop] = T.diagonal(start)
+            if variance is not None and sigmas > 0:
+                V = scipy.sparse.csr_array((variance, T.indices, T.indptr), shape=T.shape)
+                F[channel, start:stop] = first_bounces.certain(T.diagonal(start), V.diagonal(start), sigmas)
+    if "masked" not in store.extras:  # of a run that was killed between the two
         store.extra("masked", np.asarray((F <= 0).any(axis=0)))
-    F[:, np.asarray(store.extra("masked"))] = 0.0
     store.extra("first_bounce", F)
 
 

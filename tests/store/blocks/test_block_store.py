@@ -269,3 +269,17 @@ def test_what_is_no_store(tmp_path: Path) -> None:
     zarr.create_group(tmp_path / "plain")
     with pytest.raises(FileError, match="not written by ltcl"):
         BlockStore.open(tmp_path / "plain")
+
+
+def test_a_diagonal_below_its_noise_is_no_first_bounce(tmp_path: Path) -> None:
+    """Variances of `fill` are 1, 2, ... in the order of the entries; only the first few are far above."""
+    for sigmas in (0.0, 0.5):
+        store = make(tmp_path / f"{sigmas}.zarr", shape=(12, 12), camera_grid=None, block_rows=5)
+        fill(store, with_variance=True, final=False)
+        store.finalize(sigmas=sigmas)
+        T = transport(12, 12)
+        F, sigma = T.diagonal(), np.sqrt(variance(T).diagonal())
+        wanted = np.where(sigmas * sigma < F, F, 0.0)
+        np.testing.assert_array_equal(store.extra("first_bounce"), wanted[None])
+        np.testing.assert_array_equal(store.extra("masked"), wanted <= 0)
+        assert (np.count_nonzero(wanted) < np.count_nonzero(F > 0)) == (sigmas > 0)
