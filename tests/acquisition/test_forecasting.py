@@ -67,6 +67,20 @@ def test_scans_are_as_far_off_as_was_forecast(tmp_path: Path, strategy: str) -> 
     assert 0.8 < np.sqrt(np.mean(np.square(seen))) < 1.25
 
 
+def test_compensated_pictures_are_as_far_off_as_their_pattern(tmp_path: Path) -> None:
+    """What the wall shows under the true transport, beside what the measured one was made to show."""
+    truth, ratios = corner(4), []
+    y, x = np.mgrid[:4, :8] / 8
+    desired = (0.25 + 0.1 * np.sin(7 * x + 4 * y)).astype(np.float32)
+    for seed in range(6):
+        path, made = tmp_path / f"{seed}.zarr", rig(4, seed=seed, **NOISY)
+        T = acquire(made, geometry="aligned", strategy="hadamard", store=path, response=LINE, sigmas=0.0)
+        pattern = ltcl.compensate(T, desired, rtol=1e-5).pattern
+        off = truth @ np.asarray(pattern, np.float64).ravel() - desired.ravel()
+        ratios.append(off / forecast_picture(path, pattern, draws=32).ravel())
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+
+
 @pytest.mark.parametrize("strategy", ["pixel", "hadamard", "adaptive"])
 def test_first_order_is_as_the_dense_difference(tmp_path: Path, strategy: str) -> None:
     """Each draw is E: bounces of T + E, computed anew, are as far off as the formula has it."""
