@@ -189,7 +189,7 @@ def test_resume_of_nothing_begins(program: Program, scan: Path) -> None:
 
 def test_finalize_needs_no_rig(program: Program, scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(BlockStore, "finalize", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+        patch.setattr(BlockStore, "finalize", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt()))
         assert program("acquire", "run", scan).code == 130
     Ending(monkeypatch, 1, OSError("there is no rig"))
     assert program("acquire", "finalize", scan, "--json").json["before"] is False
