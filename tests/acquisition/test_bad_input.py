@@ -66,7 +66,8 @@ def test_a_scene_that_is_all_saturated(given: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("code", [0, 7])
 def test_a_scene_that_gray_code_says_nothing_of(code: int) -> None:
-    refused(AcquisitionError, "the geometry: photographs", Constant(code), strategy="pixel")
+    given: dict[str, Any] = {"strategy": "pixel", "response": LINE}
+    refused(AcquisitionError, "the geometry: photographs", Constant(code), **given)
 
 
 @pytest.mark.parametrize("strategy", ["pixel", "hadamard", "adaptive"])
