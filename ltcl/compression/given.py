@@ -75,6 +75,7 @@ def _of_rows(T: Any, grid: Any, first_bounce: Any, device: Device | str | None, 
     for part in parts:
         if tuple(part.shape) != (n, n):
             raise InputError(f"T has shape {tuple(part.shape)}; it must be square, (N, N), to have an S")
+        part.rows(0, 1)  # of rows that end with the matrix nobody sees that one too many was given
     shape = checks.grid("grid", _grid(grid), n)
     chosen = device if isinstance(device, Device) else open_device(device)
     F = _first_bounce(parts, first_bounce, chosen, memory)

@@ -21,10 +21,9 @@ def product(S: Operator) -> Product | None:
 
     >>> import ltcl
     >>> from ltcl.operators import as_operator
-    >>> S = IdentityPlus(as_operator([[0.0, 0.5], [0.5, 0.0]]))
-    >>> times = product(S)
-    >>> (times(np.array([[1.0], [1e-9]])) - 0.5).ravel().tolist()
-    [0.5000000005, 1e-09]
+    >>> times = product(IdentityPlus(as_operator([[0.0, 0.5], [0.5, 0.0]])))
+    >>> times(np.array([[1.0], [1e-9]])).ravel().tolist()
+    [1.0000000005, 0.500000001]
     """
     if isinstance(S, Host):
         return lambda x: np.asarray(S.operator @ x, np.float64)
