@@ -16,7 +16,6 @@ from ltcl.compression.streamed import Streamed
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import Operator, ScaledColumns, Shifted
-from ltcl.operators.interreflection import made_with
 from ltcl.transport import Transport, require
 
 
@@ -42,9 +41,9 @@ def given(T: Any, grid: Any, first_bounce: Any, device: Device | str | None, mem
     return _of_rows(T, grid, first_bounce, device, memory)
 
 
-def as_it_stands(T: Transport) -> Given:
+def as_it_stands(T: Transport, memory: int | None = None) -> Given:
     """A transport that may be compressed: its R~ is what is written, by products with it."""
-    problems = [Problem(source("R of T", S.R), S.R, T.grid) for S in T.systems]
+    problems = [Problem(source("R of T", S.R), S.R, T.grid, memory) for S in T.systems]
     return Given(problems, np.atleast_2d(T.first_bounce), T.grid, T.nbytes, bool(T.masked.any()), T.mixing)
 
 
@@ -53,10 +52,12 @@ def _of_transport(T: Transport, memory: int | None, others: dict[str, Any]) -> G
         if value is not None:
             raise InputError(f"{name} is given, but T is a Transport, which has its own; leave it out")
     require(T)
-    if any(made_with(matrix) is not None for matrix in T.matrices):
+    if T.error > 0.0:
         raise InputError(
             f"T is compressed already, with an error of {T.error:.2g}; compress what it came from"
         )
+    if T.is_compressed:  # but exact, as of an adaptive scan
+        return as_it_stands(T, memory)
     F = np.atleast_2d(T.first_bounce)
     rows = [Interreflection(source("T", matrix), f) for matrix, f in zip(T.matrices, F, strict=True)]
     try:

@@ -138,6 +138,8 @@ def test_the_core_is_inverted_from_products_with_it(device: Any) -> None:
     found = scan(Known(T, grid), threshold=0.03)
     made = assemble(core.arrays(found.core), device=device)
     S = dense(found)[0] / made.first_bounce
+    C = ltcl.compress(made, 0.05)
+    assert np.linalg.norm(np.linalg.inv(C.systems[0].to_dense()) @ S - np.eye(35), 2) <= C.error <= 0.05
     for basis in (("db2", "pixels"), "pixels"):
         inverse = ltcl.invert(made, 1e-2, basis=basis)
         A = inverse.systems[0].R.to_dense()
