@@ -85,9 +85,11 @@ def compress(
     ------
     InputError
         A T that is not square, compressed already with some error, or does not fit the grid; rtol not between
-        0 and 1, or below what float32 keeps; a basis that is not orthonormal; a budget that is too small: the message has
-        what this tolerance needs, and the least one that fits, to a tenth of it, which takes a few
-        compressions to find.
+        0 and 1, or below what float32 keeps; a basis that is not orthonormal; a budget that is too small: the
+        message has what this tolerance needs, and the least one that fits, to a tenth of it, which takes a
+        few compressions to find.
+    ConvergenceError
+        S is singular, or nearly so.
 
     Notes
     -----
