@@ -22,6 +22,14 @@ class InputTypeError(LtclError, TypeError):
     """An argument is of an unusable type, or an unknown option was given."""
 
 
+class ToleranceError(InputError):
+    """A tolerance is below what float32 keeps; `least` is about what it does, infinite where not known."""
+
+    def __init__(self, message: str, least: float) -> None:
+        super().__init__(message)
+        self.least = least
+
+
 class FileError(InputError, OSError):
     """A file is missing, truncated, lies about its size, or has an unknown format."""
 

@@ -111,8 +111,8 @@ def separate(
         Of `ltcl.solve`; rtol is per bounce, 1e-3 when not given, or what a compressed T or an inverse is
         off by where that is more.
     exact : Transport, optional
-        The uncompressed transport that a compressed T stands for: T then solves, to any `rtol`, and all that
-        is told is of `exact`.
+        The uncompressed transport that a compressed T stands for: T then solves, to an `rtol` as `ltcl.solve`
+        says, and all that is told is of `exact`.
     inverse : Inverse, optional
         Of T, as `ltcl.invert` makes it: each bounce is then one product, and `rtol` the error it may have.
 

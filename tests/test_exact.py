@@ -211,6 +211,26 @@ def test_compensation_beside_the_exact_one(device, kind, gain):
     assert ours.error == pytest.approx(theirs.error, abs=1e-4)
 
 
+@pytest.mark.parametrize("kind", [pair, colour])
+@pytest.mark.parametrize("rtol", [1e-7, 1e-10])
+def test_tasks_beside_the_exact_one_below_float32(device, kind, rtol):
+    """Solutions as they are before a picture is rounded: those of T itself by a factorization in float64."""
+    C, T = kind(device)
+    desired = T @ rng.uniform(0.2, 0.8, GRID)  # within the bounds
+    ours, theirs = (
+        ltcl.compensate(C, desired, exact=T, rtol=rtol),
+        ltcl.compensate(T, desired, method="direct"),
+    )
+    np.testing.assert_allclose(ours.pattern, theirs.pattern, rtol=1e-6)
+    image = T @ rng.uniform(0.2, 0.8, GRID)
+    ours, theirs = ltcl.separate(C, image, 2, exact=T, rtol=rtol), ltcl.separate(T, image, 2, method="direct")
+    np.testing.assert_allclose(ours.direct, theirs.direct, rtol=1e-5)
+    for one in ours.solutions:
+        for s in one if isinstance(one, tuple) else (one,):
+            assert s.converged
+            assert s.residual <= rtol
+
+
 def test_beyond_the_projector(device):
     """Least squares within the bounds takes products with the transpose, compressed ones or exact."""
     C, T = pair(device)

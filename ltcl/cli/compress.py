@@ -73,7 +73,7 @@ def run(
         raise InputError(f"--out is {out}; a compressed transport must be a .npz or a .zarr")
     transports.refuse_same(out, file)
     T = transports.load(file, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
-    if T.is_compressed:
+    if T.is_compressed and T.error:
         error = f"with an error of {T.error:.2g}"
         raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
     with console.Steps(1) as steps:

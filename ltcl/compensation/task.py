@@ -71,8 +71,8 @@ def compensate(
         gain * desired - background. Where no bound holds, noise of a method that samples stays; it is part of
         `error` and `gap`, and makes the gain that gain="auto" finds smaller.
     exact : Transport, optional
-        The uncompressed transport that a compressed T stands for: T then solves, to any `rtol`, and
-        everything else is of `exact`.
+        The uncompressed transport that a compressed T stands for: T then solves, to an `rtol` as
+        `ltcl.solve` says, and everything else is of `exact`; the pattern itself is rounded to float32, 6e-8.
     inverse : Inverse, optional
         Of T, as `ltcl.invert` makes it: the light without bounds is then one product, whatever the method.
     clamp : bool

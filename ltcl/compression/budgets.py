@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a budget of bytes holds: the best of a tolerance, else the least tolerance that fits into it.
+"""What a budget of bytes holds: the best of a tolerance, else about the least tolerance that fits into it.
 
 Sizes are of what was made, as it would be handed out; nothing is refused on an estimate.
 """
@@ -28,7 +28,7 @@ def within(make: Make, rtol: float, budget: int | None) -> Sequence[Made]:
     Raises
     ------
     InputError
-        They do not fit; it says what they need, and the least tolerance that does.
+        They do not fit; it says what they need, and the least tolerance that does, to a tenth of it.
     """
     made = make(rtol, math.inf if budget is None else budget)
     if budget is None or _bytes(made) <= budget:

@@ -22,7 +22,7 @@ from ltcl.compression.inverse_norm import inverse_norm
 from ltcl.compression.kinds import Kind
 from ltcl.compression.magnitudes import Magnitudes
 from ltcl.compression.result import Trial
-from ltcl.errors import ConvergenceError, InputError, MemoryLimitError
+from ltcl.errors import ConvergenceError, MemoryLimitError, ToleranceError
 from ltcl.operators import Compressed, IdentityPlus, Sum
 
 DROPPING, ROUNDING = 0.9, 0.05  # of the goal, for what is dropped and for the rounding of the core
@@ -81,7 +81,7 @@ def choose(
 
     Raises
     ------
-    InputError
+    ToleranceError
         Float32 does not keep the tolerance; it says which it does.
     """
     if all(name.endswith(kinds.SUM) for name in names):
@@ -97,7 +97,8 @@ def choose(
     if not survey.candidates:
         least = survey.least()
         kept = f"the least that it does is {checks.upwards(least)}" if least < 1.0 else "nor any below 1"
-        raise InputError(f"rtol is {rtol:g}, which float32 does not keep for this T; {kept}")
+        why = f"rtol is {rtol:g}, which float32 does not keep for this T; {kept}"
+        raise ToleranceError(why, least)
     smallest = min(survey.candidates, key=lambda one: one.core.nbytes)
     fits = [one for one in survey.candidates if one.core.nbytes <= budget] or [smallest]
     costs = [(one.seconds, one.core.nbytes) for one in fits]

@@ -25,7 +25,7 @@ from ltcl.compression.kinds import Kind
 from ltcl.compression.parted import Parted
 from ltcl.compression.result import ChannelCompression
 from ltcl.compression.sources import difference, source
-from ltcl.errors import InputError
+from ltcl.errors import ToleranceError
 from ltcl.operators import CSR, Compressed, IdentityPlus, Operator, Sum, Tiles
 from ltcl.theory import TwoNorm, two_norm
 
@@ -135,9 +135,11 @@ def confirm(
         if found.dropped > choice.DROPPING * goal:
             found = fit.gather(problem, kind, choice.GATHER * choice.DROPPING * goal, progress=progress)
         fitted = fit.fit(problem, kind, found, choice.DROPPING * goal, start)
-    raise InputError(
+    least = reached * rtol
+    raise ToleranceError(
         f"rtol is {rtol:g}, but after {_TRIES} attempts solutions may be off by "
-        f"{checks.upwards(reached * rtol)}; it must be larger"
+        f"{checks.upwards(least)}; it must be larger",
+        least,
     )
 
 

@@ -13,11 +13,10 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.compression.iterated import Iterated
+from ltcl.compression.iterated import Iterated, NoInverse
 from ltcl.compression.residual import Residual, certify
 from ltcl.compression.thresholds import above, norm_2, random_start, threshold_for
 from ltcl.device import Device
-from ltcl.errors import InputError
 from ltcl.solvers.result import Status
 
 _DENSE = 2.0e10  # additions and multiplications in a second of dense elimination, roughly, on two cores
@@ -28,12 +27,16 @@ _LARGEST = 8192  # rows
 _SHARE, _AIM, _LEAST, _MOST = 0.7, 0.8, 0.1, 0.7  # as of `iteration`
 
 
+def fits(C: Any) -> bool:
+    """Whether there is room and time for elimination."""
+    n = C.shape[0]
+    return n <= _LARGEST and 8 * _MATRICES * n * n < checks.host_memory()
+
+
 def pays(C: Any) -> bool:
     """Whether elimination takes less time than sparse products, and there is room for it."""
-    n = C.shape[0]
     multiplications = float(np.diff(C.indptr)[C.indices].sum(dtype=np.int64))
-    room = 8 * _MATRICES * n * n < checks.host_memory()
-    return n <= _LARGEST and room and 2.0 * n**3 / _DENSE < _PRODUCTS * multiplications / _SPARSE
+    return fits(C) and 2.0 * C.shape[0] ** 3 / _DENSE < _PRODUCTS * multiplications / _SPARSE
 
 
 def eliminate(C: Any, sign: float, rtol: float, device: Device) -> Iterated:
@@ -41,7 +44,7 @@ def eliminate(C: Any, sign: float, rtol: float, device: Device) -> Iterated:
 
     Raises
     ------
-    InputError
+    NoInverse
         I + sign C is singular.
     """
     exact = _exact(C, sign)
@@ -72,7 +75,7 @@ def _exact(C: Any, sign: float) -> Any:
         inverse = np.full((1, 1), np.nan)
     if not np.all(np.isfinite(inverse)):
         name = "I + C" if sign > 0 else "I - C"
-        raise InputError(f"{name} is singular; it must have an inverse: check the first bounce")
+        raise NoInverse(name, "is singular", "it must have an inverse: check the first bounce")
     inverse *= -sign
     inverse[np.diag_indices(n)] += sign
     return scipy.sparse.csr_array(inverse.astype(C.dtype))

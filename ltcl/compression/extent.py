@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse.linalg
 
-from ltcl.errors import InputError
+from ltcl.compression.iterated import NoInverse
 
 _DENSE = 64  # rows: fewer are quicker all at once, and ARPACK wants some
 _ACCURACY = 1e-2  # of an eigenvalue
@@ -24,7 +24,7 @@ def extent(C: Any, sign: float) -> tuple[float, float]:
 
     Raises
     ------
-    InputError
+    NoInverse
         The lower one is not above 0.
 
     Examples
@@ -38,9 +38,11 @@ def extent(C: Any, sign: float) -> tuple[float, float]:
     lower, upper = sorted((1.0 + sign * least, 1.0 + sign * most))
     if not lower > 0.0:
         name = "I + C" if sign > 0 else "I - C"
-        raise InputError(
-            f"{name} has an eigenvalue of real part {lower:.3g}; all must be above 0, as of every scene: "
-            "check the first bounce, and whether C is R (sign 1) or A (sign -1)"
+        raise NoInverse(
+            name,
+            f"has an eigenvalue of real part {lower:.3g}",
+            "all must be above 0, as of every scene: check the first bounce, and whether C is R (sign 1) or "
+            "A (sign -1)",
         )
     room = _WIDER * (upper - lower)
     return max(lower - room, lower / 2.0, _LEAST * upper), upper + room

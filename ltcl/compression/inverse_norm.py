@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from ltcl.device import Array
+from ltcl.errors import ConvergenceError
 from ltcl.operators import Compressed, IdentityPlus, Operator
 from ltcl.solvers import solve
 from ltcl.theory.norms import CONFIDENCE, TwoNorm, two_norm
@@ -62,6 +63,13 @@ class _Inverse(Operator):
         self._systems = (IdentityPlus(R, sign), IdentityPlus(R.T, sign))
 
     def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        solved = solve(self._systems[transpose], x.get(), "gmres", rtol=_RTOL, maxiter=_MAXITER).x
+        try:
+            solved = solve(self._systems[transpose], x.get(), "gmres", rtol=_RTOL, maxiter=_MAXITER).x
+        except ConvergenceError as error:
+            raise ConvergenceError(
+                "S is singular, or nearly so: a solve for the norm of its inverse left "
+                f"{error.solution.residual:.2g} of a light; check the first bounce",
+                error.solution,
+            ) from None
         product = scale * np.asarray(solved, np.float64)
         out.set(product if add is None else product + add.get())

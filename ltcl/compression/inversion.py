@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`invert`: A = I - S^-1 of a transport, once, so that every further frame costs one product.
 
-R is compressed, as `compress` does, in a basis that both sides share; A is found from its coefficients, as
-coefficients again (`iteration`), and stored in as few bytes as its own error allows. With e what solutions
-with R~ may be off by and g that of the inverse of S~ = I + R~,
+R is compressed, as `compress` does, in a basis that both sides share, and so is what was compressed in
+another form; A is found from its coefficients, as coefficients again (`iteration`), and stored in as few
+bytes as its own error allows. With e what solutions with R~ may be off by and g that of the inverse of
+S~ = I + R~,
 
     ||x~ - x|| <= ||x~ - x_R|| + ||x_R - x|| <= (g (1 + e) + e) ||x||,
 
@@ -23,14 +24,15 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.compression import cores, kinds
-from ltcl.compression.iteration import invert_coefficients
+from ltcl.compression.iterated import Iterated, NoInverse
+from ltcl.compression.iteration import METHODS, invert_coefficients
 from ltcl.compression.residual import Residual, certify
-from ltcl.compression.task import compress
+from ltcl.compression.rewriting import in_one_basis
 from ltcl.device import Device
-from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import CSR, Basis, Compressed, Dense, Host, IdentityPlus, Operator, Tiles, basis_of
-from ltcl.operators.interreflection import made_with
+from ltcl.errors import ConvergenceError, InputError, ToleranceError
+from ltcl.operators import CSR, Basis, Compressed, Host, IdentityPlus, Operator, Tiles, basis_of
 from ltcl.solvers import Inverse
+from ltcl.solvers.result import Status
 from ltcl.theory import two_norm
 from ltcl.transport import Transport, require
 
@@ -39,7 +41,9 @@ _SHARE = 0.4  # of the tolerance, for R
 _ITERATION = 0.9  # of the rest, for A; the last tenth is for rounding its core
 _UNIT = 2.0**-24  # rounding of float32
 _BOUNCES = 2.0  # |b| and |A| |b|, where A takes no more light than there is
-_CONFIDENCE = 1e-6  # what each of two bounds may fail with
+_CONFIDENCE = 1e-6  # what each bound on a norm may fail with
+_FLOOR = 100.0  # times what rounding leaves: an iteration that ended there has met it
+_LOOSER = 1.25  # times the tolerance, where float32 does not keep it
 
 Note = Callable[[str, float], object]
 
@@ -57,12 +61,13 @@ def invert(
     Parameters
     ----------
     T : Transport, square
-        Measured, or compressed already, in one basis on both sides.
+        Measured, or compressed already, in any form. What has wavelets on one side alone, is a sum, or was
+        scanned adaptively is written anew first, from N products with it; the error adds both losses.
     rtol : float
         Relative error that a solution may have, ``||x~ - x|| <= rtol ||x||`` for every picture.
     basis : str or sequence of str
-        In which A and R are written, "pixels" or an orthonormal wavelet; of several, the best. A compressed T
-        has its own.
+        In which A and R are written, "pixels" or an orthonormal wavelet; of several, the best. A T that was
+        compressed in one basis on both sides keeps it.
     method : str
         Of `compression.iteration.invert_coefficients`: "auto", "iteration" or "elimination".
     progress : callable(text, share), optional
@@ -76,7 +81,9 @@ def invert(
     Raises
     ------
     InputError
-        A T that is not square, an rtol below what a compressed T is worth, eigenvalues at or below 0.
+        A T that is not square, an rtol below what a compressed T is worth or float32 keeps, whose least is
+        told and takes a few inversions to find; a singular S, or one with eigenvalues at or below 0 by the
+        iteration.
     ConvergenceError
         The iteration did not end: S is singular, or nearly so.
 
@@ -92,28 +99,62 @@ def invert(
     """
     require(T)
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
-    note = progress or (lambda text, share: None)
-    compressed = any(made_with(matrix) is not None for matrix in T.matrices)
-    if compressed and rtol <= T.error:
+    checks.one_of("method", method, METHODS)
+    if T.is_compressed and rtol <= T.error:
         raise InputError(
             f"rtol is {rtol:g}, but T is compressed and its solutions may be off by "
             f"{checks.upwards(T.error)}; ask for more than that, or invert what T was compressed from"
         )
     names = _names(basis)
-    C = T
-    if not compressed and names != [kinds.PIXELS]:  # in pixels T has its numbers itself
-        C = compress(T, _SHARE * rtol, basis=names, progress=lambda text, share: note(text, share / 2))
+    try:
+        return _inverse(T, rtol, names, method, progress or _silent)
+    except ToleranceError as error:
+        least = _least(T, error.least, lambda looser: _inverse(T, looser, names, method, _silent))
+    kept = "nor any below 1" if least is None else f"the least that it does is {least:g}"
+    raise ToleranceError(
+        f"rtol is {rtol:g}, which float32 does not keep for the inverse of this T; {kept}", least or math.inf
+    )
+
+
+def _silent(text: str, share: float) -> None:
+    """Progress that nobody wants, as of what is tried only to tell a tolerance."""
+
+
+def _least(T: Transport, rtol: float, attempt: Callable[[float], object]) -> float | None:
+    """A tolerance that is kept, about the least, from `rtol` on.
+
+    What is told is looser than what was tried, since other times may choose another basis.
+    """
+    while True:
+        looser = T.error + _LOOSER * (rtol - T.error)
+        told = float(checks.upwards(looser))
+        if not told < 1.0:
+            return None
+        try:
+            attempt(rtol)
+        except ToleranceError as error:
+            rtol = max(error.least, looser)
+        else:
+            return told
+
+
+def _inverse(T: Transport, rtol: float, names: list[str], method: str, note: Note) -> Inverse:
+    """As `invert`, of what was checked; a ToleranceError tells about what it takes."""
+    try:
+        one = in_one_basis(T, _SHARE, rtol, names, lambda text, share: note(text, share / 2))
+    except ToleranceError as error:  # of the share of R
+        raise ToleranceError(str(error), T.error + error.least * (1.0 + T.error) / _SHARE) from None
     found, own = [], functools.cache(_anew)
-    for channel, S in enumerate(C.systems):
-        found.append(_invert(S, rtol, method, own))
-        note("inverted", 0.5 + 0.5 * (channel + 1) / C.channels)
+    for channel, (S, off) in enumerate(zip(one.systems, one.errors, strict=True)):
+        found.append(_invert(S, off, rtol, method, own))
+        note("inverted", 0.5 + 0.5 * (channel + 1) / T.channels)
     return Inverse(
         [A for A, _ in found],
         [error for _, error in found],
         T.grid,
         T.first_bounce,
         T.mixing,
-        confidence=1.0 - 3 * _CONFIDENCE,
+        confidence=1.0 - (one.norms + 1) * _CONFIDENCE,
     )
 
 
@@ -125,23 +166,46 @@ class _Coefficients:
     basis: Basis | None
 
 
-def _invert(S: IdentityPlus, rtol: float, method: str, own: Callable) -> tuple[Operator, float]:
-    """A of one channel, and what solutions may be off by; `own` gives the basis of A for that of R."""
-    R, off = _coefficients(S), S.solution_error
+def _invert(S: IdentityPlus, off: float, rtol: float, method: str, own: Callable) -> tuple[Operator, float]:
+    """A of one channel whose S is `off`, and what solutions may be off by.
+
+    `own` gives the basis of A for that of R.
+    """
+    R = _coefficients(S)
     norm = max(1.0, _norm(R.matrix, 1.0, S.device))  # beside active coefficients, S is the identity
     rounding = _UNIT * math.sqrt(S.shape[0]) * norm  # of x relative to x, for every unit of |b| + |A| |b|
-    rest = (rtol - off - _BOUNCES * rounding) / (1.0 + off)
+    least = off + _BOUNCES * rounding
+    rest = (rtol - least) / (1.0 + off)
     if rest <= 0.0:
-        least = checks.upwards(off + _BOUNCES * rounding)
-        raise InputError(
-            f"rtol is {rtol:g}, but float32 leaves products off by {least}; it must be above that"
-        )
-    A = invert_coefficients(R.matrix, rtol=_ITERATION * rest, method=method, device=S.device)
+        raise ToleranceError("nothing is left for A", least)
+    A = _bounce(R.matrix, _ITERATION * rest, method, S.device)
+    _require(A, _FLOOR * rounding, least)
     core, error = _stored(R.matrix, A.D, A.error, rest, norm, S.device)
     size = _norm(core.matrix(), -1.0, S.device)
-    error = error * (1.0 + off) + off + _BOUNCES * rounding
+    error = error * (1.0 + off) + least
     # Of X = I - A~ and A~ - A = (I - X S) S^-1, where ||I - X S|| <= error.
     return Compressed(core, own(R.basis), own(R.basis), error=error / (1.0 - error) * size), error
+
+
+def _bounce(R: Any, rtol: float, method: str, device: Device) -> Iterated:
+    """A of R, within `rtol` or as near as it came, or a refusal in words of T."""
+    try:
+        return invert_coefficients(R, rtol=rtol, method=method, device=device)
+    except NoInverse as error:
+        other = "" if "singular" in error.why else ", or give method='elimination', which is dense, N x N"
+        raise InputError(f"S of T {error.why}, as of no scene: check the first bounce{other}") from None
+    except ConvergenceError as error:
+        return error.solution
+
+
+def _require(A: Iterated, floor: float, least: float) -> None:
+    """Refuse an A that did not converge: for float32 where its error is below the `floor`."""
+    if A.converged:
+        return
+    if A.status is Status.STAGNATED or A.error <= floor:
+        raise ToleranceError("float32 has no more digits of A", least + A.error)
+    ended = f"{A.method} {A.status.name.lower()} after {A.products} products, error {A.error:.2g}"
+    raise ConvergenceError(f"S of T was not inverted: {ended}; give method='elimination', or loosen rtol", A)
 
 
 def _stored(
@@ -163,32 +227,12 @@ def _norm(C: Any, sign: float, device: Device) -> float:
 
 
 def _coefficients(S: IdentityPlus) -> _Coefficients:
-    """R between equal bases, as numbers on the host.
-
-    Raises
-    ------
-    InputError
-        Two bases that differ.
-    InputTypeError
-        Operators whose numbers are not at hand.
-    """
+    """R, of which `rewriting.at_hand` holds, as numbers on the host."""
     R, basis = S.R, None
     if isinstance(R, Compressed):
-        if R.out is not R.into:
-            raise InputError(
-                "T is compressed between two bases that differ; it must be in one, such as "
-                "ltcl.compress(T, basis='db2') has it, or uncompressed"
-            )
         R, basis = R.core, R.out
-    if isinstance(R, (CSR, Tiles)):
-        matrix = R.matrix().astype(np.float32)
-    elif isinstance(R, Dense):
-        matrix = scipy.sparse.csr_array(R.to_dense())
-    else:
-        raise InputTypeError(
-            f"R of T is a {type(R).__name__}, whose numbers are not at hand; invert it before"
-        )
-    return _Coefficients(matrix, basis)
+    matrix = R.matrix() if isinstance(R, (CSR, Tiles)) else R.to_dense()
+    return _Coefficients(scipy.sparse.csr_array(matrix).astype(np.float32), basis)
 
 
 def _anew(W: Basis | None) -> Basis | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from ltcl.errors import InputError
 from ltcl.solvers.result import Status
 
 _ADVICE = {
@@ -13,6 +14,14 @@ _ADVICE = {
     Status.DIVERGED: "the residual grew; try method='elimination', or a wider spectrum=",
     Status.STAGNATED: "the type of C has no more digits; loosen rtol, or give C in float64",
 }
+
+
+class NoInverse(InputError):
+    """I + sign C has none that the method finds; `why` is what was found, without a name before it."""
+
+    def __init__(self, name: str, why: str, advice: str) -> None:
+        super().__init__(f"{name} {why}; {advice}")
+        self.why = why
 
 
 @dataclass(frozen=True, eq=False)

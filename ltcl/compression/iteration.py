@@ -35,7 +35,7 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.compression import elimination
 from ltcl.compression.extent import extent
-from ltcl.compression.iterated import Iterated
+from ltcl.compression.iterated import Iterated, NoInverse
 from ltcl.compression.residual import Residual, certify
 from ltcl.compression.row_blocks import cuts
 from ltcl.compression.thresholds import above, norm_2, random_start, threshold_for
@@ -77,7 +77,8 @@ def invert_coefficients(
     rtol : float
         Relative error that a solution with I - sign D may have, for every right-hand side.
     method : str
-        "iteration"; "elimination", dense, on the host; or "auto": whichever is estimated to take less time.
+        "iteration"; "elimination", dense, on the host; or "auto": whichever is estimated to take less time,
+        and, where there is room, elimination of what the iteration cannot invert.
     spectrum : (lower, upper), optional
         Between which the real parts of the eigenvalues of I + sign C lie; found by Arnoldi's method when
         not given. (1, 1) is eq. 21.
@@ -96,7 +97,8 @@ def invert_coefficients(
     Raises
     ------
     InputError, InputTypeError
-        No square sparse matrix, or eigenvalues at or below 0: no scene has those.
+        No square sparse matrix; a singular one; eigenvalues at or below 0, which no scene has, where the
+        iteration has to do.
     ConvergenceError
         Divergence, or `maxiter` reached; ``.solution`` holds what there is.
 
@@ -120,17 +122,39 @@ def invert_coefficients(
     checks.one_of("method", method, METHODS)
     C, sign = _square(C), float(sign)
     device = device if device is not None else open_device()
-    if method == "elimination" or (method == "auto" and spectrum is None and elimination.pays(C)):
+    free = method == "auto" and spectrum is None
+    found = None
+    if method != "elimination" and not (free and elimination.pays(C)):
+        found = _iterated(C, sign, spectrum, rtol, device, maxiter, callback, free and elimination.fits(C))
+    if found is None:
         found = elimination.eliminate(C, sign, rtol, device)
         if callback is not None:
             callback(0, found.residuals[-1])
-    else:
-        bounds = extent(C, sign) if spectrum is None else _given(spectrum)
-        found = _Run(C, sign, bounds, rtol, device).until(maxiter, callback)
     found = dataclasses.replace(found, seconds=time.perf_counter() - start)
     if throw and not found.converged:
         raise ConvergenceError(str(found), found)
     return found
+
+
+def _iterated(
+    C: Any,
+    sign: float,
+    spectrum: Any,
+    rtol: float,
+    device: Device,
+    maxiter: int,
+    callback: Progress | None,
+    optional: bool,
+) -> Iterated | None:
+    """By the iteration; None where it is `optional` and does not get there."""
+    try:
+        bounds = extent(C, sign) if spectrum is None else _given(spectrum)
+    except NoInverse:
+        if optional:
+            return None
+        raise
+    found = _Run(C, sign, bounds, rtol, device).until(maxiter, callback)
+    return None if optional and not found.converged else found
 
 
 class _Run:

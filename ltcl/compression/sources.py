@@ -81,7 +81,8 @@ class _Sliced:
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         part = self.matrix[start:stop]
-        return part.toarray() if scipy.sparse.issparse(part) else np.asarray(part)
+        found = part.toarray() if scipy.sparse.issparse(part) else np.asarray(part)
+        return _wanted(f"{self.name}[{start}:{stop}]", found, (stop - start, self.shape[1]))
 
 
 @dataclass(frozen=True)
@@ -96,11 +97,16 @@ class _Told:
         return self.matrix.shape
 
     def rows(self, start: int, stop: int) -> np.ndarray:
-        call, wanted = f"{self.name}.rows({start}, {stop})", (stop - start, self.shape[1])
+        call = f"{self.name}.rows({start}, {stop})"
         found = checks.real(call, self.matrix.rows(start, stop))
-        if found.shape != wanted:
-            raise InputError(f"{call} gave shape {found.shape}; it must be {wanted}")
-        return found
+        return _wanted(call, found, (stop - start, self.shape[1]))
+
+
+def _wanted(call: str, found: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Neither more nor fewer numbers than were asked for."""
+    if found.shape != shape:
+        raise InputError(f"{call} gave shape {found.shape}; it must be {shape}")
+    return found
 
 
 @dataclass(frozen=True)

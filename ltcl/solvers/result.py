@@ -58,7 +58,8 @@ class Solution:
 
     Attributes
     ----------
-    x : like b, float32 (float64 of method "direct", and of values beyond float32)
+    x : like b, float32 (float64 of method "direct", of values beyond float32, and of what `exact` refined to
+        a tolerance below 1e-6)
         The solution; where `converged` is False, the iterate with the smallest residual, or what was sampled.
         Of `pixels=` (P,) or (P, k), in their order; of three S (3, P) or (3, P, k).
     status : Status

@@ -15,13 +15,13 @@ import numpy as np
 
 from ltcl.device import Array
 from ltcl.operators import Operator
-from ltcl.solvers import auto, coefficients, refinement, sampled, units
+from ltcl.solvers import auto, coefficients, double, refinement, sampled, units
 from ltcl.solvers.direct import Direct
 from ltcl.solvers.hybrid import Hybrid
 from ltcl.solvers.monte_carlo import MonteCarlo
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.sampled import Channel
-from ltcl.solvers.stopping import Rule, System
+from ltcl.solvers.stopping import Monitor, Rule, System
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,14 +70,37 @@ def run(method: Any, given: Problem) -> Solution:
         return _run_direct(method, given.S, given.b, given.rule)
     if isinstance(method, MonteCarlo | Hybrid):
         return sample(method, [given])[0]
+    found = _in_double(method, given)
+    if found is not None:
+        return found
     light, guess, rule, unit = _uploaded(given)
     if given.exact is None:
         x, monitor = coefficients.iterate(method, given.S, light, guess, rule)
     else:
         x, monitor = refinement.iterate(method, given.S, given.exact, light, guess, rule)
+    return _solution(method, units.restored(x.get(), unit), monitor)
+
+
+def _in_double(method: Any, given: Problem) -> Solution | None:
+    """Refined in float64, where the tolerance asks for that and the numbers of the exact S are at hand."""
+    if given.exact is None or wanted(given.b, given.rule) >= refinement.FINE:
+        return None
+    product = double.product(given.exact)
+    if product is None:
+        return None
+    unit = units.of(given.b)
+    guess = None if given.guess is None else given.guess / unit
+    rule = dataclasses.replace(given.rule, atol=given.rule.atol / unit)
+    x, monitor = refinement.iterate_in_double(
+        method, given.S, given.exact, product, given.b / unit, guess, rule
+    )
+    return _solution(method, x * unit, monitor)
+
+
+def _solution(method: Any, x: np.ndarray, monitor: Monitor) -> Solution:
     assert monitor.status is not None  # noqa: S101 - iterate returns only when the monitor said so
     return Solution(
-        units.restored(x.get(), unit),
+        x,
         monitor.status,
         monitor.iterations,
         monitor.system.products,

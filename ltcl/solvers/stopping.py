@@ -32,8 +32,10 @@ class System:
     """S x = b on the device, counting products.
 
     `whole` is what tolerances are relative to: b, or, where S and b are a part of a system whose other part
-    is solved already, the b of both.
+    is solved already, the b of both. `least` is the relative residual that is rounding alone.
     """
+
+    least = _ROUNDING
 
     def __init__(self, S: Operator, b: Array, whole: Array | None = None) -> None:
         self.S = S
@@ -73,7 +75,7 @@ class Monitor:
     A method calls `done(x, r)` once an iteration, with the residual `r` of `x`. A method that keeps its
     residual by recursion passes ``recursive=True``, and it is recomputed before convergence is claimed and
     wherever rounding may have parted the two; with ``replace=True`` the recomputed one is left in `r`.
-    Tolerances below the rounding of float32 are never claimed.
+    Tolerances below the rounding of the system, that of float32, are never claimed.
 
     A method that needs no numbers on the host passes ``lazy=True``: then its residuals wait on the device,
     and several are read at once where the tolerance may have been met, or after 8 steps. `factor` is what a
@@ -96,7 +98,7 @@ class Monitor:
         self._history = History(self.system.b, self._scale)
         self._ahead: int | None = None  # steps from the last reading to the next, once foreseen
         self._target = np.maximum(self.rule.rtol * norms, self.rule.atol)
-        self._reachable = bool(np.all(self._target >= _ROUNDING * norms))
+        self._reachable = bool(np.all(self._target >= self.system.least * norms))
         self._trusted = np.maximum(self._target, _DRIFT * norms)
         self.norms = norms
         self.unsolved = np.ones(norms.shape, bool)
@@ -218,8 +220,8 @@ class Monitor:
         grown = residual > _GROWTH * first or (self._rises >= _RISES and residual > first)
         if grown or not np.isfinite(residual):
             return Status.DIVERGED
-        if not self._reachable and residual <= _ROUNDING:
-            return Status.STAGNATED  # all that float32 can tell
+        if not self._reachable and residual <= self.system.least:
+            return Status.STAGNATED  # all that its numbers can tell
         waited = self.iterations - self._lowest_at
         if (waited >= _PATIENCE and self.lowest < _DRIFT) or self._stalled():
             return Status.STAGNATED

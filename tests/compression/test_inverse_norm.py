@@ -54,5 +54,5 @@ def test_coefficients_have_the_norm_of_pixels(device):
 def test_a_singular_system_is_no_bound(device):
     R = -np.eye(8)
     R[0, 1] = 1.0
-    with pytest.raises(ConvergenceError):
+    with pytest.raises(ConvergenceError, match=r"^S is singular, or nearly so: .*; check the first bounce$"):
         inverse_norm(IdentityPlus(Dense(device, R)))

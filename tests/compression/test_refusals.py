@@ -57,14 +57,36 @@ def test_a_basis_is_a_name_or_several(task, basis):
 @pytest.mark.parametrize("first_bounce", [None, np.ones(128)])
 def test_rows_must_be_what_the_shape_says(first_bounce):
     given = {"grid": (8, 16), "first_bounce": first_bounce, "memory": 32 * 128 * 64}
-    with pytest.raises(InputError, match=r"^T\.rows\(0, 64\) gave shape \(64, 3\); it must be \(64, 128\)$"):
+    with pytest.raises(InputError, match=r"^T\.rows\(0, 1\) gave shape \(1, 3\); it must be \(1, 128\)$"):
         ltcl.compress(Rows(3), **given)
-    with pytest.raises(InputTypeError, match=r"^T\.rows\(0, 64\) holds complex128; it must hold real"):
+    with pytest.raises(InputTypeError, match=r"^T\.rows\(0, 1\) holds complex128; it must hold real"):
         ltcl.compress(Rows(dtype=complex), **given)
     wrong = Rows()
     wrong.shape = 128
     with pytest.raises(InputError, match=r"^T has shape 128; it must be \(M, N\)$"):
         ltcl.compress(wrong, **given)
+
+
+@pytest.mark.parametrize("more", [1, 100])
+@pytest.mark.parametrize("first_bounce", [None, np.ones(128)])
+@pytest.mark.parametrize("basis", [None, "db2"])
+def test_rows_are_no_more_than_were_asked_for(more, first_bounce, basis):
+    """Also where all are asked for at once, of which a slice has no more than there are."""
+
+    class Generous(Rows):
+        def rows(self, start: int, stop: int) -> np.ndarray:
+            return np.eye(128)[start : stop + more]
+
+    class Sliced:
+        shape, dtype = (128, 128), np.dtype(float)
+
+        def __getitem__(self, key: slice) -> np.ndarray:
+            return np.eye(128)[key.start : key.stop + more]
+
+    for T, call in ((Generous(), r"T\.rows\(0, 1\)"), (Sliced(), r"T\[0:1\]")):
+        text = rf"^{call} gave shape \({1 + more}, 128\); it must be \(1, 128\)$"
+        with pytest.raises(InputError, match=text):
+            ltcl.compress(T, grid=(8, 16), first_bounce=first_bounce, basis=basis)
 
 
 @pytest.mark.parametrize("make", [corner, lambda: ltcl.scenes.box(4, sides=3, albedo=0.7).transport()])

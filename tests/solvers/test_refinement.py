@@ -11,7 +11,7 @@ import ltcl
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, as_operator
 from ltcl.solvers import Status
-from tests.bases import stands_for, two_sided
+from tests.bases import Given, stands_for, two_sided
 from tests.problems import enclosure, lambertian, residual
 from tests.solvers.helpers import METHODS
 
@@ -115,12 +115,56 @@ def test_a_step_that_fails_ends_the_solve_and_says_why(device):
     assert s.status is Status.BREAKDOWN
 
 
-def test_what_float32_cannot_tell_is_not_claimed(device):
-    s = ltcl.solve(
-        _compressed(device), rng.uniform(0.0, 1.0, N), "gmres", rtol=1e-9, exact=S_EXACT, throw=False
+@pytest.mark.parametrize("rtol", [5e-7, 1e-7, 1e-9, 1e-13])
+@pytest.mark.parametrize("kind", EXACT)
+def test_below_float32_it_refines_in_float64(device, kind, rtol):
+    """Against the operator as it stands: its numbers are float32, but for those of a LinearOperator."""
+    given = EXACT[kind](device)
+    S = {"LinearOperator": S_EXACT, "operator": np.eye(N) + SCENE.R.astype(np.float32)}.get(
+        kind, S_EXACT.astype(np.float32).astype(np.float64)
     )
+    for b in (rng.uniform(0.0, 1.0, N), rng.uniform(0.0, 1.0, (N, 5)) * 10.0 ** np.arange(-20, 5, 5)):
+        for method in ("auto", "gmres"):
+            s = ltcl.solve(_compressed(device), b, method, rtol=rtol, exact=given)
+            assert s.converged
+            assert s.x.dtype == np.float64
+            left = np.linalg.norm(b - S @ s.x, axis=0) / np.linalg.norm(b, axis=0)
+            assert np.all(left <= rtol * (1 + 1e-2))
+            assert s.residual == pytest.approx(np.max(left), rel=1e-2, abs=1e-16)
+
+
+@pytest.mark.parametrize("columns", [(), (1,), (5,)])
+def test_a_start_in_float64_is_kept(device, columns):
+    b = rng.uniform(0.5, 1.0, (N, *columns))
+    x = np.linalg.solve(S_EXACT.astype(np.float32).astype(np.float64), b)
+    s = ltcl.solve(_compressed(device), b, "gmres", rtol=1e-12, exact=S_EXACT, x0=x)
+    assert s.iterations == 0
+    np.testing.assert_array_equal(s.x, x)
+
+
+def _on_the_device(device):
+    """An S whose numbers are nowhere on the host: pixels, but in a basis."""
+    W = Given(device, np.eye(N))
+    return IdentityPlus(Compressed(Dense(device, SCENE.R), W, W))
+
+
+@pytest.mark.parametrize(
+    ("make", "rtol", "most"), [(_on_the_device, 1e-9, 1e-6), (lambda device: S_EXACT, 1e-17, 1e-15)]
+)
+@pytest.mark.parametrize("method", ["gmres", "auto"])
+def test_what_rounding_leaves_is_told_with_a_tolerance_that_works(device, make, rtol, most, method):
+    b, exact = rng.uniform(0.0, 1.0, N), make(device)
+    S = _compressed(device)
+    s = ltcl.solve(S, b, method, rtol=rtol, exact=exact, throw=False)
     assert s.status is Status.STAGNATED
-    assert s.residual < 1e-6
+    assert s.residual < most
+    with pytest.raises(ConvergenceError) as refused:
+        ltcl.solve(S, b, method, rtol=rtol, exact=exact)
+    text = str(refused.value)
+    assert text.startswith(f"rtol is {rtol:g}, but products with exact= are rounded, which left ")
+    least = float(text.rpartition("; the least that can be asked is ")[2])
+    assert rtol < least < most
+    assert ltcl.solve(S, b, method, rtol=least, exact=exact).converged
 
 
 def test_maxiter_is_of_steps(device):

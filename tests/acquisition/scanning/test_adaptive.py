@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ltcl
 from ltcl.acquisition.scanning import adaptive, core
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.pictures import Picture
@@ -129,3 +130,17 @@ def test_the_core_as_a_transport(device: Any, channels: int) -> None:
     (first, *_), pixels = found.core.matrices(), np.array([0, 3, 20, 34])
     np.testing.assert_allclose(core.between(cells, first, pixels), C[0][np.ix_(pixels, pixels)])
     assert core.variances(found.core)["core_variance_0"].shape == arrays["system_0.R.core.data"].shape
+
+
+def test_the_core_is_inverted_from_products_with_it(device: Any) -> None:
+    grid = (5, 7)
+    T = flat(grid, 1, 5) + 2.0 * np.eye(35)
+    found = scan(Known(T, grid), threshold=0.03)
+    made = assemble(core.arrays(found.core), device=device)
+    S = dense(found)[0] / made.first_bounce
+    C = ltcl.compress(made, 0.05)
+    assert np.linalg.norm(np.linalg.inv(C.systems[0].to_dense()) @ S - np.eye(35), 2) <= C.error <= 0.05
+    for basis in (("db2", "pixels"), "pixels"):
+        inverse = ltcl.invert(made, 1e-2, basis=basis)
+        A = inverse.systems[0].R.to_dense()
+        assert np.linalg.norm(np.eye(35) - (np.eye(35) - A) @ S, 2) <= inverse.error <= 1e-2
