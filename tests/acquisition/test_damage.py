@@ -50,7 +50,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         found[kind] = path = tmp_path_factory.mktemp("stores") / "T.zarr"
         if half:
             with pytest.raises(AcquisitionError, match=r"photograph 1\d\d: .*Unplugged: no such device"):
-                ltcl.acquire(unplugged_at(rig, 170 if strategy == "pixel" else 130), store=path, **given)
+                ltcl.acquire(unplugged_at(rig, 188 if strategy == "pixel" else 148), store=path, **given)
             assert BlockStore.open(path).written
         else:
             ltcl.acquire(rig, store=path, **given)
