@@ -16,6 +16,7 @@ import numpy as np
 
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import LONGEST, SHORTEST, Shots
+from ltcl.acquisition.stuck import healed
 from ltcl.errors import AcquisitionError, InputError
 
 DEEPEST = 64.0  # times the exposure of white: further in one photograph costs more than it tells
@@ -53,12 +54,13 @@ def offered(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
     return tuple(sorted({min(have, key=lambda given: abs(math.log(given / t))) for t in seconds}))
 
 
-def deepest(shots: Shots, white: float, response: Response) -> float:
-    """The longest exposure that is of use, from one photograph under a black projector."""
+def deepest(shots: Shots, white: float, response: Response, bad: np.ndarray) -> float:
+    """The longest exposure that is of use, from one photograph under a black projector; `bad` are stuck."""
     (probe,) = offered(shots, [8.0 * white])
     black = np.zeros(shots.grid, np.float32)
     shots.prepare([(black, probe)])
-    light = float(np.quantile(response.linear(shots.photograph(black, probe)), 0.99)) / probe
+    image = healed(shots.photograph(black, probe), bad)
+    light = float(np.quantile(response.linear(image), 0.99)) / probe
     most = DEEPEST * white
     return offered(shots, [min(most, _AMBIENT / light) if light * most > _AMBIENT else most])[0]
 

@@ -40,6 +40,7 @@ from ltcl.acquisition.radiometry import (
     projector,
 )
 from ltcl.acquisition.rig import Shots
+from ltcl.acquisition.stuck import healed, stuck
 from ltcl.errors import AcquisitionError, InputError
 
 Tell = Callable[[str], None]
@@ -50,6 +51,7 @@ _QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so th
 _BURST = 6  # photographs that tell the noise
 _CODES = 17  # of the projector's response
 _AGAIN = 16  # photographs of white
+_OWN = 0.5  # of what white shows at a pixel, that its own light is at least, in most scenes
 
 
 def measure(
@@ -101,10 +103,10 @@ def measure(
     response = response or _response(run, seconds)
     run.tell("geometry")
     R = _resampling(run, geometry, seconds, response)
-    seconds = _bright(run, response, seconds)
-    deep = exposing.deepest(shots, seconds, response)
+    seconds, bad = _bright(run, response, seconds)
+    deep = exposing.deepest(shots, seconds, response, bad)
     run.tell("noise")
-    noise = _noise(run, response, seconds, deep)
+    noise = _noise(run, response, seconds, deep, bad)
     run.tell("exposures")
     if exposures is None:
         chosen = exposing.for_scan(shots, seconds, deep, noise)
@@ -117,6 +119,7 @@ def measure(
     # The longest is for what is dim beside the brightest, and told by the scan at that exposure.
     times = exposing.offered(shots, [seconds / 2, seconds, chosen[-1]])
     white = run.merged(run.white, times, *sensor, _AGAIN) - ambient
+    _refuse_long(chosen, white, noise)
     run.tell("projector")
     light, M = _projector(run, seconds, *sensor)
     return Calibration(chosen, response, noise, offset, ambient, white, light, M, R)
@@ -160,6 +163,17 @@ def _refuse_saturated(run: _Run, seconds: float) -> None:
         raise AcquisitionError(
             f"every pixel is saturated under white at the shortest exposure, {seconds:g} s; there must be "
             "less light on the camera: a smaller aperture, a darker projector or room"
+        )
+
+
+def _refuse_long(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
+    """Refuse exposures of which the shortest saturates where a pixel is lit."""
+    lit = white.value[white.valid & (white.value > 0)]
+    most = noise.saturation / (_OWN * float(np.median(lit))) if lit.size else np.inf
+    if exposures[0] > most:
+        raise InputError(
+            f"exposures is {exposures}, but half of what white shows saturates at {exposures[0]:g} s; the "
+            f"shortest must be at most {0.7 * most:.2g} s"
         )
 
 
@@ -213,24 +227,27 @@ def _response(run: _Run, seconds: float) -> Response:
         raise InputError("rig.exposures has one exposure, which tells no response; give response=")
     ramps = [_ramp(grid, k * max(grid) // _RAMPS) for k in range(_RAMPS)]
     lit = [*ramps[: 1 if grid[0] * grid[1] >= _MANY else _RAMPS], run.black]
-    images = run.take([(codes, t) for t in times for codes in lit])
+    images, last = run.take([(codes, t) for t in times for codes in lit]), run.shots.count
+    bad = stuck(images[len(lit) - 1])  # under black, for the shortest time
+    images = [healed(image, bad) for image in images]
     beside = [np.hstack(images[k : k + len(lit)]) for k in range(0, len(images), len(lit))]
-    with exposing.telling("the response of the camera"):
+    with exposing.telling(f"the response of the camera, photographs {last + 1 - len(images)} to {last}"):
         return calibrate(beside, times, levels=run.shots.levels, saturation=_TOP)
 
 
-def _bright(run: _Run, response: Response, seconds: float) -> float:
-    """The exposure at which white fills most of the range."""
-    (image,) = run.take([(run.white, seconds)])
-    level = float(np.quantile(response.linear(image), 0.999))
-    return exposing.offered(run.shots, [seconds * exposing.WHITE / max(level, 0.01)])[-1]
+def _bright(run: _Run, response: Response, seconds: float) -> tuple[float, np.ndarray]:
+    """The exposure at which white fills most of the range, and the pixels that are stuck."""
+    image, dark = run.take([(run.white, seconds), (run.black, seconds)])
+    bad = stuck(dark)
+    level = float(np.quantile(response.linear(healed(image, bad)), 0.999))
+    return exposing.offered(run.shots, [seconds * exposing.WHITE / max(level, 0.01)])[-1], bad
 
 
-def _noise(run: _Run, response: Response, seconds: float, deep: float) -> NoiseModel:
+def _noise(run: _Run, response: Response, seconds: float, deep: float, bad: np.ndarray) -> NoiseModel:
     ramp = _ramp(run.shots.grid)
     scenes = ((ramp, seconds), (run.black, seconds), (run.black, deep))
     run.shots.prepare([shot for shot in scenes for _ in range(_BURST)])
-    bursts = [run.take([shot] * _BURST) for shot in scenes]
+    bursts = [[healed(image, bad) for image in run.take([shot] * _BURST)] for shot in scenes]
     with exposing.telling("the noise of the camera"):
         found = estimate(bursts, response=response, levels=run.shots.levels)
     return replace(found, read=max(found.read, _QUIETEST))

@@ -25,12 +25,13 @@ from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.columns import Code
 from ltcl.acquisition.scanning.log import Log
 from ltcl.acquisition.scanning.pictures import Picture, Pictures
-from ltcl.errors import FileError, InputError
+from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.store import BlockStore, zarr_folder
 from ltcl.store.blocks import creating
 from ltcl.store.compressed import Parts
 
 logger = logging.getLogger(__name__)
+_NOISY, _WRONG = 0.05, 0.3  # parts of white that columns may mostly be beside it
 
 Progress = Callable[[int, int], None]
 
@@ -181,7 +182,9 @@ def _finish(run: Run, patterns: int) -> None:
     """Columns as rows that add up to white; what they added up to before is kept for the report."""
     store, white = run.store, run.pictures.white
     if balance.SUMS not in store.extras:  # of a run that was killed behind it
-        store.extra(balance.SUMS, np.stack([balance.sums(store, c) for c in range(run.pictures.channels)]))
+        sums = np.stack([balance.sums(store, c) for c in range(run.pictures.channels)])
+        _compare(store.path, balance.mostly_beside(sums, white))
+        store.extra(balance.SUMS, sums)
     store.update(patterns=patterns)
 
     def add_up(c: int, first: int, matrix: Any, variance: Any) -> tuple[Any, Any]:
@@ -189,6 +192,19 @@ def _finish(run: Run, patterns: int) -> None:
         return balance.rows(matrix, variance, Picture(white.value[c, here], white.variance[c, here]))
 
     store.finalize(sigmas=run.wanted.sigmas, change=add_up)
+
+
+def _compare(path: Path, off: float) -> None:
+    """Warn of columns that do not add up to white; refuse such that have little to do with it."""
+    if not off > _NOISY:
+        return
+    told = f"{path}: columns of T add up to light that is {off:.0%} beside what white showed"
+    if off > _WRONG:
+        raise AcquisitionError(
+            f"{told}; photographs must be in the order of their patterns, and the light, the camera and the "
+            "scene must stay as they were. Put that right, and acquire into another store"
+        )
+    logger.warning("%s: noise, photographs in another order, or a set-up that changed", told)
 
 
 def _scan_cells(run: Run, progress: Progress) -> None:

@@ -14,13 +14,14 @@ import typer
 from ltcl import checks
 from ltcl.cli import console, options
 from ltcl.errors import InputError, LtclError
-from ltcl.store import Parts, Record, formats, inverses
+from ltcl.store import BlockStore, Parts, Record, formats, inverses
 
 
 def run(files: options.Matrices, json: options.Json = False) -> None:
     """Tell what transport files hold: size, channels, grid, entries, first bounce. Needs no device.
 
-    Of inverses, too. A bad file does not keep the others from being told; the exit code is then 1.
+    Of inverses, too; all bytes of a .zarr are compared with their checksums. A bad file does not keep the
+    others from being told; the exit code is then 1.
     """
     found, errors = [], []
     with console.Steps(len(files)) as steps:
@@ -46,6 +47,8 @@ def _facts(file: Path) -> dict[str, Any]:
         return {**_of_parts(file, inverses.read(file)), "stored": "inverse"}
     record = formats.read(file)
     with formats.about(file):
+        if file.is_dir():
+            BlockStore.open(file).verify()
         return describe(file, record)
 
 

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import VirtualRig, acquire
+from ltcl.acquisition import Report, Shots, VirtualRig, acquire
 from ltcl.acquisition.geometry import Correspondence
+from ltcl.acquisition.measuring import measure
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
 from ltcl.store import BlockStore
 
@@ -84,6 +85,65 @@ def test_some_black_pixels_are_masked(tmp_path: Path, strategy: str) -> None:
     seen = np.delete((T @ pattern.ravel()).ravel(), black)
     assert np.std(seen) < 10 ** (-30 / 20) * np.mean(seen)
     BlockStore.open(tmp_path / "T.zarr").verify()
+
+
+class Hot(VirtualRig):
+    """A camera with pixels that are at their last code whatever they see."""
+
+    def __init__(self, pixels: list[int]) -> None:
+        super().__init__(scene(GRID), GRID, **CAMERA)
+        self._pixels = pixels
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        image = super().photograph(codes, seconds).copy()
+        image.flat[self._pixels] = 4095
+        return image
+
+
+@pytest.mark.parametrize("pixels", [[5], [0, 63], [9, 10, 40]])
+def test_hot_pixels_decide_nothing(tmp_path: Path, pixels: list[int]) -> None:
+    """They are masked; exposures, response and so T are what they are without them."""
+    found = acquire(Hot(pixels), **FULL, store=tmp_path / "T.zarr")
+    acquire(VirtualRig(scene(GRID), GRID, **CAMERA), **FULL, store=tmp_path / "good.zarr")
+    assert np.flatnonzero(found.masked).tolist() == pixels
+    exposures, good = (Report.of(tmp_path / name).exposures for name in ("T.zarr", "good.zarr"))
+    np.testing.assert_allclose(exposures, good, rtol=0.1)
+    p = np.random.default_rng(0).random(GRID).astype(np.float32)
+    ours, theirs = (
+        np.delete(np.asarray(part).ravel(), pixels) for part in (found @ p, scene(GRID) @ p.ravel())
+    )
+    assert np.linalg.norm(ours - theirs) < 0.02 * np.linalg.norm(theirs)
+
+
+def test_exposures_at_which_lit_pixels_saturate() -> None:
+    rig = VirtualRig(scene(GRID), GRID, **CAMERA)
+    text = r"exposures is \(30.0,\), but half of what white shows saturates at 30 s; the shortest must be at"
+    refused(InputError, text, rig, **{**SHORT, "exposures": [30.0]})
+
+
+class Late(VirtualRig):
+    """Shows what was asked for a pattern ago, from some photograph on."""
+
+    def __init__(self, start: int) -> None:
+        super().__init__(scene(GRID), GRID, **CAMERA)
+        self._left, self._before = start, np.zeros(GRID, np.float32)
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        self._left -= 1
+        shown, self._before = (codes if self._left > 0 else self._before), np.array(codes)
+        return super().photograph(shown, seconds)
+
+
+def test_photographs_that_lag_behind_their_patterns(tmp_path: Path) -> None:
+    """Columns then do not add up to white: no transport is made of them."""
+    counted = VirtualRig(scene(GRID), GRID, **CAMERA)
+    shots = Shots(counted)
+    measure(shots, geometry="aligned", frames=2, response=LINE, exposures=[0.5])
+    text = (
+        "columns of T add up to light that is .* beside what white showed; photographs must be in the order"
+    )
+    refused(AcquisitionError, text, Late(shots.count + 1), **SHORT, store=tmp_path / "T.zarr")
+    assert not BlockStore.open(tmp_path / "T.zarr").final
 
 
 def test_some_saturated_pixels_are_masked(tmp_path: Path) -> None:

@@ -85,6 +85,14 @@ def test_any_flipped_byte_is_detected(stores: dict[str, Path], tmp_path: Path, k
 
 
 @pytest.mark.parametrize("kind", ["pixel", "adaptive"])
+def test_info_and_reports_notice_damage_anywhere(stores: dict[str, Path], kind: str) -> None:
+    for _ in flipped(stores[kind], 0, np.random.default_rng(4)):
+        with pytest.raises(FileError):
+            Report.of(stores[kind])
+    assert Report.of(stores[kind]).strategy == kind
+
+
+@pytest.mark.parametrize("kind", ["pixel", "adaptive"])
 def test_damage_to_the_transport_is_noticed_when_it_is_loaded(
     stores: dict[str, Path], tmp_path: Path, kind: str
 ) -> None:

@@ -14,6 +14,7 @@ from ltcl.acquisition.geometry.decoded import Axis, photographs
 from ltcl.acquisition.geometry.gray import GrayCode
 from ltcl.acquisition.geometry.phase import PhaseShift
 from ltcl.acquisition.geometry.unmixing import FINE
+from ltcl.acquisition.stuck import healed, stuck
 from ltcl.errors import AcquisitionError
 
 SMALL = 128  # sides up to here take narrow stripes in every pattern: the wide ones would be whole walls
@@ -127,6 +128,8 @@ def _take(shots: Shots, patterns: list[np.ndarray], seconds: float) -> list[np.n
 def exposure(shots: Shots, grid: tuple[int, int], seconds: float = 1 / 60) -> float:
     """Seconds at which white is bright but not saturated, but for a thousandth of the pixels.
 
+    Pixels that are saturated under black as well do not count.
+
     >>> class Lamp:
     ...     def photograph(self, codes, seconds):
     ...         return np.minimum(codes * 4.0 * seconds, 1.0)
@@ -134,10 +137,13 @@ def exposure(shots: Shots, grid: tuple[int, int], seconds: float = 1 / 60) -> fl
     0.7
     """
     white, allowed = np.ones(grid, np.float32), getattr(shots, "exposures", None)
+    bad = np.zeros((), bool)
     for _ in range(PROBES):
         seconds = nearest(seconds, allowed)
         (image,) = photographs("photographs", [shots.photograph(white, seconds)], 1)
-        level = float(np.quantile(image, 0.999))
+        if np.quantile(healed(image, bad), 0.999, method="higher") > BRIGHT:
+            bad = stuck(np.asarray(shots.photograph(0 * white, seconds)))
+        level = float(np.quantile(healed(image, bad), 0.999))
         change = 1 / 2 if level > BRIGHT else 0.7 / max(level, 0.7 / 16) if level < DIM else 1.0
         if change == 1.0 or nearest(seconds * change, allowed) == seconds:
             break

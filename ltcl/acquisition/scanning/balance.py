@@ -74,3 +74,27 @@ def sums(store: BlockStore, channel: int) -> np.ndarray:
         found = store.block(channel, block, "columns").matrix
         total += np.bincount(found.indices, found.data, minlength=len(total))
     return total
+
+
+def beside(sums: np.ndarray, white: Picture) -> float:
+    """How far `sums` (channels, N) are from white, relative to it, where that is known; NaN without light.
+
+    >>> beside(np.array([[3.0]]), Picture(np.array([[2.0]]), np.array([[0.0]])))
+    0.5
+    """
+    known = white.variance < 1e-3 * UNKNOWN
+    light = np.sum(white.value[known] ** 2, dtype=np.float64)
+    return float(np.sqrt(np.sum((sums - white.value)[known] ** 2) / light)) if light > 0 else float("nan")
+
+
+def mostly_beside(sums: np.ndarray, white: Picture) -> float:
+    """The same of the pixel in the middle, so that a few which saturate count for nothing.
+
+    >>> sums = np.array([[1.1, 0.9, 0.0]])
+    >>> round(mostly_beside(sums, Picture(np.array([[1.0, 1.0, 50.0]]), np.zeros((1, 3)))), 3)
+    0.1
+    """
+    lit = (white.variance < 1e-3 * UNKNOWN) & (white.value > 0)
+    if not lit.any():
+        return float("nan")
+    return float(np.median(np.abs(sums - white.value)[lit]) / np.median(white.value[lit]))

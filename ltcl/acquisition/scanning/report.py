@@ -14,7 +14,7 @@ import scipy.sparse
 from ltcl import reciprocity
 from ltcl.acquisition.scanning import balance, core
 from ltcl.acquisition.scanning.cells import Cells
-from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Seen
+from ltcl.acquisition.scanning.pictures import Seen
 from ltcl.errors import FileError
 from ltcl.store import BlockStore, StoredRows
 
@@ -95,6 +95,7 @@ class Report:
             The scan has not ended, or the store is none that `ltcl.acquire` made.
         """
         found = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        found.verify()
         told = found.attributes
         if not found.final or "strategy" not in told:
             state = "is still being scanned" if "strategy" in told else "was not made by ltcl.acquire"
@@ -157,14 +158,8 @@ def _of_blocks(store: BlockStore) -> dict[str, Any]:
             own, u = V.sum(axis=1), white.variance[c, start:stop]
             sums.append(_relative(own * u / np.maximum(own + u, 1e-300), T.sum(axis=1)))
         defects.append(_defect(StoredRows(store, c), F[c]))
-    beside = _beside(np.asarray(store.extra(balance.SUMS)), white)
+    beside = balance.beside(np.asarray(store.extra(balance.SUMS)), white)
     return _noise(direct, sums, entries, unknown, F, max(defects)) | {"beside_white": beside}
-
-
-def _beside(sums: np.ndarray, white: Picture) -> float:
-    known = white.variance < 1e-3 * UNKNOWN
-    light = np.sum(white.value[known] ** 2, dtype=np.float64)
-    return float(np.sqrt(np.sum((sums - white.value)[known] ** 2) / light)) if light > 0 else float("nan")
 
 
 def _of_cells(store: BlockStore) -> dict[str, Any]:
