@@ -207,6 +207,8 @@ class Shots:
     def _checked(self, number: int, image: Any) -> np.ndarray:
         """The scaled image; remembers the first for comparison, but only a good one."""
         name = f"photograph {number}"
+        if image is None:
+            raise AcquisitionError(f"{name} is None; it must be an image")
         image = np.asarray(image)
         check_photograph(name, image, self.channels)
         kind = (image.shape, image.dtype)
