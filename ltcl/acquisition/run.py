@@ -194,6 +194,7 @@ def _finish(run: Run, patterns: int) -> None:
 def _scan_cells(run: Run, progress: Progress) -> None:
     """Scan with the store as a log of pictures, which the transport then takes the place of."""
     total = int(run.store.attributes["plan"]["patterns"])
+    progress(0, total)
     log = Log(run.store, run.pictures, lambda done: progress(done, max(done, total)))
     found = adaptive.scan(run.pictures, log, run.wanted.threshold, run.wanted.sigmas)
     mixing = run.pictures.calibration.mixing

@@ -117,11 +117,11 @@ class Dying(VirtualRig):
 
     def __init__(self, at: int, **options: Any) -> None:
         super().__init__(corner(), GRID, bits=12, ambient=0.01, **options)
-        self._left = at
+        self._at, self.taken = at, 0
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
-        self._left -= 1
-        if self._left == 0:
+        self.taken += 1
+        if self.taken == self._at:
             raise OSError("unplugged")
         return super().photograph(codes, seconds)
 
@@ -289,13 +289,38 @@ def test_exposures_in_the_wrong_order_are_named() -> None:
         acquire(made, geometry="aligned", strategy="pixel")
 
 
-@pytest.mark.parametrize("strategy", ["hadamard", "adaptive"])
-def test_progress_is_told(strategy: str) -> None:
-    """To the end, though a scan by cells does not know beforehand how many patterns it takes."""
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_progress_is_told(tmp_path: Path, strategy: str) -> None:
+    """Of each pattern, to the end, though a scan by cells does not know beforehand how many it takes."""
     told: list[tuple[int, int]] = []
-    acquire(rig(4), geometry="aligned", strategy=strategy, progress=lambda *n: told.append(n))
-    assert told[-1][0] == told[-1][1]
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    path = tmp_path / "T.zarr"
+    acquire(rig(4), geometry="aligned", strategy=strategy, store=path, progress=lambda *n: told.append(n))
+    patterns = BlockStore.open(path).attributes["patterns"]
+    done = [one for one, _ in told]
+    assert sorted(set(done)) == list(range(patterns + 1))
+    assert done == sorted(done)
+    assert told[-1] == (patterns, patterns)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_progress_of_an_earlier_run_counts_at_once(tmp_path: Path, strategy: str) -> None:
+    options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy, "store": tmp_path / "T.zarr"}
+    whole = Dying(10000)
+    acquire(whole, geometry="aligned", strategy=strategy)
+    with pytest.raises(AcquisitionError, match="unplugged"):
+        acquire(Dying(whole.taken - 3), **options)
+    told: list[tuple[int, int]] = []  # patterns, and photographs of this run
+    made = Dying(10000)
+    acquire(made, **options, progress=lambda done, _: told.append((done, made.taken)))
+    store = BlockStore.open(tmp_path / "T.zarr")
+    patterns, each = store.attributes["patterns"], len(Calibration.of(store).exposures)
+    kept = patterns - made.taken // each
+    assert kept > 0
+    assert max(done for done, photographs in told if not photographs) == kept
+    later = [one for one in told if one[1]]
+    wanted = [(done, (done - kept) * each) for done in range(kept + 1, patterns + 1)]
+    assert later[: len(wanted)] == wanted
+    assert set(later[len(wanted) :]) <= {wanted[-1]}
 
 
 def test_auto_says_why(tmp_path: Path) -> None:

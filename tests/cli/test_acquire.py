@@ -248,7 +248,8 @@ def test_progress_is_told(program: Program, scan: Path, monkeypatch: pytest.Monk
     assert {"exposure", "geometry", "response", "noise", "black", "white", "projector"} <= set(stages)
     assert stages[0] == "exposure"
     assert any(line.startswith("ltcl: pixel: ") for line in lines)
-    assert any(line.startswith("ltcl: 34 of 34 patterns") for line in lines)
+    counted = [line.split()[1] for line in lines if " of 34 patterns" in line and "pixel: " not in line]
+    assert counted == [str(n) for n in range(35)]
 
 
 FOLDER = """\
