@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -168,8 +169,19 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
             acquire(rig(), geometry="aligned", store=path, **{"strategy": "pixel", **options})
     with pytest.raises(InputError, match=r"rig has \(4, 8\) pixels"):
         acquire(rig(4), geometry="aligned", strategy="pixel", store=path)
+    others: list[tuple[dict[str, Any], str]] = [
+        ({"response": "film"}, f"rig.response is 'film', but {path} was begun with 'srgb'"),
+        ({"black": 0.01}, f"rig.black is 0.01, but {path} was begun with 0.004"),
+        ({"read": 0.5}, "rig.read is 0.5, but"),
+    ]
+    for options, text in others:
+        with pytest.raises(InputError, match=re.escape(text)):
+            acquire(rig(**options), geometry="aligned", strategy="pixel", store=path)
     with pytest.raises(FileError, match="is still being scanned"):
         Report.of(path)
+    assert acquire(rig(seed=5), geometry="aligned", strategy="pixel", store=path).grid == GRID
+    with pytest.raises(InputError, match=r"rig\.response is 'film'"):  # finished, too
+        acquire(rig(response="film"), geometry="aligned", strategy="pixel", store=path)
     other = tmp_path / "other.zarr"
     ltcl.save(other, ltcl.Transport(np.eye(128), GRID))
     with pytest.raises(InputError, match=r"which ltcl\.acquire did not make"):
