@@ -159,6 +159,17 @@ class Project:
         with Shots(made):
             yield made
 
+    @contextlib.contextmanager
+    def described(self) -> Iterator[Any]:
+        """A rig for what is photographed already: that of `rig`, but no camera or display is opened."""
+        if self.kind != "live":
+            with self.rig() as made:
+                yield made
+            return
+        with self.naming("rig"):
+            grid, channels = project_rigs.pixels(self.folder, self.tables)
+        yield _Unseen(grid, channels, None)
+
     def aligned(self) -> Project:
         """The same, but what a virtual rig photographs is seen on the pixels that its transport has."""
         kept = {key: value for key, value in self.tables.rig.items() if key not in _CAMERA}
@@ -213,7 +224,7 @@ class _Unseen:
     exposures: Any
 
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
-        raise AcquisitionError("a plan takes no photographs")
+        raise AcquisitionError("no photographs are taken by a rig that was not opened")
 
 
 def _parsed(path: Path) -> dict[str, Any]:

@@ -27,8 +27,9 @@ class Rig(Protocol):
 
     Nothing else is needed. Used where a rig has it: `exposures`, the seconds the camera offers, ascending
     (else any from 1e-4 to 30); `bits` in use in a uint16 image (else 16); `prepare(shots)`, told of a list
-    of (codes, seconds) before they are asked for; `describe()`, a dict of plain JSON for the records;
-    `close()`.
+    of (codes, seconds) before they are asked for; `describe()`, a dict of plain JSON for the records,
+    which must be the same when a scan is resumed (but for `unchanged.PASSING`, such as "survey", where what
+    is measured in each session stands); `close()`.
     """
 
     @property
@@ -207,6 +208,8 @@ class Shots:
     def _checked(self, number: int, image: Any) -> np.ndarray:
         """The scaled image; remembers the first for comparison, but only a good one."""
         name = f"photograph {number}"
+        if image is None:
+            raise AcquisitionError(f"{name} is None; it must be an image")
         image = np.asarray(image)
         check_photograph(name, image, self.channels)
         kind = (image.shape, image.dtype)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.acquisition import measuring
+from ltcl.acquisition import measuring, unchanged
 from ltcl.acquisition.calibration import PREFIX, Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
@@ -103,16 +103,14 @@ def refuse_other(found: BlockStore, shots: Shots, wanted: Settings) -> None:
     other = [name for name in asked if made.get(name) != asked[name]]
     if other:
         name = other[0]
-        raise InputError(
-            f"{name} is {asked[name]!r}, but {found.path} was begun with {made.get(name)!r}; it must be "
-            "that, or another store"
-        )
+        raise unchanged.changed(name, asked[name], found.path, made.get(name))
     grid, channels = found.extra(PREFIX + "resampling.coverage").shape, found.layout.channels
     if (grid, channels) != (shots.grid, shots.channels):
         raise InputError(
             f"rig has {shots.grid} pixels and {shots.channels} channel(s), but {found.path} was begun with "
             f"{grid} and {channels}; it must be that rig, or another store"
         )
+    unchanged.refuse_other_rig(found, shots)
 
 
 def _state(found: BlockStore) -> tuple[dict[str, Any], dict[str, Any], Any]:
@@ -210,6 +208,7 @@ def _compare(path: Path, off: float) -> None:
 def _scan_cells(run: Run, progress: Progress) -> None:
     """Scan with the store as a log of pictures, which the transport then takes the place of."""
     total = int(run.store.attributes["plan"]["patterns"])
+    progress(0, total)
     log = Log(run.store, run.pictures, lambda done: progress(done, max(done, total)))
     found = adaptive.scan(run.pictures, log, run.wanted.threshold, run.wanted.sigmas)
     mixing = run.pictures.calibration.mixing

@@ -63,7 +63,8 @@ def acquire(
     resume : bool
         Go on with what is in the store; else the store must not be there yet.
     progress : function of two ints, optional
-        Told how many patterns have been photographed, and of how many in all at most.
+        Told after each pattern how many have been photographed, and of how many in all at most; those
+        of an earlier run count at once.
     exposures : sequence of float, optional
         Seconds of the photographs of each pattern; left out, they are chosen.
     response : Response, optional

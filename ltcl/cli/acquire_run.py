@@ -62,12 +62,22 @@ def resume(
     if take is not None:
         _take(project, take)
     if project.state == "final":
-        console.note(f"{project.store}: is finished already")
-        acquire_report.tell(project, open_device(device), json)
+        _finished(project, device, json)
         return
     if project.state == "new" and project.kind != "folder":
         console.note(f"{project.store}: is not begun yet, so this begins with the calibration")
     _go(project, device, json)
+
+
+def _finished(project: Project, device: str | None, json: bool) -> None:
+    """Nothing is left to do, unless the file now asks for something else."""
+    opened = open_device(device)
+    from ltcl.acquisition import acquire
+
+    with project.described() as rig, project.naming("acquire"):
+        acquire(rig, store=project.store, device=opened, **project.settings)
+    console.note(f"{project.store}: is finished already")
+    acquire_report.tell(project, opened, json)
 
 
 def _go(project: Project, device: str | None, json: bool) -> None:

@@ -164,7 +164,7 @@ def test_some_saturated_pixels_are_masked(tmp_path: Path) -> None:
     [
         (lambda image: image[:4], r"photograph 100 is uint16 \(4, 8\); it must be uint16 \(8, 8\)"),
         (lambda image: image.astype(np.uint8), r"photograph 100 is uint8 \(8, 8\); it must be uint16"),
-        (lambda image: None, "photograph 100 holds object"),
+        (lambda image: None, "photograph 100 is None; it must be an image"),
         (lambda image: np.stack([image] * 3, -1), r"photograph 100 has shape \(8, 8, 3\)"),
         (lambda image: image[:0], r"photograph 100 has shape \(0, 8\)"),
         (lambda image: image + np.uint16(60000), "photograph 100 reaches"),

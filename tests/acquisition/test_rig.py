@@ -125,7 +125,7 @@ def test_bad_exposures_are_refused(given: Any) -> None:
         ([np.zeros((2, 2, 3), np.uint8)], "photograph 1 has shape (2, 2, 3); it must be (H, W)"),
         ([np.zeros(4, np.uint8)], "photograph 1 has shape (4,)"),
         ([np.zeros((2, 2), np.int32)], "photograph 1 holds int32"),
-        ([None], "photograph 1 holds object"),
+        ([None], "photograph 1 is None; it must be an image"),
         ([np.full((1, 1), 4096, np.uint16)], "photograph 1 reaches 4096; rig.bits says that 4095"),
         ([OSError("the camera\nis gone")], "photograph 1: the rig failed with OSError: the camera is gone"),
         ([np.zeros((1, 1)), RuntimeError("unplugged")], "photograph 2: the rig failed with RuntimeError"),

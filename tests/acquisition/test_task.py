@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -117,11 +118,11 @@ class Dying(VirtualRig):
 
     def __init__(self, at: int, **options: Any) -> None:
         super().__init__(corner(), GRID, bits=12, ambient=0.01, **options)
-        self._left = at
+        self._at, self.taken = at, 0
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
-        self._left -= 1
-        if self._left == 0:
+        self.taken += 1
+        if self.taken == self._at:
             raise OSError("unplugged")
         return super().photograph(codes, seconds)
 
@@ -168,8 +169,19 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
             acquire(rig(), geometry="aligned", store=path, **{"strategy": "pixel", **options})
     with pytest.raises(InputError, match=r"rig has \(4, 8\) pixels"):
         acquire(rig(4), geometry="aligned", strategy="pixel", store=path)
+    others: list[tuple[dict[str, Any], str]] = [
+        ({"response": "film"}, f"rig.response is 'film', but {path} was begun with 'srgb'"),
+        ({"black": 0.01}, f"rig.black is 0.01, but {path} was begun with 0.004"),
+        ({"read": 0.5}, "rig.read is 0.5, but"),
+    ]
+    for options, text in others:
+        with pytest.raises(InputError, match=re.escape(text)):
+            acquire(rig(**options), geometry="aligned", strategy="pixel", store=path)
     with pytest.raises(FileError, match="is still being scanned"):
         Report.of(path)
+    assert acquire(rig(seed=5), geometry="aligned", strategy="pixel", store=path).grid == GRID
+    with pytest.raises(InputError, match=r"rig\.response is 'film'"):  # finished, too
+        acquire(rig(response="film"), geometry="aligned", strategy="pixel", store=path)
     other = tmp_path / "other.zarr"
     ltcl.save(other, ltcl.Transport(np.eye(128), GRID))
     with pytest.raises(InputError, match=r"which ltcl\.acquire did not make"):
@@ -289,13 +301,38 @@ def test_exposures_in_the_wrong_order_are_named() -> None:
         acquire(made, geometry="aligned", strategy="pixel")
 
 
-@pytest.mark.parametrize("strategy", ["hadamard", "adaptive"])
-def test_progress_is_told(strategy: str) -> None:
-    """To the end, though a scan by cells does not know beforehand how many patterns it takes."""
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_progress_is_told(tmp_path: Path, strategy: str) -> None:
+    """Of each pattern, to the end, though a scan by cells does not know beforehand how many it takes."""
     told: list[tuple[int, int]] = []
-    acquire(rig(4), geometry="aligned", strategy=strategy, progress=lambda *n: told.append(n))
-    assert told[-1][0] == told[-1][1]
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    path = tmp_path / "T.zarr"
+    acquire(rig(4), geometry="aligned", strategy=strategy, store=path, progress=lambda *n: told.append(n))
+    patterns = BlockStore.open(path).attributes["patterns"]
+    done = [one for one, _ in told]
+    assert sorted(set(done)) == list(range(patterns + 1))
+    assert done == sorted(done)
+    assert told[-1] == (patterns, patterns)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_progress_of_an_earlier_run_counts_at_once(tmp_path: Path, strategy: str) -> None:
+    options: dict[str, Any] = {"geometry": "aligned", "strategy": strategy, "store": tmp_path / "T.zarr"}
+    whole = Dying(10000)
+    acquire(whole, geometry="aligned", strategy=strategy)
+    with pytest.raises(AcquisitionError, match="unplugged"):
+        acquire(Dying(whole.taken - 3), **options)
+    told: list[tuple[int, int]] = []  # patterns, and photographs of this run
+    made = Dying(10000)
+    acquire(made, **options, progress=lambda done, _: told.append((done, made.taken)))
+    store = BlockStore.open(tmp_path / "T.zarr")
+    patterns, each = store.attributes["patterns"], len(Calibration.of(store).exposures)
+    kept = patterns - made.taken // each
+    assert kept > 0
+    assert max(done for done, photographs in told if not photographs) == kept
+    later = [one for one in told if one[1]]
+    wanted = [(done, (done - kept) * each) for done in range(kept + 1, patterns + 1)]
+    assert later[: len(wanted)] == wanted
+    assert set(later[len(wanted) :]) <= {wanted[-1]}
 
 
 def test_auto_says_why(tmp_path: Path) -> None:

@@ -240,6 +240,48 @@ def test_other_settings_than_begun_with(
     program("acquire", "resume", scan).refused("[acquire] strategy is 'hadamard'", "was begun with 'pixel'")
 
 
+def test_another_rig_than_begun_with(program: Program, scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        Ending(patch, 200, KeyboardInterrupt())
+        assert program("acquire", "run", scan).code == 130
+    path = scan / "acquisition.toml"
+    text = path.read_text()
+    path.write_text(text.replace('\nresponse = "film"', '\nresponse = "srgb"'))
+    program("acquire", "resume", scan).refused("rig.response is 'srgb'", "was begun with 'film'")
+    path.write_text(text)
+    assert program("acquire", "resume", scan).code == 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ('strategy = "pixel"', 'strategy = "hadamard"', "[acquire] strategy is 'hadamard'"),
+        ('transport = "truth.npz"', 'transport = "truth.npz"\ngrid = [8, 4]', "rig has (8, 4) pixels"),
+        ('\nresponse = "film"', '\nresponse = "srgb"', "rig.response is 'srgb'"),
+    ],
+)
+def test_a_finished_scan_is_not_that_of_other_settings(
+    program: Program, acquired: Path, tmp_path: Path, old: str, new: str, part: str
+) -> None:
+    scan = Path(shutil.copytree(acquired, tmp_path / "scan"))
+    path = scan / "acquisition.toml"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    program("acquire", "resume", scan).refused(part, "was begun with", "or another store")
+
+
+def test_a_finished_live_scan_opens_no_camera(program: Program, acquired: Path, tmp_path: Path) -> None:
+    scan = Path(shutil.copytree(acquired, tmp_path / "scan"))
+    path = scan / "acquisition.toml"
+    live = '[rig]\nkind = "live"\n[rig.camera]\nkind = "opencv"\nsource = 999\nchannels = 1\n'
+    settings = path.read_text().partition("\n[acquire]\n")[2]
+    for grid, code in (("[4, 8]", 0), ("[8, 8]", 1)):
+        path.write_text(f"{live}[rig.display]\ngrid = {grid}\n[acquire]\n{settings}")
+        outcome = program("acquire", "resume", scan)
+        assert outcome.code == code, outcome.err
+    assert "rig has (8, 8) pixels" in outcome.err
+
+
 def test_progress_is_told(program: Program, scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, "_PATIENCE", -1.0)
     monkeypatch.setattr(console, "_AGAIN", 0.0)
@@ -248,7 +290,8 @@ def test_progress_is_told(program: Program, scan: Path, monkeypatch: pytest.Monk
     assert {"exposure", "geometry", "response", "noise", "black", "white", "projector"} <= set(stages)
     assert stages[0] == "exposure"
     assert any(line.startswith("ltcl: pixel: ") for line in lines)
-    assert any(line.startswith("ltcl: 34 of 34 patterns") for line in lines)
+    counted = [line.split()[1] for line in lines if " of 34 patterns" in line and "pixel: " not in line]
+    assert counted == [str(n) for n in range(35)]
 
 
 FOLDER = """\

@@ -237,7 +237,8 @@ class LiveRig:
         if off > self._drift:
             raise AcquisitionError(
                 f"it is {off:.1%} brighter or darker than an earlier one of the same codes and seconds, "
-                f"{self._drift:.1%} is accepted: the camera, the projector or the light of the room drifts"
+                f"drift={self._drift:g} accepts {self._drift:.1%}: the camera, the projector or the light of "
+                "the room drifts"
             )
 
 

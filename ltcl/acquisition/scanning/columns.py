@@ -77,20 +77,26 @@ def scan(
     sigmas : float
         Of `thresholds.keep`; 0 keeps every entry.
     tell : function of an int
-        Told the patterns that were photographed, block by block; those of an earlier run as well.
+        Told the patterns that were photographed: first those of an earlier run, 0 of none, then each one.
     """
     missing = sorted({block for _, block in store.missing("columns")})
+    lit = {block: _count(code, store, block) for block in range(store.layout.blocks("columns"))}
+    tell(sum(count for block, count in lit.items() if block not in missing))
     pictures.announce(p for block in missing for p in _lit(pictures.grid, code, store, block))
-    for block in range(store.layout.blocks("columns")):
-        start, stop = store.layout.span(block, "columns")
-        if block in missing:
-            _batch(pictures, code, store, block, sigmas)
-        tell(code.count(stop - start))
+    for block in missing:
+        _batch(pictures, code, store, block, sigmas, lambda: tell(1))
 
 
-def _batch(pictures: Pictures, code: Code, store: BlockStore, block: int, sigmas: float) -> None:
+def _count(code: Code, store: BlockStore, block: int) -> int:
     start, stop = store.layout.span(block, "columns")
-    taken = pictures.take(_lit(pictures.grid, code, store, block))
+    return code.count(stop - start)
+
+
+def _batch(
+    pictures: Pictures, code: Code, store: BlockStore, block: int, sigmas: float, tell: Callable[[], None]
+) -> None:
+    start, stop = store.layout.span(block, "columns")
+    taken = pictures.take(_lit(pictures.grid, code, store, block), tell)
     for c in range(pictures.channels):
         value, variance = (np.stack([part[k][c] for part in taken]) for k in (0, 1))
         x, v = (part[: stop - start] for part in code.decode(value, variance, pictures.ambient[c]))

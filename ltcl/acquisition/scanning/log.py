@@ -51,13 +51,16 @@ class Log:
             raise AcquisitionError(f"the scan asks for more than {number} batches; that is a fault of ltcl")
         if self._written(number):
             found = self._read(number, len(patterns))
+            self._count(len(patterns))
         else:
-            found = self._pictures.take(patterns)
+            found = self._pictures.take(patterns, lambda: self._count(1))
             for c in range(self._pictures.channels):
                 self._write(number, c, found)
-        self.done += len(patterns)
-        self._tell(self.done)
         return found
+
+    def _count(self, pictures: int) -> None:
+        self.done += pictures
+        self._tell(self.done)
 
     def _read(self, number: int, count: int) -> list[Picture]:
         blocks = [self._store.block(c, number, "columns") for c in range(self._pictures.channels)]

@@ -7,7 +7,7 @@ blocks of the scan, less the ambient light, in units of the light that all chann
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -99,12 +99,16 @@ class Pictures(Seen):
         times = self.calibration.exposures
         self.shots.prepare((self._codes(part), t) for part in patterns for t in times)
 
-    def take(self, patterns: Iterable[np.ndarray]) -> list[Picture]:
-        """A picture under each pattern (h, w) of the scan, on where it is not 0."""
+    def take(self, patterns: Iterable[np.ndarray], tell: Callable[[], None]) -> list[Picture]:
+        """A picture under each pattern (h, w) of the scan, on where it is not 0; told of each."""
         codes = [self._codes(pattern) for pattern in patterns]
         times = self.calibration.exposures
         self.shots.prepare([(part, t) for part in codes for t in times])
-        return [self._picture([self.shots.photograph(part, t) for t in times]) for part in codes]
+        found = []
+        for part in codes:
+            found.append(self._picture([self.shots.photograph(part, t) for t in times]))
+            tell()
+        return found
 
     def _codes(self, pattern: np.ndarray) -> np.ndarray:
         return self.blocks.enlarged(np.asarray(pattern, np.float32))

@@ -169,6 +169,8 @@ def test_a_lamp_that_fades_is_found_at_the_next_identical_shot(clock: Clock, dis
     camera.gain = lambda *_: 0.9
     with pytest.raises(AcquisitionError, match=r"^photograph 5: it is (9|10)\.\d% brighter or darker"):
         rig.photograph(first, SECONDS)
+    with pytest.raises(AcquisitionError, match=r"drift=0\.02 accepts 2\.0%"):
+        rig.photograph(first, SECONDS)
 
 
 def test_a_camera_that_looks_elsewhere_is_named(clock: Clock, display: Display) -> None:
