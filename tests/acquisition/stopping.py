@@ -100,7 +100,8 @@ class Nursery:
         child, answer = int(self._hear()), self._hear()
         if answer == "now":
             time.sleep(moment.later if moment else 0.0)
-            os.kill(child, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # it has come to its end before
+                os.kill(child, signal.SIGKILL)
             answer = self._hear()
         status = int(answer)
         assert status in (0, -signal.SIGKILL), f"{strategy} at {moment} ended with {status}"
