@@ -10,6 +10,8 @@
     projector       codes to light of each channel, and from these pictures how its colours mix
 
 Known limit: the unit of light is what the response reaches at the last code, for which nothing else stands.
+A colour that the wall hardly reflects is photographed for longer, up to 16 times, so that its curve reaches
+that code too: one that ends before has a unit of its own, and grey is no longer grey.
 """
 
 from __future__ import annotations
@@ -45,6 +47,8 @@ from ltcl.errors import AcquisitionError, InputError
 
 Tell = Callable[[str], None]
 _BRACKET, _SPAN = 8, 16.0  # exposures to find the response from, and how far from that of white
+_LONGER, _STEP = 4, 2.0  # more of them at most, where a colour stays dark; times the one before
+_DARKER = 0.99  # share of the pixels: the others must reach the last code in each colour
 _RAMPS, _MANY = 4, 4096  # scenes of them where there are fewer pixels
 _TOP = 0.995  # of the codes: the unit of a curve is what it reaches at the last one
 _QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so that weights are finite
@@ -227,12 +231,28 @@ def _response(run: _Run, seconds: float) -> Response:
         raise InputError("rig.exposures has one exposure, which tells no response; give response=")
     ramps = [_ramp(grid, k * max(grid) // _RAMPS) for k in range(_RAMPS)]
     lit = [*ramps[: 1 if grid[0] * grid[1] >= _MANY else _RAMPS], run.black]
-    images, last = run.take([(codes, t) for t in times for codes in lit]), run.shots.count
-    bad = stuck(images[len(lit) - 1])  # under black, for the shortest time
-    images = [healed(image, bad) for image in images]
-    beside = [np.hstack(images[k : k + len(lit)]) for k in range(0, len(images), len(lit))]
-    with exposing.telling(f"the response of the camera, photographs {last + 1 - len(images)} to {last}"):
+    first, taken = run.shots.count + 1, run.take([(codes, t) for t in times for codes in lit])
+    bad = stuck(taken[len(lit) - 1])  # under black, for the shortest time
+    beside = _beside(taken, len(lit), bad)
+    longest = exposing.offered(run.shots, [times[-1] * _STEP**k for k in range(1, _LONGER + 1)])
+    for longer in (t for t in longest if t > times[-1]):
+        if _reached(beside[-1]):
+            break
+        more = run.take([(codes, longer) for codes in lit])
+        beside, times = [*beside, *_beside(more, len(lit), bad)], (*times, longer)
+    with exposing.telling(f"the response of the camera, photographs {first} to {run.shots.count}"):
         return calibrate(beside, times, levels=run.shots.levels, saturation=_TOP)
+
+
+def _beside(images: list[np.ndarray], count: int, bad: np.ndarray) -> list[np.ndarray]:
+    """Every `count` of them side by side, without the pixels that are stuck."""
+    whole = [healed(image, bad) for image in images]
+    return [np.hstack(whole[k : k + count]) for k in range(0, len(whole), count)]
+
+
+def _reached(image: np.ndarray) -> bool:
+    """Whether each colour has light at its last code; of one channel, no other's unit must be the same."""
+    return image.ndim == 2 or bool(np.quantile(image, _DARKER, axis=(0, 1)).min() >= _TOP)
 
 
 def _bright(run: _Run, response: Response, seconds: float) -> tuple[float, np.ndarray]:

@@ -198,9 +198,9 @@ def test_arguments_are_refused_before_the_first_photograph(
     refused(error, text, _dark_room(), **{**FULL, **given})
 
 
-def _dark_room() -> VirtualRig:
+def _dark_room(made: VirtualRig | None = None) -> VirtualRig:
     """A rig that must not be asked for a photograph."""
-    made = VirtualRig(scene(GRID), GRID)
+    made = made or VirtualRig(scene(GRID), GRID)
 
     def photograph(codes: Any, seconds: float) -> np.ndarray:
         raise AssertionError("photographed before all was checked")
@@ -231,21 +231,16 @@ def test_a_place_where_no_store_can_be(tmp_path: Path) -> None:
 
 
 def test_a_store_through_a_link_or_in_an_empty_folder(tmp_path: Path) -> None:
-    rig, given = made("block")
+    given = made("block")[1]
     (tmp_path / "disk").mkdir()
     (tmp_path / "T.zarr").symlink_to(tmp_path / "disk" / "scan.zarr")
     (tmp_path / "empty").mkdir()
     for name in ("T.zarr", "empty"):
-        acquire(rig, store=tmp_path / name, **given)
-        acquire(_of_grid(_dark_room(), rig), store=tmp_path / name, **given)  # it is done
+        acquire(made("block")[0], store=tmp_path / name, **given)
+        acquire(_dark_room(made("block")[0]), store=tmp_path / name, **given)  # it is done
         BlockStore.open(tmp_path / name).verify()
     assert (tmp_path / "T.zarr").is_symlink()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["T.zarr", "disk", "empty"]
-
-
-def _of_grid(dark: VirtualRig, like: VirtualRig) -> VirtualRig:
-    dark.projector_grid, dark.channels = like.projector_grid, like.channels
-    return dark
 
 
 def test_grids_that_do_not_match(tmp_path: Path) -> None:

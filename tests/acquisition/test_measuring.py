@@ -60,6 +60,16 @@ def test_colours() -> None:
     np.testing.assert_allclose(told.light, told.mixing.sum(axis=1))
 
 
+@pytest.mark.parametrize("response", ["srgb", "film"])
+def test_colours_have_one_unit(response: str) -> None:
+    """Also that of a colour with an eighth of the light of another."""
+    walls = [corner(8, albedo) for albedo in (0.8, 0.7, 0.1)]
+    shots = Shots(VirtualRig(walls, (8, 16), response=response, bits=12, ambient=0.01))
+    white = measure(shots, geometry="aligned").white.value.reshape(-1, 3)
+    units = [np.mean(white[:, c] / wall.sum(axis=1)) for c, wall in enumerate(walls)]
+    np.testing.assert_allclose(units, np.mean(units), rtol=0.015)
+
+
 def test_a_camera_with_few_exposures() -> None:
     offered = (0.01, 0.05, 0.2, 0.5, 2.0, 6.0)
     told = measure(Shots(rig(exposures=offered)), geometry="aligned")

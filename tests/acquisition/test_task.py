@@ -219,6 +219,19 @@ def test_one_exposure_tells_no_response() -> None:
     assert off(dense(T), corner(), GRID) < 0.02
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_colours_keep_their_balance(seed: int) -> None:
+    """No scale of its own for any colour: one that the wall hardly reflects has the unit of the others."""
+    corner_of_three = ltcl.scenes.dihedral(8, albedo=(0.8, 0.6, 0.4))
+    truth, grid = corner_of_three.transport(), corner_of_three.grid
+    made = VirtualRig(truth, grid, response="srgb", bits=12, ambient=0.01, seed=seed)
+    T = acquire(made, geometry="aligned")
+    for p in np.random.default_rng(5).random((3, *grid, 3)):
+        ours, theirs = (np.asarray(part @ p).reshape(-1, 3) for part in (T, truth))
+        off_by = np.linalg.norm(ours - theirs, axis=0) / np.linalg.norm(theirs, axis=0)
+        assert off_by.max() < 0.02
+
+
 @pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
 def test_colours_that_mix(strategy: str) -> None:
     M = np.array([[0.9, 0.15, 0.0], [0.05, 0.8, 0.1], [0.0, 0.2, 0.9]])

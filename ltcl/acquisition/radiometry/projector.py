@@ -91,7 +91,8 @@ def _table(codes: np.ndarray, pictures: Sequence[Any], name: str) -> np.ndarray:
     L = np.stack([picture.value[seen] for picture in pictures]).astype(np.float64)
     dark, bright = (pictures[k].variance[seen].astype(np.float64) for k in (0, -1))
     w, s = 1.0 / np.maximum(dark + bright, 1e-300), L[-1] - L[0]
-    if np.sum(w * s) < _LEAST * np.sqrt(np.sum(w)):
+    # Not weighted: colours that a channel does not light have next to no variance, and would decide alone.
+    if np.sum(s) < _LEAST * np.sqrt(np.sum(dark + bright)):
         raise InputError(f"{name} are no brighter under code 1 than under code 0; does the projector shine?")
     above = (L[1:-1] - L[0]) * s - dark
     g = (above @ w) / np.sum(w * (s**2 - dark - bright))

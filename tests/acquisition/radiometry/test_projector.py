@@ -48,6 +48,14 @@ def test_each_channel_has_a_curve():
     np.testing.assert_allclose(found.linear(np.stack([codes] * 3, axis=-1)), wanted, atol=2e-3)
 
 
+def test_a_colour_that_the_channel_does_not_light_says_nothing_of_it():
+    """Next to no variance is told of such a colour; what is there of noise must not outweigh the others."""
+    seen = np.full((4, 4, 3), True)
+    light, variance, _ = np.broadcast_arrays([-2e-4, 0.3, 0.6], [1e-12, 3e-5, 6e-5], seen)
+    pictures = [Radiance(c * light, variance, seen) for c in CODES]
+    np.testing.assert_allclose(projector.measure(CODES, pictures).linear(CODES), CODES, atol=0.01)
+
+
 def test_invalid_pixels_do_not_count():
     pictures = ramp(lambda c: c**2, 1e-4)
     pictures[5].valid[:8] = False
