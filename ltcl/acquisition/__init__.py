@@ -8,7 +8,7 @@
     geometry/   which projector pixel a camera pixel sees: Gray code, phase shift, resampling
     calibration, measuring, exposing    all that is measured once of a set-up, and for how many seconds
     scanning/   which pixels are lit when, and T from the pictures; plan before, report after
-    task, run   acquire: all of it, into a store, stopped and resumed
+    task, run   acquire: all of it, into a store, stopped and resumed; kept: photographs of a calibration
     forecasting how far pictures and bounces are off by the noise of the scan
     finishing   finalize: the transport of a store whose photographs are all there
     setup       Setup: codes for a pattern, and the ambient light, on the pixels of a transport

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition import exposing, project_rigs
+from ltcl.acquisition import exposing, kept, project_rigs
 from ltcl.acquisition.project_rigs import Tables
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
@@ -137,6 +137,17 @@ class Project:
             return "new"
         found = BlockStore.open(self.store)
         return "final" if found.final else "begun" if "strategy" in found.attributes else "new"
+
+    @property
+    def kept(self) -> int:
+        """Photographs that a calibration which has not ended can go on with; those of a folder rig apart."""
+        return kept.count(self.store)
+
+    @property
+    def next(self) -> str:
+        """The command that photographs what is missing."""
+        how = "run" if self.state == "new" and not self.kept else "resume"
+        return f"'ltcl acquire {how} {self.folder}'"
 
     @contextlib.contextmanager
     def rig(self) -> Iterator[Any]:

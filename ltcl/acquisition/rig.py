@@ -29,7 +29,9 @@ class Rig(Protocol):
     (else any from 1e-4 to 30); `bits` in use in a uint16 image (else 16); `prepare(shots)`, told of a list
     of (codes, seconds) before they are asked for; `describe()`, a dict of plain JSON for the records,
     which must be the same when a scan is resumed (but for `unchanged.PASSING`, such as "survey", where what
-    is measured in each session stands); `close()`.
+    is measured in each session stands); `recall(codes, seconds, image)`, told of a photograph that it took in
+    an earlier session and is not asked for again; `keeps_photographs`, whether it keeps them itself;
+    `close()`.
     """
 
     @property
@@ -47,6 +49,18 @@ class Rig(Protocol):
 
         Returns uint8, uint16 or float of (H, W) or (H, W, 3), always the same; full scale of a float is 1.
         """
+        ...
+
+
+class Keeper(Protocol):
+    """Photographs of an earlier session, and a place for those of this one: `kept`."""
+
+    def find(self, codes: np.ndarray, seconds: float) -> np.ndarray | None:
+        """The next one of these codes and seconds, as the rig gave it; None where it has to be taken."""
+        ...
+
+    def add(self, codes: np.ndarray, seconds: float, image: np.ndarray) -> None:
+        """Keep one that was not found."""
         ...
 
 
@@ -72,6 +86,10 @@ class Shots:
         Of the camera, once there was a photograph.
     levels : int, or None
         Codes of an integer camera, 256 of 8 bits, once there was a photograph; None of a float camera.
+    keeper : Keeper, or None
+        Asked before the rig is, and given what the rig gave.
+    asking : bool
+        Whether a photograph was asked for and did not come as it must be: then an error is the rig's.
 
     Raises
     ------
@@ -104,6 +122,8 @@ class Shots:
             raise InputError(f"rig.channels is {self.channels!r}; it must be 1 or 3")
         self.exposures = _exposures(getattr(rig, "exposures", None))
         self.count = 0
+        self.keeper: Keeper | None = None
+        self.asking = False
         self._first: tuple[tuple[int, ...], np.dtype] | None = None
 
     @property
@@ -155,17 +175,15 @@ class Shots:
             `PhotographMissing` where a person has yet to take it.
         """
         codes, seconds = self._codes(codes), self._seconds(seconds)
-        number = self.count + 1
-        try:
-            image = self.rig.photograph(codes, seconds)
-        except LtclError:
-            raise
-        except Exception as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise AcquisitionError(f"photograph {number}: the rig failed with {reason}") from error
-        image = self._checked(number, image)
-        self.count = number
-        return image
+        self.asking = True
+        found = None if self.keeper is None else self.keeper.find(codes, seconds)
+        image = self._asked(codes, seconds) if found is None else found
+        scaled = self._checked(self.count + 1, image)
+        if found is None and self.keeper is not None:
+            self.keeper.add(codes, seconds, np.asarray(image))
+        self.asking = False
+        self.count += 1
+        return scaled
 
     def describe(self) -> dict[str, Any]:
         """Plain JSON for the records: what the rig says of itself, the grids, and the count so far."""
@@ -190,6 +208,15 @@ class Shots:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _asked(self, codes: np.ndarray, seconds: float) -> Any:
+        try:
+            return self.rig.photograph(codes, seconds)
+        except LtclError:
+            raise
+        except Exception as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise AcquisitionError(f"photograph {self.count + 1}: the rig failed with {reason}") from error
 
     def _codes(self, codes: Any) -> np.ndarray:
         return as_codes(codes, self.grid, self.channels)

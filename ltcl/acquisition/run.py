@@ -7,6 +7,7 @@ transport takes the place of when it is found. What decides the photographs, `Se
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ltcl.acquisition import measuring, unchanged
+from ltcl.acquisition import kept, measuring, unchanged
 from ltcl.acquisition.calibration import PREFIX, Calibration
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
@@ -66,17 +67,30 @@ class Run:
 
 
 def begin(
+    path: Path,
+    shots: Shots,
+    wanted: Settings,
+    geometry: str | Correspondence,
+    response: Response | None,
+    keep: bool,
+) -> Run:
+    """Measure the set-up and make the store; `keep` photographs until it is there."""
+    creating.check(path, overwrite=True)
+    with kept.keeping(path, shots) if keep else contextlib.nullcontext():
+        return _begun(path, shots, wanted, geometry, response)
+
+
+def _begun(
     path: Path, shots: Shots, wanted: Settings, geometry: str | Correspondence, response: Response | None
 ) -> Run:
-    """Measure the set-up and make the store; it is one to be resumed from the last line on."""
-    creating.check(path, overwrite=True)
+    """The store is one to be resumed from the last line on."""
     told = measuring.measure(
         shots,
         geometry=geometry,
         response=response,
         exposures=wanted.exposures,
         frames=wanted.frames,
-        tell=lambda what: logger.info("calibration: %s", what),
+        tell=lambda what: logger.info("calibration: %s, from photograph %d", what, shots.count + 1),
     )
     plans = _plans(shots, told, wanted)
     strategy, why = (wanted.strategy, "as asked for")
@@ -110,7 +124,8 @@ def refuse_other(found: BlockStore, shots: Shots, wanted: Settings) -> None:
             f"rig has {shots.grid} pixels and {shots.channels} channel(s), but {found.path} was begun with "
             f"{grid} and {channels}; it must be that rig, or another store"
         )
-    unchanged.refuse_other_rig(found, shots)
+    told = found.provenance["acquisition"]
+    unchanged.refuse_other_rig(told.get("rig") if isinstance(told, dict) else None, shots, found.path)
 
 
 def _state(found: BlockStore) -> tuple[dict[str, Any], dict[str, Any], Any]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`acquire`: from a rig to a transport, with photographs alone; it can be stopped at any time and goes on.
 
-First the set-up is measured (`measuring`), which is committed as a whole, then T is scanned
-(`scanning`), of which every batch of photographs is committed before the next is taken. What is in the store
-is read back and never photographed again.
+First the set-up is measured (`measuring`), which is committed as a whole, its photographs being `kept` until
+then; then T is scanned (`scanning`), of which every batch of photographs is committed before the next is
+taken. What is in the store is read back, and nothing that was committed is photographed again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ltcl import checks
-from ltcl.acquisition import run
+from ltcl.acquisition import kept, run
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, Shots
@@ -59,7 +59,8 @@ def acquire(
         that are divided where it tells. "auto" decides by the noise of the camera (`scanning.plan`).
     store : path, optional
         Folder of the transport on disk, which keeps what was photographed; without one nothing can be
-        resumed, and all is held in memory.
+        resumed, and all is held in memory. Until the set-up is measured its photographs are in a folder
+        beside it, STORE.calibration; to begin anew, remove both.
     resume : bool
         Go on with what is in the store; else the store must not be there yet.
     progress : function of two ints, optional
@@ -127,11 +128,12 @@ def acquire(
         found = _found(path, resume)
         if found is not None:
             run.refuse_other(found, shots, wanted)
+            kept.forget(path)
         if found is not None and found.final:
             found.finalize()  # removes what a process that was killed at the very end had left
         else:
             begun = found and run.resumed(found, shots, wanted)
-            begun = begun or run.begin(path, shots, wanted, geometry, response)
+            begun = begun or run.begin(path, shots, wanted, geometry, response, keep=store is not None)
             run.scan(begun, progress or (lambda done, total: None))
         T = load(path, on_dark="mask", device=device)
         return T if store is not None else _in_memory(T, device)
@@ -175,6 +177,11 @@ def _place(store: str | os.PathLike[str] | None) -> Iterator[Path]:
 
 def _found(path: Path, resume: bool) -> BlockStore | None:
     """The store of an earlier run whose calibration was committed."""
+    if not resume and kept.count(path):
+        raise InputError(
+            f"resume is False, but {kept.place(path)} holds {kept.count(path)} photographs of a calibration "
+            "that has not ended; remove it, or give another store"
+        )
     if not os.path.exists(path) or (path.is_dir() and not any(path.iterdir())):
         return None
     if not resume:

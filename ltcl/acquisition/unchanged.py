@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Whether a scan in a store is gone on with by the set-up, and with the settings, that it was begun with.
 
-The store keeps what the rig said of itself, `describe()`. What differs from session to session is left out of
+A store keeps what the rig said of itself, `describe()`. What differs from session to session is left out of
 the comparison, `PASSING`: what is measured or counted anew, and where things lie.
 """
 
@@ -15,7 +15,6 @@ from typing import Any
 
 from ltcl.acquisition.rig import Shots
 from ltcl.errors import InputError
-from ltcl.store import BlockStore
 
 PASSING = frozenset(
     {
@@ -34,16 +33,15 @@ PASSING = frozenset(
 _CLOSE = 1e-4  # relative difference of numbers that are the same
 
 
-def refuse_other_rig(found: BlockStore, shots: Shots) -> None:
-    """Refuse a rig that describes itself otherwise than the one that the scan was begun with."""
+def refuse_other_rig(told: Any, shots: Shots, path: Path) -> None:
+    """Refuse a rig that describes itself otherwise than the one that `path` was begun with, as `told`."""
     if getattr(shots.rig, "describe", None) is None:
         return
-    kept = found.provenance["acquisition"]
-    was = _leaves(kept.get("rig") if isinstance(kept, dict) else None)
+    was = _leaves(told)
     now = _leaves(json.loads(json.dumps(shots.describe()["rig"], default=str)))
     for key in sorted((was.keys() | now.keys()) - PASSING):
         if not _same(now.get(key), was.get(key)):
-            raise changed(f"rig.{key}", now.get(key), found.path, was.get(key))
+            raise changed(f"rig.{key}", now.get(key), path, was.get(key))
 
 
 def changed(name: str, now: Any, path: Path, was: Any) -> InputError:

@@ -17,15 +17,14 @@ def run(folder: options.Acquisition, json: options.Json = False) -> None:
     from ltcl.acquisition import Project, finalize
 
     project = Project.open(folder)
-    again = f"'ltcl acquire {'run' if project.state == 'new' else 'resume'} {folder}'"
     if project.state == "new":
-        raise FileError(f"{project.store}: is not begun; {again} photographs it")
+        raise FileError(f"{project.store}: is not begun; {project.next} photographs it")
     done = project.state == "final"
     try:
         with console.Frames("patterns") as progress:
             finalize(project.store, progress)
     except AcquisitionError as error:
-        raise AcquisitionError(f"{error}; {again} goes on") from None
+        raise AcquisitionError(f"{error}; {project.next} goes on") from None
     if json:
         console.answer({"folder": folder, "store": project.store, "before": done})
     else:

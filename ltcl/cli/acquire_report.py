@@ -42,7 +42,7 @@ def run(
 
     project = Project.open(folder)
     if project.state == "new":
-        raise FileError(f"{project.store}: is not begun; 'ltcl acquire run {folder}' photographs it")
+        raise FileError(f"{project.store}: is not begun; {project.next} photographs it")
     tell(project, open_device(device), json, out)
 
 

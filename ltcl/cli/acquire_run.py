@@ -36,11 +36,16 @@ def run(folder: options.Acquisition, device: options.Device = None, json: option
     A folder rig writes patterns and a shooting list, and ends where photographs are missing: take them, then
     'ltcl acquire resume'. After Ctrl-C, too, and whatever else ends it early.
     """
-    from ltcl.acquisition import Project
+    from ltcl.acquisition import Project, kept
 
     project = Project.open(folder)
     if project.state == "begun":
-        raise InputError(f"{project.store}: is begun; 'ltcl acquire resume {folder}' goes on")
+        raise InputError(f"{project.store}: is begun; {project.next} goes on")
+    if project.state == "new" and project.kept:
+        raise InputError(
+            f"{kept.place(project.store)}: holds {project.kept} photographs of a calibration that has not "
+            f"ended; {project.next} goes on, and to begin anew it must be removed"
+        )
     if project.state == "final":
         raise InputError(
             f"{project.store}: is finished; 'ltcl acquire report {folder}' tells what came of it, and to "
@@ -64,7 +69,7 @@ def resume(
     if project.state == "final":
         _finished(project, device, json)
         return
-    if project.state == "new" and project.kind != "folder":
+    if project.state == "new" and project.kind != "folder" and not project.kept:
         console.note(f"{project.store}: is not begun yet, so this begins with the calibration")
     _go(project, device, json)
 
@@ -94,20 +99,32 @@ def _go(project: Project, device: str | None, json: bool) -> None:
 @contextmanager
 def _ending(project: Project, rig: Any) -> Iterator[None]:
     """What ends an acquisition early is told with the way to go on."""
-    again = f"'ltcl acquire resume {project.folder}'"
     try:
         yield
     except PhotographMissing as error:
         raise _asking(project, rig, error) from None
     except AcquisitionError as error:
-        kept = "what was photographed before is kept" if project.state == "begun" else "nothing is kept yet"
-        raise AcquisitionError(f"{error}; {kept}, {again} goes on") from error
+        raise AcquisitionError(f"{error}; {_left(project)}") from error
     except KeyboardInterrupt:
-        if project.state == "begun":
-            console.note(f"what was photographed is kept in {project.store}; {again} goes on from there")
-        else:
-            console.note(f"the calibration has not ended, and nothing of it is kept; {again} begins it anew")
+        console.note(_left(project))
         raise
+
+
+def _left(project: Project) -> str:
+    """What an acquisition that ended early has left, and how to go on."""
+    from ltcl.acquisition import kept
+
+    if project.state == "begun":
+        return f"what was photographed before is kept in {project.store}, {project.next} goes on"
+    if project.kept:
+        place = kept.place(project.store)
+        return f"{project.kept} photographs of the calibration are kept in {place}, {project.next} goes on"
+    if project.kind == "folder":
+        return (
+            f"photographs that are wrong must be taken anew in {project.folder}/photographs, then 'ltcl "
+            f"acquire resume {project.folder}' goes on"
+        )
+    return f"nothing of the calibration is kept, {project.next} begins it anew"
 
 
 def _asking(project: Project, rig: Any, error: PhotographMissing) -> PhotographMissing:

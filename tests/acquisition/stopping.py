@@ -5,7 +5,8 @@ That process has imported everything and opened no OpenCL device, and forks for 
 a process that had opened one lacks PoCL's threads, and waits for them for ever.)
 
 A child writes what it does into a log, a line each: `stage NAME` when it comes to scan, store or finalize;
-`shot KEY` of every photograph; `block CHANNEL NUMBER` of every block that was committed. It counts events of
+`shot KEY` of every photograph, `kept` when it is of the calibration and was committed; `block CHANNEL NUMBER`
+of every block that was committed. It counts events of
 a stage: photographs, and calls of the system that change the disk. At the one that is asked for it kills
 itself, before, inside or behind it; or it tells, and is killed from outside while it goes on.
 """
@@ -32,6 +33,7 @@ import ltcl
 from ltcl.acquisition import VirtualRig, run
 from ltcl.acquisition.radiometry import Response
 from ltcl.store import BlockStore, zarr_folder
+from ltcl.store.blocks.shelf import Shelf
 
 ROOT = Path(__file__).resolve().parents[2]
 CALLS = ("write", "mkdir", "rename", "replace", "open", "rmdir", "unlink", "fsync", "close")
@@ -76,6 +78,7 @@ class Told(NamedTuple):
     killed: bool
     stage: str  # where it ended
     calibrated: int  # photographs of the calibration
+    kept: int  # of these, committed
     shots: list[str]  # photographs of the scan
     blocks: dict[tuple[int, int], int]  # committed, and how many of `shots` there were then
     events: dict[str, int]  # of each stage, where it was not killed
@@ -125,11 +128,13 @@ class Nursery:
 
 
 def _told(log: Path, killed: bool) -> Told:
-    found = Told(killed, "calibrating", 0, [], {}, {})
+    found = Told(killed, "calibrating", 0, 0, [], {}, {})
     for line in log.read_text().splitlines() if log.exists() else ():
         what, *rest = line.split()
         if what == "stage":
             found = found._replace(stage=rest[0])
+        elif what == "kept":
+            found = found._replace(kept=found.kept + 1)
         elif what == "block":
             found.blocks[int(rest[0]), int(rest[1])] = len(found.shots)
         elif what == "events":
@@ -215,6 +220,12 @@ class _Child:
         rig.photograph = photograph
 
     def count_stages(self, keep: str | None) -> None:
+        put = Shelf.put
+
+        def committed(shelf: Shelf, name: str, array: np.ndarray) -> None:
+            put(shelf, name, array)
+            self.tell("kept")
+
         write, finalize, conclude = BlockStore.write, BlockStore.finalize, zarr_folder.conclude
         scan = run.scan
 
@@ -234,7 +245,9 @@ class _Child:
             scan(*given)
             self.comes_to("loading")
 
-        patched: Any = BlockStore
+        patched: Any = Shelf
+        patched.put = committed
+        patched = BlockStore
         patched.write = written
         patched.finalize = lambda store, **options: kept(store, finalize, **options)
         zarr_folder.conclude = lambda store, *given: kept(store, conclude, *given)

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from ltcl.acquisition import kept
 from ltcl.store import BlockStore
 
 from .stopping import MADE, Moment, Nursery, Told
@@ -108,20 +109,25 @@ def test_killed_and_resumed(tmp_path: Path, nursery: Nursery, strategy: str) -> 
     while stages.total() < KILLS:
         begun, committed = held(path)
         final = path.exists() and BlockStore.open(path).final
+        calibrated = kept.count(path)
         told = nursery.acquire(path, strategy, draw(rng, begun, expected.told.events, stages))
-        if begun:
-            assert told.calibrated == 0
+        lacking = 0 if begun else expected.told.calibrated - calibrated
+        assert told.calibrated <= lacking
+        if told.stage != "calibrating":
+            assert told.calibrated == lacking
         if not final:
             due = still_to_take(expected, committed)
             assert told.shots == due[: len(told.shots)]
         if told.killed:
             stages[told.stage] += 1
-            after = held(path)[1]
+            began, after = held(path)
+            assert began or kept.count(path) >= calibrated + told.kept
             if path.exists() and not BlockStore.open(path).final:
                 assert committed | told.blocks.keys() <= after
                 same_blocks(path, expected.scanned)
         else:
             assert contents(path) == expected.files
+            assert not kept.place(path).exists()
             path = tmp_path / f"{stages.total()}.zarr"
     if path.exists():
         assert not nursery.acquire(path, strategy, None).killed

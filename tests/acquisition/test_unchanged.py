@@ -12,8 +12,8 @@ import pytest
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.unchanged import refuse_other_rig
 from ltcl.errors import InputError
-from ltcl.store import BlockStore
 
+PATH = Path("T.zarr")
 TOLD: dict[str, Any] = {
     "kind": "live",
     "camera": {"kind": "opencv", "source": 0, "locked": {"exposure": True}},
@@ -39,11 +39,6 @@ class Described:
         return self.told
 
 
-def begun(path: Path, told: Any) -> BlockStore:
-    """A store that was begun with a rig that said this."""
-    return BlockStore.create(path, shape=(4, 4), grid=(2, 2), provenance={"acquisition": {"rig": told}})
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -57,8 +52,8 @@ def begun(path: Path, told: Any) -> BlockStore:
         {"shots": 80, "folder": "elsewhere", "seed": 3, "mitsuba": "3.9"},
     ],
 )
-def test_what_differs_between_sessions_passes(tmp_path: Path, change: dict[str, Any]) -> None:
-    refuse_other_rig(begun(tmp_path / "T.zarr", TOLD), Shots(Described({**TOLD, **change})))
+def test_what_differs_between_sessions_passes(change: dict[str, Any]) -> None:
+    refuse_other_rig(TOLD, Shots(Described({**TOLD, **change})), PATH)
 
 
 @pytest.mark.parametrize(
@@ -75,20 +70,19 @@ def test_what_differs_between_sessions_passes(tmp_path: Path, change: dict[str, 
         ({"iso": "200"}, "rig.iso is '200', but {path} was begun with None"),
     ],
 )
-def test_another_set_up_is_refused_by_its_key(tmp_path: Path, change: dict[str, Any], part: str) -> None:
-    path = tmp_path / "T.zarr"
+def test_another_set_up_is_refused_by_its_key(change: dict[str, Any], part: str) -> None:
     with pytest.raises(InputError) as error:
-        refuse_other_rig(begun(path, TOLD), Shots(Described({**TOLD, **change})))
-    assert part.format(path=path) in str(error.value)
+        refuse_other_rig(TOLD, Shots(Described({**TOLD, **change})), PATH)
+    assert part.format(path=PATH) in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_a_store_that_does_not_say_is_refused(tmp_path: Path) -> None:
+def test_a_store_that_does_not_say_is_refused() -> None:
     with pytest.raises(InputError, match=r"rig\.camera\.kind is 'opencv', but .* was begun with None"):
-        refuse_other_rig(begun(tmp_path / "T.zarr", [1, 2]), Shots(Described(TOLD)))
+        refuse_other_rig([1, 2], Shots(Described(TOLD)), PATH)
 
 
-def test_a_rig_that_says_nothing_goes_on(tmp_path: Path) -> None:
+def test_a_rig_that_says_nothing_goes_on() -> None:
     silent = Described(None)
     silent.describe = None  # pyright: ignore[reportAttributeAccessIssue]
-    refuse_other_rig(begun(tmp_path / "T.zarr", {"kind": "Described"}), Shots(silent))
+    refuse_other_rig({"kind": "Described"}, Shots(silent), PATH)

@@ -144,18 +144,23 @@ def test_what_is_interrupted_is_resumed(
         Ending(patch, 20, KeyboardInterrupt())
         early = program("acquire", "run", scan)
     assert (early.code, early.out) == (130, "")
-    assert "nothing of it is kept; 'ltcl acquire resume" in early.err
+    place = f"{scan / 'transport.zarr'}.calibration"
+    assert f"19 photographs of the calibration are kept in {place}, 'ltcl acquire resume" in early.err
+    program("acquire", "run", scan).refused(
+        f"{place}: holds 19 photographs", f"acquire resume {scan}' goes on"
+    )
+    program("acquire", "report", scan).refused("is not begun; 'ltcl acquire resume")
     with monkeypatch.context() as patch:
         Ending(patch, 200, KeyboardInterrupt())
-        late = program("acquire", "run", scan)
+        late = program("acquire", "resume", scan)
     assert late.code == 130
-    assert f"kept in {scan / 'transport.zarr'}; 'ltcl acquire resume {scan}' goes on from there" in late.err
+    assert f"is kept in {scan / 'transport.zarr'}, 'ltcl acquire resume {scan}' goes on" in late.err
     program("acquire", "run", scan).refused(f"is begun; 'ltcl acquire resume {scan}' goes on")
     program("acquire", "report", scan).refused("is still being scanned")
     program("acquire", "finalize", scan).refused("batches of patterns are not photographed", "acquire resume")
     with monkeypatch.context() as patch:
         Ending(patch, 10, OSError("unplugged"))
-        program("acquire", "resume", scan).refused("unplugged", "is kept, 'ltcl acquire resume", "goes on")
+        program("acquire", "resume", scan).refused("unplugged", "is kept in", "goes on")
     assert program("acquire", "resume", scan, "--json").code == 0
     found, whole = (BlockStore.open(one / "transport.zarr") for one in (scan, acquired))
     for b in range(whole.layout.blocks()):
@@ -286,9 +291,13 @@ def test_progress_is_told(program: Program, scan: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(console, "_PATIENCE", -1.0)
     monkeypatch.setattr(console, "_AGAIN", 0.0)
     lines = program("acquire", "run", scan).err.splitlines()
-    stages = [line.removeprefix("ltcl: calibration: ") for line in lines if "calibration: " in line]
-    assert {"exposure", "geometry", "response", "noise", "black", "white", "projector"} <= set(stages)
-    assert stages[0] == "exposure"
+    told = [line.removeprefix("ltcl: calibration: ").split() for line in lines if "calibration: " in line]
+    stages, numbers = [words[0].rstrip(",") for words in told], [int(words[-1]) for words in told]
+    wanted = ["exposure", "response", "geometry", "noise", "exposures", "black", "white", "projector"]
+    assert stages == wanted
+    assert numbers[0] == 1
+    assert numbers == sorted(numbers)
+    assert numbers[-1] > 50
     assert any(line.startswith("ltcl: pixel: ") for line in lines)
     counted = [line.split()[1] for line in lines if " of 34 patterns" in line and "pixel: " not in line]
     assert counted == [str(n) for n in range(35)]

@@ -79,6 +79,8 @@ class FolderRig:
            [128, 128]], dtype=uint8)
     """
 
+    keeps_photographs = True
+
     def __init__(
         self,
         folder: str | os.PathLike[str],

@@ -155,6 +155,10 @@ class VirtualRig:
         value = self._sensitivity * seconds * self.radiance(codes)
         return self._sensor.expose(np.maximum(value, 0.0), self._noise.of(codes, seconds))
 
+    def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
+        """Pass over the noise of a photograph that was taken in an earlier session."""
+        self._noise.of(as_codes(codes, self.projector_grid, self.channels), as_seconds(seconds))
+
     def radiance(self, codes: Any) -> np.ndarray:
         """L, without a sensor: float64, (H, W) or (H, W, 3). What the photographs are to be compared with.
 

@@ -87,15 +87,12 @@ def tidy(root: Path) -> int:
         for folder in (root / FOLDER).iterdir():
             if fcntl is None or folder.is_symlink() or not folder.is_dir():
                 continue
-            handle = os.open(folder, os.O_RDONLY)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(folder, ignore_errors=True)
-                removed += 1
-            except BlockingIOError:  # somebody is at work there
-                pass
-            finally:
-                os.close(handle)
+            handle = try_lock(folder)
+            if handle is None:  # somebody is at work there
+                continue
+            shutil.rmtree(folder, ignore_errors=True)
+            os.close(handle)
+            removed += 1
     return removed
 
 
@@ -147,6 +144,19 @@ def _lock(path: Path) -> int:
         return -1
     handle = os.open(path, os.O_RDONLY)
     fcntl.flock(handle, fcntl.LOCK_EX)
+    return handle
+
+
+def try_lock(path: Path) -> int | None:
+    """A handle that locks a folder until it is closed; None where another process has it."""
+    if fcntl is None:
+        return -1
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        return None
     return handle
 
 

@@ -36,7 +36,7 @@ def check(path: Path, overwrite: bool) -> None:
         target = _target(path)
         _refuse_other(path, target, overwrite)
         target.parent.mkdir(parents=True, exist_ok=True)
-        probe = _hidden(target) if target.exists() else target
+        probe = hidden(target) if target.exists() else target
         probe.mkdir()
         probe.rmdir()
 
@@ -49,7 +49,7 @@ def beside(path: Path, overwrite: bool) -> Iterator[Path]:
     killed between two renames leaves it under a hidden name beside.)
     """
     target = _target(path)
-    folder, old = _hidden(target), _hidden(target)
+    folder, old = hidden(target), hidden(target)
     with aside.refusing(path, "the store"):
         _refuse_other(path, target, overwrite)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -88,7 +88,7 @@ def _target(path: Path) -> Path:
         raise FileError(f"{path}: the store cannot be written: {error}") from None
 
 
-def _hidden(target: Path) -> Path:
+def hidden(target: Path) -> Path:
     """A new name beside it."""
     return target.with_name(f".{target.name[:80]}-{secrets.token_hex(6)}")
 
