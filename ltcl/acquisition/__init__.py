@@ -6,7 +6,8 @@
                 live (a camera on a cable and a second display)
     radiometry/ light from codes: response, noise, exposures, black, merging, colours
     geometry/   which projector pixel a camera pixel sees: Gray code, phase shift, resampling
-    calibration, measuring, exposing    all that is measured once of a set-up, and for how many seconds
+    calibration, measuring, ramps, taking, exposing, agreeing, stuck    all that is measured once of a set-up:
+                for how many seconds, from photographs that do not contradict each other
     scanning/   which pixels are lit when, and T from the pictures; plan before, report after
     task, run   acquire: all of it, into a store, stopped and resumed; kept: photographs of a calibration
     forecasting how far pictures and bounces are off by the noise of the scan
