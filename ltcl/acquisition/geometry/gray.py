@@ -167,6 +167,7 @@ class _Plane:
         self.bits, self.size, self.narrow = bits, size, narrow
         self.value, self.width, self.confidence = (np.zeros((H, W), np.float32) for _ in range(3))
         self.place = np.zeros((H, W), np.int32)
+        self.flips = _flips(bits, narrow and bits > 1)
         self.edges = Edges(self.place, *(np.full((H, W), np.nan, np.float32) for _ in range(2)))
 
     def axis(self, edges: bool) -> Axis:
@@ -198,23 +199,24 @@ class _Plane:
         of two neighbouring columns one bit flips, or with narrow stripes all, where the finest one does.
         """
         low, W = self.place[rows].ravel(), self.place.shape[1]
-        bit, size = self._flipped(), low.size
+        size = low.size
         if self.narrow and self.bits > 1:
             difference = np.concatenate([difference, difference.sum(axis=0, keepdims=True)])
         for out, step in ((self.edges.right[rows], 1), (self.edges.below[rows], W)):
             site = np.flatnonzero(np.abs(low[step:] - low[:-step]) == 1)
-            index = bit[np.maximum(low[site], low[site + step])] * size + site
+            index = self.flips.take(np.maximum(low.take(site), low.take(site + step))) * size + site
             before, after = difference.take(index), difference.take(index + step)
             total = before + after
-            out.ravel()[site] = np.divide(before, total, out=np.full_like(total, np.nan), where=total > 0)
+            total[total <= 0] = np.nan
+            out.ravel()[site] = before / total
         self.edges.right[rows, -1] = np.nan  # no neighbour, but the first of the next row
 
-    def _flipped(self) -> np.ndarray:
-        """Which bit tells n - 1 and n apart, highest first; where all do, their number."""
-        n = np.arange(1 << self.bits)
-        order = self.bits - np.frexp((n & -n).astype(np.float64))[1]
-        every = self.narrow and self.bits > 1
-        return np.where(every & (order == self.bits - 1), self.bits, order)
+
+def _flips(bits: int, narrow: bool) -> np.ndarray:
+    """Which bit tells n - 1 and n apart, highest first; where narrow stripes flip all, their number."""
+    n = np.arange(1 << bits)
+    order = bits - np.frexp((n & -n).astype(np.float64))[1]
+    return np.where(narrow & (order == bits - 1), bits, order)
 
 
 def _number(bits: np.ndarray) -> np.ndarray:

@@ -50,8 +50,8 @@ def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         planes = _planes(axis, valid, reach)
     plane = _at_pixels(axis, valid, planes, reach)
     far = axis.width / 2
-    cell = np.clip(plane, axis.value - far, axis.value + far)
-    return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32), valid
+    cell = axis.value + np.clip(plane - axis.value, -far, far)
+    return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32, copy=False), valid
 
 
 def _fit(axis: Axis, plane: np.ndarray) -> np.ndarray:
@@ -82,7 +82,7 @@ def _at_pixels(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) ->
     (Kuwahara et al. 1976), and then smaller ones.
     """
     value = planes[0].copy()
-    v, u = np.nonzero(valid & (planes[3] > SPREAD))
+    v, u = np.divmod(np.flatnonzero(valid & (planes[3] > SPREAD)), valid.shape[1])
     while len(v):
         value[v, u], spread = _best(axis, planes, reach, v, u)
         if reach <= SMALLEST:
@@ -159,8 +159,9 @@ def _plane(sums: list[np.ndarray], top: int, out: np.ndarray) -> None:
     """Weighted least-squares planes from their ten moments: value at the pixel, b, c, spread; (4, h, W)."""
     h, W = sums[0].shape
     v, u = np.ogrid[float(top) : top + h, : float(W)]
-    n = np.maximum(sums[0], 1e-6)  # no valid pixel near
-    mean_u, mean_v, mean_x, uu, uv, vv, ux, vx, xx = (m / n for m in sums[1:])
+    n, *means = sums
+    part = 1.0 / np.maximum(n, 1e-6)  # no valid pixel near
+    mean_u, mean_v, mean_x, uu, uv, vv, ux, vx, xx = (np.multiply(m, part, out=m) for m in means)
     # A little more spread than there is: edges on one line tell the slope across it only.
     uu += 1e-3 - mean_u**2
     vv += 1e-3 - mean_v**2
