@@ -23,11 +23,24 @@ ENOUGH = 6  # pairs that tell a variance
 
 @dataclass(frozen=True)
 class Bits:
-    """Decisions on B bits, (B, ...) each: `on`, `certain`, and by how much of l_d the two pictures differ."""
+    """Decisions on B bits, (B, ...) each: `on`, `certain`, and by how much the two pictures differ.
+
+    `part` (...) is what takes a difference to a part of l_d; 0 where that is too little to count.
+    """
 
     on: np.ndarray
     certain: np.ndarray
-    confidence: np.ndarray
+    difference: np.ndarray
+    part: np.ndarray
+
+    def __getitem__(self, some: slice) -> Bits:
+        """Some of the bits."""
+        return Bits(self.on[some], self.certain[some], self.difference[some], self.part)
+
+    @property
+    def confidence(self) -> np.ndarray:
+        """(...), in [0, 1]: by what part of l_d the two pictures of the weakest bit differ."""
+        return np.minimum(self.difference.min(axis=0) * self.part, 1.0)
 
 
 def direct_global(lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,16 +65,21 @@ def noise(pattern: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """
     if len(pattern) < 2:
         return np.zeros(pattern.shape[1:], np.float32)
-    total, difference = pattern + inverse, np.abs(pattern - inverse)
-    plain = total.var(axis=0, ddof=1)
-    far = difference > 0.7 * difference.max(axis=0)
-    count = np.count_nonzero(far, axis=0)
+    total, difference = pattern + inverse, pattern - inverse
+    np.abs(difference, out=difference)
     total -= total.mean(axis=0)  # small numbers, for the squares
+    plain = _squares(total) / (len(total) - 1)
+    far = np.greater(difference, 0.7 * difference.max(axis=0), out=difference)
+    count = far.sum(axis=0).astype(np.float64)
     total *= far
     mean = total.sum(axis=0) / np.maximum(count, 1)
-    square = np.einsum("b...,b...->...", total, total)
-    chosen = np.maximum(square - count * mean**2, 0.0) / np.maximum(count - 1, 1)
+    chosen = np.maximum(_squares(total) - count * mean**2, 0.0) / np.maximum(count - 1, 1)
     return np.where(count >= ENOUGH, np.minimum(chosen, plain), plain) / 2.0
+
+
+def _squares(stack: np.ndarray) -> np.ndarray:
+    """Their sum over the pictures (B, ...)."""
+    return np.einsum("b...,b...->...", stack, stack)
 
 
 def classify(
@@ -93,8 +111,8 @@ def classify(
     --------
     A pixel in much indirect light: it is lit in the first pattern; the second tells nothing.
 
-    >>> one, lit = np.ones(1), np.array([[5.0], [3.0]])
-    >>> bits = classify(lit, np.array([[1.0], [2.5]]), 2 * one, 4 * one, 0.1 * one, one > 0, 0 * one)
+    >>> one, lit, two = np.ones(1), np.array([[5.0], [3.0]]), np.ones(2)
+    >>> bits = classify(lit, np.array([[1.0], [2.5]]), 2 * one, 4 * one, 0.1 * one, two > 0, 0 * two)
     >>> bits.on[:, 0].tolist(), bits.certain[:, 0].tolist()
     ([True, True], [True, False])
     """
@@ -103,11 +121,11 @@ def classify(
     np.abs(difference, out=difference)
     certain = difference > least
     for k in np.flatnonzero(uneven):
-        certain[k] &= difference[k] > least + uneven[k] * indirect
+        certain[k] &= difference[k] > least + float(uneven[k]) * indirect
     certain &= direct > least
-    dim = direct <= indirect
-    if wide.any() and dim.any():
-        told = (np.maximum(pattern, inverse) > indirect) & (np.minimum(pattern, inverse) < direct)
-        certain &= told | ~(dim & wide.reshape(-1, *[1] * dim.ndim))
-    difference *= np.where(direct > least, 1.0 / np.maximum(direct, least), 0.0)
-    return Bits(on, certain, np.minimum(difference, 1.0, out=difference))
+    bright = direct > indirect
+    for k in np.flatnonzero(wide) if not bright.all() else ():
+        lit, other = np.maximum(pattern[k], inverse[k]), np.minimum(pattern[k], inverse[k])
+        certain[k] &= bright | ((lit > indirect) & (other < direct))
+    part = np.where(direct > least, 1.0 / np.maximum(direct, least), 0.0)
+    return Bits(on, certain, difference, part)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,3 +96,16 @@ def side(n: int) -> int:
     [0, 1, 2, 6, 7]
     """
     return (n - 1).bit_length()
+
+
+def strips(H: int, rows: int, work: Callable[[slice], None]) -> None:
+    """Do `work` on slices of at most `rows` (at least one) of H rows, side by side.
+
+    >>> found = []
+    >>> strips(5, 3, found.append)
+    >>> sorted(found, key=lambda part: part.start)
+    [slice(0, 3, None), slice(3, 5, None)]
+    """
+    parts = [slice(top, min(top + max(rows, 1), H)) for top in range(0, H, max(rows, 1))]
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(parts))) as pool:
+        list(pool.map(work, parts))

@@ -20,7 +20,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition.geometry import classification, consistency
-from ltcl.acquisition.geometry.decoded import Axis, Edges, photographs, side
+from ltcl.acquisition.geometry.decoded import Axis, Edges, photographs, side, strips
 from ltcl.errors import InputError
 
 STRIP = 1 << 19  # values of all pictures of a strip of rows: they stay in the cache
@@ -106,16 +106,20 @@ class GrayCode:
             _Plane(H, W, n, size, self.high_frequency)
             for n, size in zip(self.bits, self.grid[::-1], strict=True)
         ]
-        rows = max(STRIP // (W * self.count), 1)
-        for top in range(0, H, rows):
+        light = self._light()
+
+        def strip(rows: slice) -> None:
             # One row more: edges between this strip and the next.
-            self._strip(pictures, slice(top, min(top + rows + edges, H)), both, least, sigmas, edges)
+            more = slice(rows.start, min(rows.stop + edges, H))
+            self._strip(pictures, more, both, least, sigmas, edges, light)
+
+        strips(H, STRIP // (W * self.count), strip)
         x, y = (plane.axis(edges) for plane in both)
         if self.high_frequency:
             x, y = consistency.confirmed(x, both[0].place), consistency.confirmed(y, both[1].place)
         return x, y
 
-    def _strip(self, pictures, rows, both, least, sigmas, edges) -> None:
+    def _strip(self, pictures, rows, both, least, sigmas, edges, light) -> None:
         stack = np.stack(
             [picture[rows] for picture in pictures[:-2]] or [pictures[-2][rows]], dtype=np.float32
         )
@@ -130,13 +134,12 @@ class GrayCode:
         if self.high_frequency:  # neighbours may confirm faint bits, but not those of noise in the dark
             lit = direct > DARK * threshold
             threshold = np.maximum(threshold, FAINT * direct)
-        found = classification.classify(pattern, inverse, direct, indirect, threshold, *self._light())
+        found = classification.classify(pattern, inverse, direct, indirect, threshold, *light)
         split = self.bits[0]
         for plane, part in ((both[0], slice(0, split)), (both[1], slice(split, None))):
-            bits = classification.Bits(found.on[part], found.certain[part], found.confidence[part])
-            plane.fill(rows, bits, lit)
+            plane.fill(rows, found[part], lit)
             if edges and plane.bits:
-                plane.mark(rows, bits.on, np.abs(pattern[part] - inverse[part]))
+                plane.mark(rows, found.difference[part])
 
     def _bits_of(self, n: int) -> list[np.ndarray]:
         place = np.arange(n)
@@ -164,6 +167,7 @@ class _Plane:
         self.bits, self.size, self.narrow = bits, size, narrow
         self.value, self.width, self.confidence = (np.zeros((H, W), np.float32) for _ in range(3))
         self.place = np.zeros((H, W), np.int32)
+        self.flips = _flips(bits, narrow and bits > 1)
         self.edges = Edges(self.place, *(np.full((H, W), np.nan, np.float32) for _ in range(2)))
 
     def axis(self, edges: bool) -> Axis:
@@ -177,42 +181,55 @@ class _Plane:
             certain = np.concatenate([certain[:-1] & certain[-1], certain[-1:]])
         code, undecided = _number(on), _number(~certain)
         low = _binary(code)
-        value, width = low.astype(np.float32), np.ones(low.shape, np.float32)
         other = _binary(code ^ undecided)
         edge = (undecided != 0) & (undecided & (undecided - 1) == 0) & (np.abs(low - other) == 1)
-        value[edge] = (low[edge] + other[edge]) / 2.0
-        width[edge] = 2.0
+        width = 1 + edge.astype(np.float32)
+        value = np.where(edge, low + other, 2 * low) * np.float32(0.5)
         rough = (undecided != 0) & ~edge
         if rough.any():
             value[rough], width[rough] = _coarse(low[rough], undecided[rough], self.size)
         width[~lit | (value > self.size - 1)] = np.inf
         self.value[rows], self.width[rows], self.place[rows] = value, width, low
-        self.confidence[rows] = bits.confidence.min(axis=0) if self.bits else lit
+        self.confidence[rows] = bits.confidence if self.bits else lit
 
-    def mark(self, rows: slice, on: np.ndarray, difference: np.ndarray) -> None:
+    def mark(self, rows: slice, difference: np.ndarray) -> None:
         """Where the difference of pattern and inverse passes zero between a pixel and the next.
 
         Albedo scales both pictures alike, and blur is even about an edge: neither moves the zero. At an edge
-        of two neighbouring columns one bit flips, or with narrow stripes several, all in the same place.
+        of two neighbouring columns one bit flips, or with narrow stripes all, where the finest one does.
         """
-        low = self.place[rows]
-        right, below = self.edges.right[rows][:, :-1], self.edges.below[rows][:-1]
-        for out, here, there in (
-            (right, np.s_[..., :, :-1], np.s_[..., :, 1:]),
-            (below, np.s_[..., :-1, :], np.s_[..., 1:, :]),
-        ):
-            flip = (on[here] != on[there]) & (np.abs(low[here] - low[there]) == 1)
-            before = np.where(flip, difference[here], 0.0).sum(axis=0)
-            total = before + np.where(flip, difference[there], 0.0).sum(axis=0)
-            np.divide(before, total, out=out, where=total > 0)
+        low, W = self.place[rows].ravel(), self.place.shape[1]
+        size = low.size
+        if self.narrow and self.bits > 1:
+            difference = np.concatenate([difference, difference.sum(axis=0, keepdims=True)])
+        for out, step in ((self.edges.right[rows], 1), (self.edges.below[rows], W)):
+            site = np.flatnonzero(np.abs(low[step:] - low[:-step]) == 1)
+            index = self.flips.take(np.maximum(low.take(site), low.take(site + step))) * size + site
+            before, after = difference.take(index), difference.take(index + step)
+            total = before + after
+            total[total <= 0] = np.nan
+            out.ravel()[site] = before / total
+        self.edges.right[rows, -1] = np.nan  # no neighbour, but the first of the next row
+
+
+def _flips(bits: int, narrow: bool) -> np.ndarray:
+    """Which bit tells n - 1 and n apart, highest first; where narrow stripes flip all, their number."""
+    n = np.arange(1 << bits)
+    order = bits - np.frexp((n & -n).astype(np.float64))[1]
+    return np.where(narrow & (order == bits - 1), bits, order)
 
 
 def _number(bits: np.ndarray) -> np.ndarray:
     """Bits (B, ...), highest first, as whole numbers."""
     code = np.zeros(bits.shape[1:], np.int32)
-    for bit in bits:
-        code <<= 1
-        code |= bit
+    for start in range(0, len(bits), 8):
+        part = bits[start : start + 8].view(np.uint8)
+        byte = part[0].copy()
+        for bit in part[1:]:
+            byte <<= 1
+            byte |= bit
+        code <<= len(part)
+        code |= byte
     return code
 
 

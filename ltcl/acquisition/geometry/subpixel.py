@@ -15,12 +15,10 @@ Known limit: beside the border of an object pixels are off by some tenths, and s
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 
-from ltcl.acquisition.geometry.decoded import Axis, Edges
+from ltcl.acquisition.geometry.decoded import Axis, Edges, strips
 
 LEAVES = 0.25
 COMPANY = 5  # side of a window
@@ -45,14 +43,15 @@ def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return axis.value, valid
     reach = _reach(axis.edges, valid)
     planes = _planes(axis, valid, reach)
-    fits = _fit(axis, planes[0]) | _in_company(valid & ~_fit(axis, planes[0]))
-    if not fits[valid].all():  # edges beside them are none
-        valid = valid & fits
+    odd = valid & ~_fit(axis, planes[0])
+    odd &= ~_in_company(odd)
+    if odd.any():  # edges beside them are none
+        valid = valid & ~odd
         planes = _planes(axis, valid, reach)
     plane = _at_pixels(axis, valid, planes, reach)
     far = axis.width / 2
-    cell = np.clip(plane, axis.value - far, axis.value + far)
-    return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32), valid
+    cell = axis.value + np.clip(plane - axis.value, -far, far)
+    return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32, copy=False), valid
 
 
 def _fit(axis: Axis, plane: np.ndarray) -> np.ndarray:
@@ -63,11 +62,16 @@ def _fit(axis: Axis, plane: np.ndarray) -> np.ndarray:
 def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
     """Planes through the window about each pixel: value there, slopes b and c, spread about it; (4, H, W)."""
     H, W = valid.shape
-    planes, rows = np.empty((4, H, W)), max(STRIP // W, 4 * reach)
-    for top in range(0, H, rows):
-        first, last = max(top - reach, 0), min(top + rows + reach, H)
-        part = _plane(_moments(axis, valid, slice(first, last), 2 * reach + 1))
-        planes[:, top : top + rows] = part[:, top - first :][:, : min(rows, H - top)]
+    planes = np.empty((4, H, W), np.float32)
+
+    def strip(rows: slice) -> None:
+        above = min(reach, rows.start)
+        # One row more: edges below the last one of the window.
+        more = slice(rows.start - above, min(rows.stop + reach + 1, H))
+        own = slice(above, above + rows.stop - rows.start)
+        _plane([m[own] for m in _moments(axis, valid, more, 2 * reach + 1)], above, planes[:, rows])
+
+    strips(H, max(STRIP // W, 4 * reach), strip)
     return planes
 
 
@@ -78,7 +82,7 @@ def _at_pixels(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) ->
     (Kuwahara et al. 1976), and then smaller ones.
     """
     value = planes[0].copy()
-    v, u = np.nonzero(valid & (planes[3] > SPREAD))
+    v, u = np.divmod(np.flatnonzero(valid & (planes[3] > SPREAD)), valid.shape[1])
     while len(v):
         value[v, u], spread = _best(axis, planes, reach, v, u)
         if reach <= SMALLEST:
@@ -119,50 +123,55 @@ def _reach(edges: Edges, valid: np.ndarray) -> int:
 
 
 def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np.ndarray]:
-    """Sums over the window about each pixel of w, w u, w v, w x, w uu, w uv, w vv, w ux, w vx and w xx."""
-    total: list[np.ndarray] = []
-    for w, u, v, x in _observations(axis, valid, rows):
-        wu, wv = w * u, w * v
-        wx = w * x
-        moments = [w, wu, wv, wx, wu * u, wu * v, wv * v, wu * x, wv * x, wx * x]
-        total = [a + b for a, b in zip(total, moments, strict=True)] if total else moments
+    """Sums over the window about each pixel of w, w u, w v, w x, w uu, w uv, w vv, w ux, w vx and w xx.
+
+    Edges to the right are at (u + r, v), those below at (u, v + d), with r and d in [0, 1].
+    """
+    edges, valid = axis.edges, valid[rows]
+    assert edges is not None  # noqa: S101  (said by `refine`)
+    v, u = np.ogrid[: float(len(valid)), : float(valid.shape[1])]
+    n, value, place = axis.weight * valid, axis.value[rows].astype(np.float64), edges.place[rows]
+    x = n * value
+    xx = x * value
+    shifts = []
+    for part, here, there in (
+        (edges.right[rows], np.s_[:, :-1], np.s_[:, 1:]),
+        (edges.below[rows], np.s_[:-1], np.s_[1:]),
+    ):
+        seen = np.isfinite(part[here]) & valid[here] & valid[there]
+        t, tx = np.zeros_like(n), np.zeros_like(n)
+        np.copyto(t[here], part[here], where=seen)
+        between = seen * (0.5 * (place[here] + place[there]))
+        np.multiply(t[here], between, out=tx[here])
+        shifts += [t, tx]
+        n[here] += seen
+        x[here] += between
+        xx[here] += between * between
+    r, rx, d, dx = shifts
+    nu, nv = n * u + r, n * v + d
+    total = [n, nu, nv, x, (nu + r) * u + r * r, nu * v + d * u, (nv + d) * v + d * d]
+    total += [x * u + rx, x * v + dx, xx]
     size = (window, window)
     return [cv2.boxFilter(m, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT) for m in total]
 
 
-def _observations(axis: Axis, valid: np.ndarray, rows: slice) -> Iterator[tuple[np.ndarray, ...]]:
-    """Weight, place (u, v) and coordinate x of pixels, and of edges to the right and below."""
-    edges, valid, value = axis.edges, valid[rows], axis.value[rows]
-    assert edges is not None  # noqa: S101  (said by `refine`)
-    v, u = (place.astype(np.float64) for place in np.mgrid[: valid.shape[0], : valid.shape[1]])
-    yield np.where(valid, axis.weight, 0.0), u, v, np.where(valid, value, 0.0)
-    place = edges.place[rows]
-    for part, down, right in ((edges.right[rows], 0, 1), (edges.below[rows], 1, 0)):
-        there = (-down, -right)
-        seen = np.isfinite(part) & valid & np.roll(valid, there, (0, 1))
-        if down:
-            seen[-1] = False  # the last row of a strip has no next one
-        t = np.where(seen, part, 0.0)
-        yield (
-            seen.astype(np.float64),
-            u + right * t,
-            v + down * t,
-            (place + np.roll(place, there, (0, 1))) / 2,
-        )
-
-
-def _plane(sums: list[np.ndarray]) -> np.ndarray:
-    """Weighted least-squares planes from their ten moments: value at the pixel, b, c, spread; (4, H, W)."""
-    H, W = sums[0].shape
-    v, u = np.mgrid[:H, :W]
-    n, U, V, X, UU, UV, VV, UX, VX, XX = sums
-    n = np.maximum(n, 1e-6)  # no valid pixel near
-    mean_u, mean_v, mean_x = U / n, V / n, X / n
-    uu, uv, vv = UU / n - mean_u**2, UV / n - mean_u * mean_v, VV / n - mean_v**2
-    ux, vx, xx = UX / n - mean_u * mean_x, VX / n - mean_v * mean_x, XX / n - mean_x**2
+def _plane(sums: list[np.ndarray], top: int, out: np.ndarray) -> None:
+    """Weighted least-squares planes from their ten moments: value at the pixel, b, c, spread; (4, h, W)."""
+    h, W = sums[0].shape
+    v, u = np.ogrid[float(top) : top + h, : float(W)]
+    n, *means = sums
+    part = 1.0 / np.maximum(n, 1e-6)  # no valid pixel near
+    mean_u, mean_v, mean_x, uu, uv, vv, ux, vx, xx = (np.multiply(m, part, out=m) for m in means)
     # A little more spread than there is: edges on one line tell the slope across it only.
-    uu, vv = uu + 1e-3, vv + 1e-3
+    uu += 1e-3 - mean_u**2
+    vv += 1e-3 - mean_v**2
+    uv -= mean_u * mean_v
+    ux -= mean_u * mean_x
+    vx -= mean_v * mean_x
+    xx -= mean_x**2
     det = np.maximum(uu * vv - uv**2, 1e-9)
     b, c = (ux * vv - vx * uv) / det, (vx * uu - ux * uv) / det
-    spread = np.where(n >= EDGES, np.sqrt(np.maximum(xx - b * ux - c * vx, 0.0)), np.inf)
-    return np.stack([mean_x + b * (u - mean_u) + c * (v - mean_v), b, c, spread])
+    out[:3] = mean_x + b * (u - mean_u) + c * (v - mean_v), b, c
+    out[3] = np.maximum(xx - b * ux - c * vx, 0.0)
+    np.sqrt(out[3], out=out[3])
+    out[3][n < EDGES] = np.inf

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from ltcl.acquisition.geometry import Correspondence, GrayCode, classification, decode
+from ltcl.acquisition.geometry import Correspondence, GrayCode, classification, decode, gray, subpixel
 from ltcl.errors import InputError
-from tests.acquisition.geometry.scenes import Rig, homography
+from tests.acquisition.geometry.scenes import MAPS, Rig, homography
 
 GRIDS = [(1, 1), (1, 2), (7, 1), (1, 53), (3, 5), (16, 16), (53, 7), (64, 64), (45, 100)]
 
@@ -178,3 +178,18 @@ def test_noise_is_known_without_more_photographs(gamma):
     for pair, full in zip(pairs, ends, strict=True):
         pair[2:] = full[2:]
     assert np.mean(classification.noise(*pairs)) == pytest.approx(sigma**2, rel=0.1)
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+def test_it_is_the_same_map_wherever_strips_of_rows_end(monkeypatch, narrow) -> None:
+    grid, camera = (60, 83), (97, 111)
+    rig = Rig(*MAPS["fold"](camera, grid), grid, noise=0.01, indirect=0.1, bits=8)
+    images = [rig.photograph(p, 1 / 60) for p in GrayCode(grid, narrow).patterns()]
+    whole = decode(images, grid, high_frequency=narrow)
+    monkeypatch.setattr(gray, "STRIP", 1)
+    monkeypatch.setattr(subpixel, "STRIP", 1)
+    strips = decode(images, grid, high_frequency=narrow)
+    assert np.array_equal(strips.valid, whole.valid)
+    assert np.array_equal(strips.confidence, whole.confidence)
+    for found, all_at_once in ((strips.x, whole.x), (strips.y, whole.y)):
+        assert np.allclose(found, all_at_once, atol=1e-4, rtol=0, equal_nan=True)
