@@ -14,9 +14,10 @@ the pixels that one of both lights alone. Refused are, beyond 6 standard deviati
 
     exchanged   cycles of the assignment with most votes that gain 0.15 of D / 2, and 8 votes; or fewer where
                 all show 4 times as much where the other is lit as where they are, and as the other shows
-    repeated    one that gains a quarter of D / 2, and 4 votes, for the pattern of another
+    repeated    one that gains 0.35 of D / 2, and 3 votes, for the pattern of another
     strange     those that show less than 1/4 of the light where they are lit (8 pixels), and more than half
-                of white at as many pixels that are not; or of which others show what is lit there
+                of white at a quarter as many that are not, or at one where most of the batch is strange; or
+                of which others show what is lit there
     missing     where the last pattern is the sum of the others: one that shows less than 1/4 where it is
                 lit, which the last shows; or the last
 
@@ -43,6 +44,7 @@ _SIGMAS, _SURE = 6.0, 4.0  # the latter where it is asked for something else as 
 _SPREAD = 0.25  # standard deviation of s that counts half
 _LEAST = 0.25  # of white: less than that of a batch at a pixel is not taken for all of its light
 _PART = 0.15  # of D / 2 that an exchange gains
+_SHOWN, _VOTES = 0.35, 3.0  # of D / 2, and at least, that one picture alone gains
 _LITTLE, _CERTAIN, _MUCH = 0.25, 0.4, 0.5  # of the light at a pixel
 _FEW = 8.0  # pixels, fewer of which may be mirrors
 _CLEAR = 5.0  # standard deviations that white is above 0 where it tells what a pixel shows
@@ -182,7 +184,7 @@ class Shares:
         shown, kept = _alone(weight * self.share, on)
         noise = np.sqrt(np.maximum(sum(_alone((weight * self.sigma) ** 2, on)), 0.0))  # of rounding
         there, here = shown / np.maximum(other, 1e-9), kept / np.maximum(own, 1e-9)
-        clear = (there >= _CERTAIN) & (_LITTLE * there >= np.maximum(here, self.own()[1]))
+        clear = (there >= _CERTAIN) & (_LITTLE * there >= np.maximum(here, here.T))
         return Moves(shown - kept - 0.5 * (other - own), noise, 0.5 * (other + own), clear)
 
 
@@ -190,7 +192,7 @@ class Moves(NamedTuple):
     """Of picture a and pattern b, (k, k): V(a, b) - V(a, a), its standard deviation, D / 2.
 
     `clear`: where b alone lights, picture a shows 0.4 of the light, and 4 times as much as where a alone
-    does, and as picture b does where it is lit.
+    does, and as picture b does where it alone is lit.
     """
 
     gain: np.ndarray
@@ -209,7 +211,7 @@ def _others(moves: Moves) -> dict[int, int | None]:
     """Pictures that show the pattern of another, and that."""
     gain, noise, most, _ = moves
     found: dict[int, int | None] = {}
-    much = (gain > _SIGMAS * noise) & (gain >= _LITTLE * most) & (gain >= _LITTLE * _FEW * 2.0)
+    much = (gain > _SIGMAS * noise) & (gain >= _SHOWN * most) & (gain >= _VOTES)
     for a in np.flatnonzero(much.any(axis=1)).tolist():
         found[a] = int(np.argmax(np.where(much[a], gain[a], -np.inf)))
     return found
@@ -244,10 +246,10 @@ def _cycles(best: np.ndarray) -> Iterator[np.ndarray]:
 def _strange(shares: Shares, absent: np.ndarray, beside: np.ndarray) -> list[int]:
     """Pictures that show light elsewhere, or none where others show it."""
     pixels, *_ = shares.own()
-    elsewhere = absent & (beside >= np.maximum(1.0, _LITTLE * pixels))
-    most = 2 * np.count_nonzero(elsewhere) > np.count_nonzero(pixels > 0.5)
-    if not (most and pixels[elsewhere].sum() >= _FEW):
-        elsewhere &= pixels >= _FEW
+    elsewhere = absent & (beside > 0)
+    all_over = 2 * np.count_nonzero(elsewhere) > np.count_nonzero(pixels > 0.5)
+    if not (all_over and pixels[elsewhere].sum() >= _FEW):
+        elsewhere &= (beside >= _LITTLE * pixels) & (pixels >= _FEW)
     dark = shares.absent(shares.shown) & (shares.own(shares.shown)[0] >= _FEW)
     return np.flatnonzero(elsewhere | dark).tolist()
 
