@@ -135,15 +135,38 @@ class Late(VirtualRig):
 
 
 def test_photographs_that_lag_behind_their_patterns(tmp_path: Path) -> None:
+    """Named in the first batch: nothing of it is kept."""
+    text = "photograph 109 shows the pattern of .*; photographs must be in the order of their patterns"
+    refused(AcquisitionError, text, Late(_calibrating() + 1), **SHORT, store=tmp_path / "T.zarr")
+    assert not BlockStore.open(tmp_path / "T.zarr").written
+
+
+class Dimmed(VirtualRig):
+    """Sends half of its light, from some photograph on."""
+
+    def __init__(self, start: int) -> None:
+        super().__init__(scene(GRID), GRID, **CAMERA)
+        self._left = start
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        self._left -= 1
+        return super().photograph(codes * np.float32(1.0 if self._left > 0 else 0.5), seconds)
+
+
+def test_light_that_changes_behind_the_calibration(tmp_path: Path) -> None:
     """Columns then do not add up to white: no transport is made of them."""
-    counted = VirtualRig(scene(GRID), GRID, **CAMERA)
-    shots = Shots(counted)
-    measure(shots, geometry="aligned", frames=2, response=LINE, exposures=[0.5])
     text = (
         "columns of T add up to light that is .* beside what white showed; photographs must be in the order"
     )
-    refused(AcquisitionError, text, Late(shots.count + 1), **SHORT, store=tmp_path / "T.zarr")
+    refused(AcquisitionError, text, Dimmed(_calibrating() + 1), **SHORT, store=tmp_path / "T.zarr")
     assert not BlockStore.open(tmp_path / "T.zarr").final
+
+
+def _calibrating() -> int:
+    """Photographs before the first of a scan."""
+    shots = Shots(VirtualRig(scene(GRID), GRID, **CAMERA))
+    measure(shots, geometry="aligned", frames=2, response=LINE, exposures=[0.5])
+    return shots.count
 
 
 def test_some_saturated_pixels_are_masked(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.exposing import telling
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
+from ltcl.acquisition.scanning import order
 from ltcl.acquisition.scanning.block import Blocks
 from ltcl.store import BlockStore
 
@@ -100,14 +101,24 @@ class Pictures(Seen):
         self.shots.prepare((self._codes(part), t) for part in patterns for t in times)
 
     def take(self, patterns: Iterable[np.ndarray], tell: Callable[[], None]) -> list[Picture]:
-        """A picture under each pattern (h, w) of the scan, on where it is not 0; told of each."""
+        """A picture under each pattern (h, w) of the scan, on where it is not 0; told of each.
+
+        Raises
+        ------
+        AcquisitionError
+            Photographs do not show their patterns (`order`).
+        """
+        patterns = list(patterns)
         codes = [self._codes(pattern) for pattern in patterns]
-        times = self.calibration.exposures
+        times, first = self.calibration.exposures, self.shots.count
         self.shots.prepare([(part, t) for part in codes for t in times])
         found = []
         for part in codes:
             found.append(self._picture([self.shots.photograph(part, t) for t in times]))
             tell()
+        lit = np.stack(patterns).reshape(len(found), -1)
+        value, variance = (np.stack(part) for part in zip(*found, strict=True))
+        order.check(lit, value, variance, self.ambient, self.white, lambda a: _numbered(first, a, len(times)))
         return found
 
     def _codes(self, pattern: np.ndarray) -> np.ndarray:
@@ -126,3 +137,13 @@ class Pictures(Seen):
         known = (variance < UNKNOWN) & (self._dark.variance < UNKNOWN)
         value = np.where(known, lit.value - self._dark.value, np.float32(0.0)) / self._scale
         return Picture(value, np.where(known, variance, UNKNOWN).astype(np.float32))
+
+
+def _numbered(before: int, picture: int, each: int) -> str:
+    """The photographs of a picture of a batch, before which there were some.
+
+    >>> _numbered(10, 0, 1), _numbered(10, 1, 2)
+    ('photograph 11', 'photographs 13 to 14')
+    """
+    last = before + (picture + 1) * each
+    return f"photograph {last}" if each == 1 else f"photographs {last + 1 - each} to {last}"
