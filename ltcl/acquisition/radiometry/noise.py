@@ -28,7 +28,7 @@ import scipy.optimize
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.response import Response
-from ltcl.acquisition.radiometry.stack import levels_of, normalised, photographs
+from ltcl.acquisition.radiometry.stack import BLACK, NO_LIGHT, levels_of, normalised, photographs
 from ltcl.errors import InputError
 
 _BINS, _ROUNDS = 64, 10
@@ -172,7 +172,8 @@ def _bins(rows: np.ndarray, model: NoiseModel) -> _Bins:
     dark, full = low > _MOST_CLIPPED, high > _MOST_CLIPPED
     kept = (np.cumsum(dark[::-1])[::-1] == 0) & (np.cumsum(full) == 0)
     if not kept.any():
-        raise InputError("bursts have no pixels between black and saturation; other exposures are needed")
+        why = NO_LIGHT if code.max() < BLACK else "other exposures are needed"
+        raise InputError(f"bursts have no pixels between black and saturation; {why}")
     if not model.levels:
         return _Bins(light, whole, whole, count, np.full_like(light, np.inf))[kept]
     least, most = (pick.reduceat(code, cuts) * (model.levels - 1) for pick in (np.minimum, np.maximum))

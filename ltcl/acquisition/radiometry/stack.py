@@ -17,6 +17,8 @@ from scipy.special import stdtrit
 from ltcl import checks
 from ltcl.errors import InputError
 
+BLACK = 0.05  # of full scale: photographs that reach no more at any exposure show no scene
+NO_LIGHT = "is the lens cap on, the projector off or showing something else, or every exposure far too short?"
 _SEEN = 1 << 14  # pixels that the order of two photographs is told by
 _CLIPPED = 0.98  # codes above tell nothing of an order
 _RATIO = 1.2  # of seconds, below which two photographs may look alike

@@ -79,7 +79,7 @@ class Plan:
     snr_direct, snr_indirect : float
         Signal over noise of an entry on the diagonal and of one beside it.
     error : float
-        e, relative, of T p; infinite where every exposure saturates.
+        e, relative, of T p; 1 at most, as where every exposure saturates.
     why : str
 
     Examples
@@ -220,7 +220,7 @@ class _Run:
             self._disk(name, n, patterns),
             light.direct / math.sqrt(own),
             light.indirect / n / math.sqrt(weak),
-            math.hypot(math.sqrt(whole) / lit, _REST),
+            min(math.hypot(math.sqrt(whole) / lit, _REST), 1.0),
             why,
         )
 

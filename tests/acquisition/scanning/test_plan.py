@@ -119,3 +119,5 @@ def test_what_saturates_has_no_signal() -> None:
     found = plans(GRID, (8.0,), NoiseModel(), Light(direct=0.5))
     assert found["pixel"].snr_direct == 0.0
     assert found["pixel"].snr_indirect > 0.0
+    assert found["pixel"].error == found["hadamard"].error == 1.0  # and JSON holds it
+    assert choose(found)[0] in ("pixel", "adaptive")
