@@ -29,7 +29,13 @@ After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
+
+from ltcl import interrupts
+
+if interrupts.is_program(sys.orig_argv):  # before what takes a while
+    interrupts.end_in_one_line()
 
 from ltcl import errors
 from ltcl.analysis import Analysis, analyze

@@ -81,6 +81,7 @@ def _show(project: Project, known: dict[str, Any], plans: dict[str, Plan], told:
             "disk at most",
             "direct",
             "weak entry",
+            "T p off",
             "how",
         ),
         [
@@ -93,6 +94,7 @@ def _show(project: Project, known: dict[str, Any], plans: dict[str, Plan], told:
                 checks.size(one.disk),
                 f"{one.snr_direct:.3g}",
                 f"{one.snr_indirect:.2g}",
+                f"{100 * one.error:.2g} %",
                 one.why,
             )
             for name, one in plans.items()
@@ -100,8 +102,8 @@ def _show(project: Project, known: dict[str, Any], plans: dict[str, Plan], told:
     )
     more = 200 if known["channels"] == 3 else 100
     typer.echo(
-        f"\ndirect, weak entry: signal over noise; before these come about {more} photographs of "
-        "calibration, and those of the geometry"
+        "\ndirect, weak entry: signal over noise; T p off: a picture, by noise; before these come about "
+        f"{more} photographs of calibration, and those of the geometry"
     )
     if told["asked_for"] == "auto":
         typer.echo(f"auto takes {told['auto']}: {told['why']}")

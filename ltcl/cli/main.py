@@ -216,6 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except KeyboardInterrupt:  # before a command began, or while one was cleaning up
+        console.error("interrupted")
         return 130
     return 0
 

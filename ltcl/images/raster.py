@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import FileError
 from ltcl.images import headers
+from ltcl.images.decoder import overheard
 from ltcl.images.pictures import check_opaque
 
 BITS: dict[str, tuple[int, ...]] = {  # per channel that can be written, the default first
@@ -22,6 +24,8 @@ BITS: dict[str, tuple[int, ...]] = {  # per channel that can be written, the def
     ".tiff": (32, 8, 16),
     ".bmp": (8,),
 }
+_log = logging.getLogger(__name__)
+_PERHAPS = "extraneous bytes before marker"  # that some cameras leave; damaged data leave them, too
 _STORED = ("uint8", "uint16", "float32", "float64")
 
 
@@ -66,7 +70,7 @@ def read(path: Path) -> np.ndarray:
     headers.check_size(headers.declared_size(data), len(data))
     if data.startswith(headers.PNG):
         headers.check_png_chunks(data)
-    stored = _decode(data)
+    stored = _decode(path, data)
     if data[:4] in headers.TIFF:
         with silence:
             pages = cv2.imcount(str(path))
@@ -103,12 +107,20 @@ def write(path: Path, codes: np.ndarray) -> None:
     path.write_bytes(data.tobytes())
 
 
-def _decode(data: bytes) -> np.ndarray:
+def _decode(path: Path, data: bytes) -> np.ndarray:
     try:
-        with silence:
+        with silence, overheard() as said:
             stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise FileError(f"cannot be decoded: {' '.join(error.err.split())}") from None
+    said = [
+        line for line in said if not line.startswith("libpng warning")
+    ]  # of colours and texts, not pixels
+    certain = [line for line in said if _PERHAPS not in line]
+    if certain:
+        raise FileError(f"is damaged; its decoder says: {certain[0]:.200}")
     if stored is None:
         raise FileError(f"is no picture of a known kind, or a damaged one (it begins with {data[:8]!r})")
+    if said:
+        _log.warning("%s: may be damaged; its decoder says: %.200s", path, said[0])
     return stored

@@ -30,7 +30,8 @@ GRID = (8, 8)
 FULL: dict[str, Any] = {"geometry": "aligned", "strategy": "pixel", "frames": 2}
 SHORT: dict[str, Any] = {**FULL, "response": LINE, "exposures": [0.5]}
 CAMERA: dict[str, Any] = {"bits": 12, "ambient": 0.01, "response": "linear"}
-SHINE = "pictures are no brighter under code 1 than under code 0; does the projector shine"
+CAUSES = "is the lens cap on, the projector off or showing something else, or every exposure far too short"
+SHINE = "pictures are no brighter under code 1 than under code 0; "
 SATURATED = "every pixel is saturated under white at the shortest exposure, 0.0001 s"
 
 
@@ -54,9 +55,11 @@ class Constant(VirtualRig):
 
 @pytest.mark.parametrize("given", [FULL, SHORT, {**SHORT, "strategy": "adaptive"}])
 def test_a_scene_without_light(given: dict[str, Any]) -> None:
-    refused(AcquisitionError, SHINE, VirtualRig(0 * scene(GRID), GRID, **CAMERA), **given)
-    refused(AcquisitionError, "the response of|the noise of the camera: ", Constant(0), **given)
-    refused(AcquisitionError, f"tell no response|{SHINE}", Constant(7), **given)
+    refused(AcquisitionError, f"{SHINE}.*{CAUSES}", VirtualRig(0 * scene(GRID), GRID, **CAMERA), **given)
+    for code in (0, 7):
+        refused(
+            AcquisitionError, f"(the response of|the noise of|{SHINE}).*{CAUSES}", Constant(code), **given
+        )
 
 
 @pytest.mark.parametrize("given", [FULL, SHORT, {"strategy": "pixel"}])

@@ -353,7 +353,7 @@ def test_auto_says_why(tmp_path: Path) -> None:
     acquire(rig(), geometry="aligned", store=path)
     told = Report.of(path)
     assert told.strategy in ("pixel", "hadamard")
-    assert "signal over noise of a weak entry" in told.why
+    assert "a picture T p is off by: pixel" in told.why
     assert told.coverage == 1.0
     light = np.linspace(0.0, 1.0, 9)
     np.testing.assert_allclose(from_srgb(Calibration.of(path).projector.codes(light)), light, atol=0.01)

@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse
+from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
+from ltcl.acquisition import VirtualRig
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.unchanged import refuse_other_rig
 from ltcl.errors import InputError
@@ -86,3 +89,50 @@ def test_a_rig_that_says_nothing_goes_on() -> None:
     silent = Described(None)
     silent.describe = None  # pyright: ignore[reportAttributeAccessIssue]
     refuse_other_rig({"kind": "Described"}, Shots(silent), PATH)
+
+
+T = np.random.default_rng(2).random((12, 12))
+MAP = scipy.sparse.random_array((12, 12), density=0.5, rng=np.random.default_rng(3), format="csr")
+
+
+def other(T: Any) -> Any:
+    """The same with one entry that differs by a thousandth."""
+    found = T.copy()
+    found[3, 4] = 1.001 * found[3, 4] + 1e-3
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({}, None),
+        ({"T": T.copy()}, None),
+        ({"T": other(T)}, "transport"),
+        ({"T": [T, T, other(T)]}, "transport"),
+        ({"T": scipy.sparse.coo_array(other(T))}, "transport"),
+        ({"T": aslinearoperator(1.01 * T)}, "transport"),
+        ({"camera_map": MAP}, "camera_map"),
+        ({"ambient": np.linspace(0, 0.02, 12)}, "ambient"),
+    ],
+)
+def test_a_virtual_rig_of_another_scene_does_not_go_on(change: dict[str, Any], name: str | None) -> None:
+    made = {"T": T, "grid": (3, 4), "ambient": 0.01}
+    if isinstance(change.get("T"), list):
+        made["T"] = [T] * 3
+    if scipy.sparse.issparse(change.get("T")):
+        made["T"] = scipy.sparse.csr_array(T)
+    if isinstance(change.get("T"), LinearOperator):
+        made["T"] = aslinearoperator(T)
+    told = VirtualRig(**made).describe()
+    shots = Shots(VirtualRig(**{**made, **change}))
+    if name is None:
+        refuse_other_rig(told, shots, PATH)
+        return
+    with pytest.raises(InputError, match=rf"rig\.digests\.{name} is .*, but .* was begun with"):
+        refuse_other_rig(told, shots, PATH)
+
+
+@pytest.mark.parametrize("kind", [scipy.sparse.csr_array, scipy.sparse.csc_array, aslinearoperator])
+def test_a_sparse_or_implicit_scene_is_the_same_again(kind: Any) -> None:
+    told = VirtualRig(kind(T), (3, 4)).describe()
+    refuse_other_rig(told, Shots(VirtualRig(kind(T.copy()), (3, 4))), PATH)

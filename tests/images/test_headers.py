@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import sys
 import zlib
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 
 from ltcl import images
 from ltcl.errors import FileError, LtclError
+from ltcl.images.decoder import overheard
 from ltcl.images.headers import declared_size
 
 SUFFIXES = [".png", ".jpg", ".tif", ".bmp", ".exr"]
@@ -166,3 +168,64 @@ def test_any_damage_gives_a_picture_or_an_error_of_ours(tmp_path, suffix, place,
         assert np.isfinite(picture).all()
     assert not message or message.startswith(str(path))
     assert "\n" not in message
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png(data: bytes, depth: int = 8, more: bytes = b"") -> bytes:
+    """A grey one of 4 x 3 pixels whose checksums are right, whatever is in it."""
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 4, 3, depth, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + more + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+ROWS = b"\0abcd" * 3
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (png(b"nothing that zlib wrote"), "IDAT"),
+        (png(zlib.compress(b"\x09" + ROWS[1:])), "bad adaptive filter value"),
+        (png(zlib.compress(ROWS[:7])), "Not enough image data"),
+        (png(zlib.compress(ROWS), depth=7), "Invalid IHDR data"),
+        (png(zlib.compress(ROWS)[:-4] + b"abcd"), "incorrect data check"),
+    ],
+)
+def test_what_libpng_says_is_part_of_the_one_line(tmp_path, capfd, data, said):
+    text = refusal(tmp_path / "a.png", data)
+    assert "is damaged; its decoder says: libpng error: " in text
+    assert said in text
+    assert capfd.readouterr().err == ""
+
+
+def test_what_libpng_warns_of_is_no_damage(tmp_path, capfd):
+    profile = chunk(b"iCCP", b"x\0\0" + zlib.compress(b"no profile"))
+    (tmp_path / "a.png").write_bytes(png(zlib.compress(ROWS), more=profile))
+    np.testing.assert_array_equal(images.read_codes(tmp_path / "a.png"), [list(b"abcd")] * 3)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_jpeg_that_ends_early_is_refused(tmp_path, capfd):
+    data = good(tmp_path, ".jpg", (64, 64))
+    text = refusal(tmp_path / "a.jpg", data[: len(data) // 2] + b"\xff\xd9")
+    assert "is damaged; its decoder says: Corrupt JPEG data: premature end" in text
+    assert capfd.readouterr().err == ""
+
+
+def test_a_jpeg_with_bytes_too_many_is_warned_of_by_its_name(tmp_path, capfd, caplog):
+    data = good(tmp_path, ".jpg", (64, 64))
+    (tmp_path / "a.jpg").write_bytes(data[:-2] + bytes(20) + data[-2:])
+    images.read(tmp_path / "a.jpg")
+    (line,) = caplog.messages
+    assert line.startswith(f"{tmp_path / 'a.jpg'}: may be damaged; its decoder says: Corrupt JPEG data: ")
+    assert capfd.readouterr().err == ""
+
+
+def test_others_still_write_to_stderr_while_a_picture_is_decoded(capfd):
+    with overheard() as said:
+        os.write(2, b"libpng error: one\nof another library\n")
+        sys.stderr.flush()
+    assert said == ["libpng error: one"]
+    assert capfd.readouterr().err == "of another library\n"

@@ -31,7 +31,7 @@ from ltcl import checks
 from ltcl.acquisition.radiometry import curve
 from ltcl.acquisition.radiometry.noise import NoiseModel
 from ltcl.acquisition.radiometry.response import Response
-from ltcl.acquisition.radiometry.stack import Stack, normalised, photographs, stack
+from ltcl.acquisition.radiometry.stack import BLACK, NO_LIGHT, Stack, normalised, photographs, stack
 from ltcl.errors import InputError
 
 _TABLE = 4097  # values of the response returned
@@ -168,7 +168,7 @@ def _fit(
     levels = bracket.levels
     floor = 0.5 / (levels - 1) if levels else 0.0
     usable = (codes <= saturation) & (codes > floor)
-    _check_seen(usable, bracket.seconds)
+    _check_seen(usable, bracket.seconds, float(codes.max()))
     model = replace(noise or NoiseModel(), levels=levels)
     state = _State(
         curve.PLACES.copy(), model, usable / (0.05 * (0.02 + codes)) ** 2, codes, np.zeros_like(codes)
@@ -179,16 +179,22 @@ def _fit(
     return state.theta
 
 
-def _check_seen(usable: np.ndarray, seconds: np.ndarray) -> None:
+def _check_seen(usable: np.ndarray, seconds: np.ndarray, most: float) -> None:
     """Refuse where hardly a pixel is seen at two exposures."""
     shortest = np.where(usable, seconds[:, None], np.inf).min(axis=0)
     longest = np.where(usable, seconds[:, None], 0.0).max(axis=0)
     seen = int(np.count_nonzero(longest > shortest))
     if seen < _LEAST:
+        _refuse_black(most)
         raise InputError(
             f"images have {seen} sampled pixel(s) that are neither black nor saturated at two exposures; "
             f"there must be {_LEAST}: take exposures closer to each other, or a scene with more between"
         )
+
+
+def _refuse_black(most: float) -> None:
+    if most < BLACK:
+        raise InputError(f"images are black, with {most:.1%} of full scale at most: {NO_LIGHT}")
 
 
 def _solve(state: _State, seconds: np.ndarray, still: tuple[float, int] | None) -> np.ndarray:
@@ -208,6 +214,7 @@ def _solve(state: _State, seconds: np.ndarray, still: tuple[float, int] | None) 
         b = curve.design(np.array([still[0]]))[0]
         M += np.outer(b, b) * still[1] / state.noise.variance(0.0)
     if not np.any(w > 0):
+        _refuse_black(float(state.near.max()))
         raise InputError(
             "images tell no response: no pixel grows with the seconds as light does; the exposure of the "
             "camera must be what was asked for, and the scene must be lit"

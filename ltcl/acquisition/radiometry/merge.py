@@ -83,7 +83,7 @@ def merge(
     Parameters
     ----------
     images : sequence of (H, W) or (H, W, 3)
-        One or more: uint8, uint16, or floats with 1 for the largest code.
+        One or more: uint8, uint16, or floats with 1 for the largest code; floats above it are saturated.
     seconds : (K,)
         Of each photograph, in any order; repeated exposures are averaged.
     response : Response, optional

@@ -6,12 +6,21 @@
 x is the linear sensor value above black, 1 at full scale; `slope` is linear value per code where the response
 is no straight line. Photon transfer: the variance of a pixel among repeated photographs against their mean is
 a straight line, fitted with weights 1 / variance^2 as samples of a variance have them.
+
+Whole codes hide noise of less than half of one. A normal value with the deviation s codes, about any mean
+with the same chance, has among repeated photographs the variance
+
+    V(s) = s^2 + 1/12 - sum_k exp(-(2 pi k s)^2) / (2 pi^2 k^2)
+
+not s^2 + 1/12: the rest is an error that each photograph repeats. V is undone where the pixels of a bin lie
+about many means. Where they do not, as in the dark, they only tell how large s may be: 0.2 where one code
+comes again and again, for 0.5 codes away the next would be seen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -19,12 +28,16 @@ import scipy.optimize
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.response import Response
-from ltcl.acquisition.radiometry.stack import levels_of, normalised, photographs
+from ltcl.acquisition.radiometry.stack import BLACK, NO_LIGHT, levels_of, normalised, photographs
 from ltcl.errors import InputError
 
 _BINS, _ROUNDS = 64, 10
 _MOST_CLIPPED = 0.002  # share of a bin's samples at either end
 _MOST_ELECTRONS = 1e9
+_DITHERED, _HIDDEN = 0.4, 0.2  # codes: V is s^2 + 1/12 from there at any mean; what one code can hide
+_TERMS = 2.0 * np.pi**2 * np.arange(1, 401)[:, None] ** 2  # of V
+_SPREADS = np.concatenate([[0.0], np.geomspace(1e-3, 2.0, 200)])
+_VARIANCES = _SPREADS**2 + 1 / 12 - (np.exp(-2.0 * _TERMS * _SPREADS**2) / _TERMS).sum(axis=0)
 
 
 @dataclass(frozen=True)
@@ -123,35 +136,80 @@ def estimate(
 
 
 def _moments(shots: tuple[np.ndarray, ...], response: Response, levels: int, saturation: float) -> np.ndarray:
-    """Of each pixel: mean, variance, slope of the response, share of clipped shots, freedom. (5, pixels)."""
+    """Of each pixel: mean, variance, slope, code, shares of shots with the lowest and the last, freedom."""
     codes = np.stack([normalised(shot, levels) for shot in shots])
     linear = response.linear(codes).astype(np.float64)
     mean, variance = linear.mean(axis=0), linear.var(axis=0, ddof=1)
-    slope = response.derivative(codes.mean(axis=0))
-    clipped = np.mean((linear > saturation) | ((codes <= 0) & (levels > 0)), axis=0)
-    parts = (mean, variance, slope, clipped, np.full(mean.shape, len(shots) - 1.0))
+    code = codes.mean(axis=0)
+    low, high = np.mean((codes <= 0) & (levels > 0), axis=0), np.mean(linear > saturation, axis=0)
+    slope, freedom = response.derivative(code), np.full(mean.shape, len(shots) - 1.0)
+    parts = (mean, variance, slope, code, low, high, freedom)
     return np.stack([part.ravel() for part in parts])
+
+
+@dataclass(frozen=True)
+class _Bins:
+    """Pixels of about the same mean, from dark to bright: (bins,) each."""
+
+    light: np.ndarray  # above black
+    found: np.ndarray  # variance without that of whole codes
+    whole: np.ndarray  # variance
+    count: np.ndarray  # degrees of freedom
+    least: np.ndarray  # the variance that whole codes may hide; infinite where they hide none
+
+    def __getitem__(self, kept: np.ndarray) -> _Bins:
+        return _Bins(*(getattr(self, part.name)[kept] for part in fields(self)))
+
+
+def _bins(rows: np.ndarray, model: NoiseModel) -> _Bins:
+    mean, variance, slope, code, low, high, freedom = rows[:, np.argsort(rows[0], kind="stable")]
+    cuts = np.linspace(0, len(mean), min(_BINS, len(mean)) + 1).astype(int)[:-1]
+    count = np.add.reduceat(freedom, cuts)
+    rounding = 12.0 * model.rounding(slope) * np.ones_like(mean)  # a code squared
+    parts = (mean - model.black, variance, rounding, low, high)
+    light, whole, step, low, high = (np.add.reduceat(part * freedom, cuts) / count for part in parts)
+    # Whole bins go, and all beyond: a pixel chosen by its own noise would bias the variance.
+    dark, full = low > _MOST_CLIPPED, high > _MOST_CLIPPED
+    kept = (np.cumsum(dark[::-1])[::-1] == 0) & (np.cumsum(full) == 0)
+    if not kept.any():
+        why = NO_LIGHT if code.max() < BLACK else "other exposures are needed"
+        raise InputError(f"bursts have no pixels between black and saturation; {why}")
+    if not model.levels:
+        return _Bins(light, whole, whole, count, np.full_like(light, np.inf))[kept]
+    least, most = (pick.reduceat(code, cuts) * (model.levels - 1) for pick in (np.minimum, np.maximum))
+    place, narrow = (least + most) / 2, most - least < 1.0
+    # Sorted by their noise, bins of one mean differ in variance: only together they tell how large it may be.
+    near = (np.abs(place - place[:, None]) < 1.0) * count
+    together = _undone((near @ whole) / (near @ step))
+    hidden = np.where(narrow & (together < _DITHERED), np.maximum(together, _HIDDEN) ** 2 * step, np.inf)
+    return _Bins(light, _undone(whole / step) ** 2 * step, whole, count, hidden)[kept]
+
+
+def _undone(variance: np.ndarray) -> np.ndarray:
+    """s of V(s), in codes.
+
+    >>> _undone(np.array([0.0, 1.0 + 1 / 12, 100.0 + 1 / 12])).round(3)
+    array([ 0.,  1., 10.])
+    """
+    far = np.sqrt(np.maximum(variance - 1 / 12, 0.0))
+    return np.where(variance < _VARIANCES[-1], np.interp(variance, _VARIANCES, _SPREADS), far)
 
 
 def _line(rows: np.ndarray, model: NoiseModel) -> NoiseModel:
     """Straight line through variances, averaged in bins of equal mean, weighted as samples of a variance."""
-    mean, variance, slope, clipped, freedom = rows[:, np.argsort(rows[0], kind="stable")]
-    cuts = np.linspace(0, len(mean), min(_BINS, len(mean)) + 1).astype(int)[:-1]
-    count = np.add.reduceat(freedom, cuts)
-    excess = variance - model.rounding(slope)
-    parts = (mean - model.black, excess, variance, clipped)
-    light, found, whole, clipped = (np.add.reduceat(part * freedom, cuts) / count for part in parts)
-    # Whole bins go: a pixel chosen by its own noise would bias the variance.
-    kept = clipped <= _MOST_CLIPPED
-    if not kept.any():
-        raise InputError("bursts have no pixels between black and saturation; other exposures are needed")
-    light, found, whole, count = light[kept], found[kept], whole[kept], count[kept]
-    columns = np.stack([np.maximum(light, 0.0), np.ones_like(light)], axis=1)
-    least = 1e-3 * whole.mean() + 1e-30
-    expected, gain, floor = np.maximum(whole, least), 0.0, 0.0
+    every = _bins(rows, model)
+    clear = np.isinf(every.least)
+    bins = every[clear] if clear.any() else every
+    columns = np.stack([np.maximum(bins.light, 0.0), np.ones_like(bins.light)], axis=1)
+    least = 1e-3 * bins.whole.mean() + 1e-30
+    expected, gain, floor, scale = np.maximum(bins.whole, least), 0.0, 0.0, np.ones_like(bins.light)
     for _ in range(_ROUNDS):
-        scale = np.sqrt(count) / expected
-        (gain, floor), _ = scipy.optimize.nnls(columns * scale[:, None], found * scale)
-        expected = np.maximum(columns @ (gain, floor) + whole - found, least)
+        scale = np.sqrt(bins.count / 2.0) / expected
+        (gain, floor), _ = scipy.optimize.nnls(columns * scale[:, None], bins.found * scale)
+        expected = np.maximum(columns @ (gain, floor) + bins.whole - bins.found, least)
+    told = columns * scale[:, None]
+    error = float(np.sqrt(max(np.linalg.pinv(told.T @ told)[1, 1], 0.0)))
+    # Not told from none, it may be as large as the error; and never more than whole codes could hide.
+    floor = min(floor if floor > error else floor + error, float(every.least.min()))
     electrons = float(1.0 / max(gain, 1.0 / _MOST_ELECTRONS))
     return NoiseModel(electrons, float(np.sqrt(floor)), model.black, model.saturation, model.levels)

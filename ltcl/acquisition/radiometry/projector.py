@@ -23,6 +23,7 @@ from scipy.interpolate import PchipInterpolator
 from ltcl import checks
 from ltcl.acquisition.radiometry.merge import Radiance
 from ltcl.acquisition.radiometry.response import Response
+from ltcl.acquisition.radiometry.stack import NO_LIGHT
 from ltcl.errors import InputError, InputTypeError
 
 _TABLE = 1025
@@ -93,7 +94,7 @@ def _table(codes: np.ndarray, pictures: Sequence[Any], name: str) -> np.ndarray:
     w, s = 1.0 / np.maximum(dark + bright, 1e-300), L[-1] - L[0]
     # Not weighted: colours that a channel does not light have next to no variance, and would decide alone.
     if np.sum(s) < _LEAST * np.sqrt(np.sum(dark + bright)):
-        raise InputError(f"{name} are no brighter under code 1 than under code 0; does the projector shine?")
+        raise InputError(f"{name} are no brighter under code 1 than under code 0; {NO_LIGHT}")
     above = (L[1:-1] - L[0]) * s - dark
     g = (above @ w) / np.sum(w * (s**2 - dark - bright))
     rising = scipy.optimize.isotonic_regression(np.concatenate([[0.0], np.clip(g, 0.0, 1.0), [1.0]])).x

@@ -6,18 +6,23 @@ A code is what the camera wrote, over the largest it can write: in [0, 1], and n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from ltcl import checks
 from ltcl.errors import InputError
 
+BLACK = 0.05  # of full scale: photographs that reach no more at any exposure show no scene
+NO_LIGHT = "is the lens cap on, the projector off or showing something else, or every exposure far too short?"
 _SEEN = 1 << 14  # pixels that the order of two photographs is told by
 _CLIPPED = 0.98  # codes above tell nothing of an order
 _RATIO = 1.2  # of seconds, below which two photographs may look alike
+_CHANCE = 3e-5  # of refusing photographs in order: 4 standard deviations where pixels are many
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -141,13 +146,22 @@ def _check_order(made: Stack, order: np.ndarray) -> None:
         short, long = made.codes(k, part), made.codes(k + 1, part)
         seen = np.maximum(short, long) < _CLIPPED
         rise = (long - short)[seen].astype(np.float64)
-        if ratio == 1.0 or len(rise) == 0:
+        if ratio == 1.0 or len(rise) < 2:
             continue
-        error = rise.std() / np.sqrt(len(rise)) + 1.0 / max(made.levels, 1 << 12)
-        falls = rise.mean() < -4.0 * error
-        stays = ratio > _RATIO and short[seen].mean() > 0.1 and np.median(rise) <= 0
+        mean, error = rise.mean(), _error(rise, made.levels)
+        falls = mean < -error
+        # Codes rise more than the fourth root of light, or the noise may be all that hides it.
+        least = short[seen].mean() * (ratio**0.25 - 1.0)
+        stays = ratio > _RATIO and short[seen].mean() > 0.1 and np.median(rise) <= 0 and mean + error < least
         if falls or stays:
             raise InputError(
                 f"images[{order[k + 1]}] has {made.seconds[k + 1]:g} s and is not brighter than "
                 f"images[{order[k]}] of {made.seconds[k]:g} s; brightness must rise with the seconds"
             )
+
+
+def _error(rise: np.ndarray, levels: int) -> float:
+    """How far the mean of two pixels or more may be off; a few tell their own noise badly (Student's t)."""
+    rounding = 1.0 / (6.0 * levels**2) if levels else 0.0
+    scatter = math.sqrt((rise.var(ddof=1) + rounding) / len(rise))
+    return -float(stdtrit(len(rise) - 1, _CHANCE)) * (scatter + 1.0 / max(levels, 1 << 12))

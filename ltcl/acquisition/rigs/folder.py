@@ -14,6 +14,7 @@ numbers.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from collections import Counter
 from collections.abc import Iterable
@@ -32,15 +33,21 @@ from ltcl.acquisition.rigs.shooting_list import ShootingList, Shot, pattern_name
 from ltcl.errors import AcquisitionError, FileError, InputError, MemoryLimitError, PhotographMissing
 from ltcl.files import as_path
 
+_log = logging.getLogger(__name__)
 _GREEN = 1
+_FULL, _FEW = 1.001, 0.01  # full scale with what rounding adds; share of pixels that may be defects
 
 
 class FolderRig:
     """A projector and a camera that somebody works by hand, through a folder.
 
     Photographs are PNG, TIFF, JPEG, BMP, EXR or camera RAW (extra `camera`); their codes are taken as they
-    stand. A rig of one channel takes the green one of colour photographs: its pixels are the most on a
-    sensor, and a mean of channels with curves of their own would follow none.
+    stand. Full scale of float ones (EXR, TIFF) is 1, what the sensor holds at most, at every exposure: what
+    is above counts as saturated, and a warning says so once. Values in another unit, or divided by the
+    seconds as HDR programs do, are to be scaled back first.
+
+    A rig of one channel takes the green one of colour photographs: its pixels are the most on a sensor, and a
+    mean of channels with curves of their own would follow none.
 
     Parameters
     ----------
@@ -111,6 +118,7 @@ class FolderRig:
         self._asked: Counter[tuple[str, float]] = Counter()
         self._arrivals = Arrivals(self.folder)
         self._sequence = Sequence(in_order=checks.flag("in_order", in_order))
+        self._warned = False
 
     def prepare(self, shots: Iterable[tuple[Any, float]]) -> None:
         """Write the patterns and the list of all that will be asked for next, in order.
@@ -158,6 +166,7 @@ class FolderRig:
         name = f"photograph {number} ({path.name})"
         photograph = self._read(name, path)
         self._sequence.check(name, number, key[1], photograph)
+        self._warn_of_scale(name, photograph.codes)
         self._asked[key] += 1
         return photograph.codes
 
@@ -222,6 +231,19 @@ class FolderRig:
         if self._arrivals.strangers:
             text += f"; {self._arrivals.strangers[0]!r} there is the name of no photograph on the list"
         return PhotographMissing(text, number)
+
+    def _warn_of_scale(self, name: str, codes: np.ndarray) -> None:
+        """Once, of float codes that cannot have 1 for what the sensor holds at most."""
+        if self._warned or codes.dtype.kind != "f" or not (share := float(np.mean(codes > _FULL))) > _FEW:
+            return
+        self._warned = True
+        _log.warning(
+            "%s reaches %.4g; full scale of float photographs is 1, so %.0f%% of its pixels count as "
+            "saturated: divide all photographs by the largest value that the camera can give",
+            name,
+            float(codes.max()),
+            100 * share,
+        )
 
     def _read(self, name: str, path: Path) -> Photograph:
         try:

@@ -20,7 +20,7 @@ from ltcl.acquisition.rig import LONGEST, SHORTEST, as_codes, as_seconds
 from ltcl.acquisition.rigs import periods
 from ltcl.acquisition.rigs.freshness import Freshness
 from ltcl.acquisition.rigs.stage import Frame, Stage
-from ltcl.acquisition.rigs.survey import Survey, saturated, survey
+from ltcl.acquisition.rigs.survey import Survey, drifted, saturated, survey
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 
 _log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ class LiveRig:
     margin : float
         Seconds to wait beyond the slowest flash.
     drift : float
-        Largest relative difference of brightness between identical shots.
+        Largest relative difference of brightness between identical shots, beside what noise explains.
     retakes : int
         Further frames before a photograph is refused.
     flashes : int
@@ -145,7 +145,7 @@ class LiveRig:
         seconds = self._offered(as_seconds(seconds))
         try:
             frame = self._ready().frame(codes, seconds)
-            self._refuse_drift(codes, seconds, frame)
+            self._refuse_drift(codes, seconds, frame, self._ready().survey.noise)
         except AcquisitionError as error:
             raise AcquisitionError(f"photograph {self._count + 1}: {error}") from error
         self._count += 1
@@ -229,12 +229,12 @@ class LiveRig:
             "lower the camera's gain"
         )
 
-    def _refuse_drift(self, codes: np.ndarray, seconds: float, frame: Frame) -> None:
+    def _refuse_drift(self, codes: np.ndarray, seconds: float, frame: Frame, noise: float) -> None:
         digest = hashlib.blake2b(repr(codes.shape).encode() + codes.tobytes(), digest_size=16).digest()
         mean = frame.cells.mean(axis=(0, 1))
         before = self._brightness.setdefault((digest, seconds), mean)
-        off = float(np.max(np.abs(mean - before) / np.maximum(before, _DIM)))
-        if off > self._drift:
+        off, beyond = drifted(mean, before, _DIM, noise)
+        if beyond > self._drift:
             raise AcquisitionError(
                 f"it is {off:.1%} brighter or darker than an earlier one of the same codes and seconds, "
                 f"drift={self._drift:g} accepts {self._drift:.1%}: the camera, the projector or the light of "

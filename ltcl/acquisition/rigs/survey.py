@@ -7,7 +7,8 @@
     dims?       a strip of white alone, then all white: with more light no cell may get darker. Where one
                 does, an automatic exposure is at work, which may be too fast for the next test.
     drifts?     a frame right after a flash, and one a while later: a slow automatic exposure or white
-                balance. The figure is the relative difference of the means, of the worst channel.
+                balance. The figure is the relative difference of the means, of the worst channel; 5 standard
+                deviations of it, which the noise of few pixels explains, are no drift.
 
 A cell is lit where white differs from black by at least a fifth of the largest difference, and by more than
 noise does. A flash has arrived once all but a hundredth of the lit cells have come nine tenths of the way, or
@@ -26,6 +27,7 @@ from ltcl.errors import AcquisitionError
 _FRAMES = 6  # of the same picture
 _LIT, _ARRIVED, _OUTLIERS = 0.2, 0.9, 0.01
 _SAFETY = 1.5  # over the largest noise that was seen in some ten thousand differences
+_CLEAR = 5.0  # standard deviations between the means of two frames that noise explains
 _STEP = 1 / 255  # a code of the coarsest camera: changes below are none
 _VISIBLE = 4.0  # times the noise: the least of white
 _SHAKY = 0.1  # of full scale: more noise than that is flicker
@@ -51,6 +53,8 @@ class Survey:
         Largest difference of a cell between white and black, of full scale.
     drift : float
         Relative change of the brightness between identical frames.
+    noise : float
+        Difference of the brightness of two identical frames, of full scale, that noise explains.
     """
 
     latency: float
@@ -59,6 +63,7 @@ class Survey:
     tolerance: float
     contrast: float
     drift: float
+    noise: float
 
 
 def survey(stage: Stage, seconds: float, *, flashes: int, patience: float, drift: float) -> Survey:
@@ -82,9 +87,9 @@ def survey(stage: Stage, seconds: float, *, flashes: int, patience: float, drift
         The camera does not see the display, flickers, adapts, or a flash does not arrive.
     """
     stage.expose(seconds)
-    dark, black = _at_rest(stage, 0.0, patience)
-    bright, white = _at_rest(stage, 1.0, patience)
-    noise = max(dark, bright)
+    dark, black, dim = _at_rest(stage, 0.0, patience)
+    bright, white, lit = _at_rest(stage, 1.0, patience)
+    noise, explained = max(dark, bright), max(dim, lit)
     contrast = float((white.cells - black.cells).max())
     if contrast < _VISIBLE * noise or contrast < _VISIBLE * _STEP:
         raise AcquisitionError(
@@ -94,13 +99,13 @@ def survey(stage: Stage, seconds: float, *, flashes: int, patience: float, drift
     tolerance = _SAFETY * (noise + _STEP)
     _refuse_dimming(stage, white, tolerance, patience)
     latencies = _latencies(stage, (black, white), flashes, patience, tolerance)
-    found = _drift(stage, max(latencies), patience)
-    if found > drift:
+    found, beyond = _drift(stage, max(latencies), patience, explained)
+    if beyond > drift:
         raise AcquisitionError(
             f"the camera drifts by {found:.1%} between identical shots, {drift:.1%} is accepted: switch off "
             "automatic exposure and white balance, and lamps that flicker"
         )
-    return Survey(float(np.median(latencies)), max(latencies), seconds, tolerance, contrast, found)
+    return Survey(float(np.median(latencies)), max(latencies), seconds, tolerance, contrast, found, explained)
 
 
 def saturated(stage: Stage, seconds: float, patience: float) -> bool:
@@ -115,8 +120,29 @@ def _show(stage: Stage, code: float) -> None:
     stage.show(np.full(stage.display.grid, code, np.float32))
 
 
-def _at_rest(stage: Stage, code: float, patience: float) -> tuple[float, Frame]:
-    """The largest change between frames of the same picture, and the last of them."""
+def drifted(now: np.ndarray, before: np.ndarray, least: float, noise: float) -> tuple[float, float]:
+    """Relative difference of brightness, of the worst channel, and what noise does not explain of it.
+
+    Parameters
+    ----------
+    now, before : (channels,)
+        Means of two frames.
+    least : float
+        Brightness that differences are relative to at least.
+    noise : float
+        Difference that noise explains.
+
+    Examples
+    --------
+    >>> drifted(np.array([0.44]), np.array([0.4]), 0.1, 0.02)  # doctest: +ELLIPSIS
+    (0.0999..., 0.0499...)
+    """
+    off, whole = np.abs(now - before), np.maximum(before, least)
+    return float(np.max(off / whole)), float(np.max((off - noise) / whole))
+
+
+def _at_rest(stage: Stage, code: float, patience: float) -> tuple[float, Frame, float]:
+    """Of frames of the same picture the largest change, the last one, and what noise changes of means."""
     _show(stage, code)
     stage.settle(patience + (stage.seconds or 0.0))
     frames = [stage.frame() for _ in range(_FRAMES)]
@@ -126,7 +152,10 @@ def _at_rest(stage: Stage, code: float, patience: float) -> tuple[float, Frame]:
             f"frames of the same picture differ by {noise:.1%} of full scale: something flickers or moves, "
             "or the exposure is no multiple of the display's period"
         )
-    return noise, frames[-1]
+    many = np.stack([frame.cells for frame in frames])
+    a, b, _ = frames[0].cells.shape
+    variance = float(many.var(axis=0, ddof=1).mean(axis=(0, 1)).max()) / (a * b)
+    return noise, frames[-1], _CLEAR * float(np.sqrt(2 * variance))
 
 
 def _refuse_dimming(stage: Stage, white: Frame, tolerance: float, patience: float) -> None:
@@ -172,8 +201,8 @@ def _arrival(stage: Stage, before: Frame, after: Frame, patience: float, toleran
             raise AcquisitionError(f"no frame shows a flash of the display within {waited:.2g} s")
 
 
-def _drift(stage: Stage, wait: float, patience: float) -> float:
-    """Between a frame right after a flash and one a while later."""
+def _drift(stage: Stage, wait: float, patience: float, noise: float) -> tuple[float, float]:
+    """Between frames right after a flash and some a while later; as `drifted`."""
     _show(stage, 0.0)
     stage.settle(patience + (stage.seconds or 0.0))
     _show(stage, 1.0)
@@ -182,4 +211,4 @@ def _drift(stage: Stage, wait: float, patience: float) -> float:
     early = np.mean([stage.frame().cells.mean(axis=(0, 1)) for _ in range(2)], axis=0)
     stage.settle(wait + patience)
     late = np.mean([stage.frame().cells.mean(axis=(0, 1)) for _ in range(2)], axis=0)
-    return float(np.max(np.abs(early - late) / np.maximum(late, _STEP)))
+    return drifted(early, late, _STEP, noise / np.sqrt(2.0))

@@ -16,6 +16,7 @@ Known limit: no blur, no light that falls on the camera outside T.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ import numpy as np
 from ltcl import channels, checks
 from ltcl.acquisition.rig import as_codes, as_seconds
 from ltcl.acquisition.rigs import curves
+from ltcl.acquisition.rigs.digests import digest
 from ltcl.acquisition.rigs.noise import NoiseStreams
 from ltcl.acquisition.rigs.sensor import Sensor
 from ltcl.errors import InputError
@@ -206,6 +208,16 @@ class VirtualRig:
             "read": sensor.read,
             "sensitivity": self._sensitivity,
             "seed": self._noise.seed,
+            "digests": self._digests,
+        }
+
+    @cached_property
+    def _digests(self) -> dict[str, Any]:
+        """Of what is too large for the records."""
+        return {
+            "transport": [digest(T) for T in self._T],
+            "camera_map": None if self._map is None else digest(self._map),
+            "ambient": digest(self._ambient),
         }
 
     def _lit(self, d: int, code: np.ndarray) -> np.ndarray:

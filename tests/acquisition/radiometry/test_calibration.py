@@ -120,8 +120,12 @@ def test_light_of_consistent_exposures_has_the_ratio_of_the_seconds():
         ([np.full((4, 4), np.nan), np.ones((4, 4))], [1, 2], "NaN"),
         (np.zeros((2, 4, 4)), [1.0, -1.0], "seconds"),
         (np.zeros((2, 4, 4)), [1.0], "seconds"),
-        (np.zeros((2, 20, 20)), [1.0, 2.0], "0 sampled pixel"),  # all black
-        (np.full((2, 20, 20), 255, np.uint8), [1.0, 2.0], "0 sampled pixel"),  # all saturated
+        (np.zeros((2, 20, 20)), [1.0, 2.0], "images are black, with 0.0% of full scale at most"),  # all black
+        (
+            np.full((2, 20, 20), 255, np.uint8),
+            [1.0, 2.0],
+            "0 sampled pixel",
+        ),  # all saturated
     ],
 )
 def test_what_tells_no_response_is_refused(images, seconds, part):

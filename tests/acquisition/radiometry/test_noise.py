@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ltcl.acquisition.radiometry import NoiseModel, estimate
+from ltcl.acquisition.radiometry.noise import _undone
 from ltcl.errors import InputError
 from tests.acquisition.radiometry.cameras import Camera, corner
 
@@ -56,6 +57,34 @@ def test_clipped_pixels_do_not_count():
         [[camera.shoot(light, 1.0, rng) for _ in range(4)]], response=camera.response, levels=4096
     )
     assert found.electrons == pytest.approx(4000.0, rel=0.05)
+
+
+@pytest.mark.parametrize("n", [16, 64])
+@pytest.mark.parametrize("black", [0.0, 0.004, 0.01])
+@pytest.mark.parametrize(("read", "electrons"), [(0.0005, 10000.0), (0.003, 2000.0), (0.01, 1000.0)])
+def test_read_noise_is_found_where_black_frames_are_clipped_or_rounded_to_one_code(n, black, read, electrons):
+    """Eight bits: 0.13, 0.77 and 2.6 codes of it, with black at 0, 1.02 and 2.55 codes."""
+    camera, rng = Camera("linear", 256, electrons, read, black), np.random.default_rng(0)
+    ramp = np.broadcast_to(np.linspace(0, 1, n) ** 2.2 * 0.6, (n, n))
+    bursts = [[camera.shoot(light, 1.0, rng) for _ in range(6)] for light in (ramp, 0 * ramp, 0 * ramp)]
+    found = estimate(bursts, response=camera.response, levels=256)
+    assert found.electrons == pytest.approx(electrons, rel=0.2)
+    assert 0.5 * read < found.read < 1.5 * read
+
+
+def test_codes_that_never_change_hide_a_fifth_of_one_at_most():
+    """A scene of three even parts without any noise that the codes show."""
+    shots = [np.repeat(np.array([3, 90, 200], np.uint8), 100).reshape(15, 20)] * 4
+    assert 0 < estimate([shots]).read * 255 <= 0.2
+
+
+def test_what_rounding_leaves_of_a_variance_is_undone():
+    """V(s) against normal values about means that lie anywhere between two codes."""
+    rng = np.random.default_rng(3)
+    means = rng.uniform(0, 10, 40000)
+    for s in (0.1, 0.25, 0.6, 3.0):
+        codes = np.rint(means + rng.normal(0, s, (6, means.size)))
+        assert _undone(np.array([codes.var(axis=0, ddof=1).mean()]))[0] == pytest.approx(s, rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -218,6 +218,28 @@ def test_exposures_are_those_of_the_list(tmp_path: Path, seconds: float, good: b
         )
 
 
+def test_floats_above_full_scale_are_warned_of_once(tmp_path: Path, caplog: Any) -> None:
+    """Codes of 12 bits as floats; 11 of 12 pixels are above 1."""
+    rig = prepared(tmp_path)
+    for number in range(1, len(SHOTS) + 1):
+        images.write(tmp_path / f"photographs/photo_{number:06d}.exr", GREY * np.float32(300.0))
+    for shot in SHOTS:
+        np.testing.assert_array_equal(rig.photograph(*shot), GREY * np.float32(300.0))
+    (line,) = caplog.messages
+    assert line.startswith(
+        "photograph 1 (photo_000001.exr) reaches 3300; full scale of float photographs is 1"
+    )
+    assert "92% of its pixels count as saturated" in line
+
+
+def test_floats_with_a_hot_pixel_are_not_warned_of(tmp_path: Path, caplog: Any) -> None:
+    rig, codes = prepared(tmp_path, 1), np.full((12, 16), 0.5, np.float32)
+    codes[3, 4], codes[0, 0] = 7.0, 1.0005
+    images.write(tmp_path / "photographs/photo_000001.exr", codes)
+    rig.photograph(*SHOTS[0])
+    assert not caplog.messages
+
+
 def at(second: float) -> str:
     return f"2026:03:01 12:00:{second:05.2f}"
 

@@ -173,6 +173,28 @@ def test_a_lamp_that_fades_is_found_at_the_next_identical_shot(clock: Clock, dis
         rig.photograph(first, SECONDS)
 
 
+NOISY: dict[str, Any] = {"gain": 3000.0, "read": 0.01, "response": "linear", "black": 0.06}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_noise_of_few_pixels_is_no_drift(clock: Clock, display: Display, seed: int) -> None:
+    """48 pixels: means of identical frames differ by 0.2 % of full scale, 2 % of what is dim."""
+    rig = LiveRig(Watcher(clock, scene(**NOISY, seed=seed)), display)
+    for codes in [*patterns(4), *patterns(4), 0 * WHITE, single((1, 1)), 0 * WHITE, single((1, 1))] * 4:
+        rig.photograph(codes, SECONDS)
+
+
+def test_a_lamp_that_fades_is_found_through_the_noise_of_few_pixels(clock: Clock, display: Display) -> None:
+    camera = Watcher(clock, scene(**NOISY))
+    rig = LiveRig(camera, display)
+    first, second = patterns(2)
+    for codes in (first, second, first):
+        rig.photograph(codes, SECONDS)
+    camera.gain = lambda *_: 0.85
+    with pytest.raises(AcquisitionError, match=r"^photograph 4: it is \d+\.\d% brighter or darker"):
+        rig.photograph(second, SECONDS)
+
+
 def test_a_camera_that_looks_elsewhere_is_named(clock: Clock, display: Display) -> None:
     camera = Watcher(clock, scene(gain=2000.0, sensitivity=0.01, ambient=20.0))
     with pytest.raises(AcquisitionError, match=r"does not see the display: white is .*% of full scale above"):
