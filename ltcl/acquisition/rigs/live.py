@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.rig import LONGEST, SHORTEST, as_codes, as_seconds
+from ltcl.acquisition.rig import LONGEST, SHORTEST, as_codes, as_seconds, check_photograph, to_unit
 from ltcl.acquisition.rigs import periods
 from ltcl.acquisition.rigs.freshness import Freshness
-from ltcl.acquisition.rigs.stage import Frame, Stage
+from ltcl.acquisition.rigs.stage import Frame, Stage, cells
 from ltcl.acquisition.rigs.survey import Survey, drifted, saturated, survey
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 
@@ -151,6 +151,22 @@ class LiveRig:
         self._count += 1
         return frame.codes
 
+    def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
+        """Remember a photograph of an earlier session: one of the same codes and seconds must be as bright.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            As in `photograph`.
+        AcquisitionError
+            The image is none of this camera.
+        """
+        codes = as_codes(codes, self.projector_grid, self.channels)
+        check_photograph("image", image, self.channels)
+        seen = cells(to_unit("image", image, self._stage.camera)).mean(axis=(0, 1))
+        self._brightness.setdefault(_shot(codes, self._offered(as_seconds(seconds))), seen)
+        self._count += 1
+
     @property
     def survey(self) -> Survey | None:
         """What was measured; None before the first photograph."""
@@ -230,9 +246,8 @@ class LiveRig:
         )
 
     def _refuse_drift(self, codes: np.ndarray, seconds: float, frame: Frame, noise: float) -> None:
-        digest = hashlib.blake2b(repr(codes.shape).encode() + codes.tobytes(), digest_size=16).digest()
         mean = frame.cells.mean(axis=(0, 1))
-        before = self._brightness.setdefault((digest, seconds), mean)
+        before = self._brightness.setdefault(_shot(codes, seconds), mean)
         off, beyond = drifted(mean, before, _DIM, noise)
         if beyond > self._drift:
             raise AcquisitionError(
@@ -240,6 +255,11 @@ class LiveRig:
                 f"drift={self._drift:g} accepts {self._drift:.1%}: the camera, the projector or the light of "
                 "the room drifts"
             )
+
+
+def _shot(codes: np.ndarray, seconds: float) -> tuple[bytes, float]:
+    told = repr(codes.shape).encode() + codes.tobytes()
+    return hashlib.blake2b(told, digest_size=16).digest(), seconds
 
 
 def _refuse_lacking(name: str, given: Any, wanted: tuple[str, ...]) -> None:

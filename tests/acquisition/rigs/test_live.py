@@ -173,6 +173,20 @@ def test_a_lamp_that_fades_is_found_at_the_next_identical_shot(clock: Clock, dis
         rig.photograph(first, SECONDS)
 
 
+def test_a_lamp_that_fades_between_sessions_is_found(clock: Clock, display: Display) -> None:
+    camera = Watcher(clock, scene(**CLEAN, response="linear", black=0.0))
+    first, second = patterns(2)
+    earlier = LiveRig(camera, display).photograph(first, SECONDS)
+    rig = LiveRig(camera, display)
+    rig.recall(first, SECONDS, earlier)
+    rig.photograph(second, SECONDS)
+    camera.gain = lambda *_: 0.9
+    with pytest.raises(AcquisitionError, match=r"^photograph 3: it is (9|10)\.\d% brighter or darker"):
+        rig.photograph(first, SECONDS)
+    with pytest.raises(AcquisitionError, match="image has shape"):
+        rig.recall(first, SECONDS, earlier[0])
+
+
 NOISY: dict[str, Any] = {"gain": 3000.0, "read": 0.01, "response": "linear", "black": 0.06}
 
 
