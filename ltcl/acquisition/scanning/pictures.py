@@ -12,7 +12,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from ltcl.acquisition import agreeing
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.exposing import telling
 from ltcl.acquisition.radiometry import Radiance, merge
@@ -129,9 +128,7 @@ class Pictures(Seen):
         told = self.calibration
         levels = told.noise.levels or None
         last = self.shots.count
-        first = last + 1 - len(images)
-        agreeing.refuse_unlike(images, told.exposures, range(first, last + 1), told.response, told.noise)
-        with telling(f"photographs {first} to {last}"):
+        with telling(f"photographs {last + 1 - len(images)} to {last}"):
             merged = merge(
                 images, told.exposures, told.response, told.noise, levels=levels, black=told.offset
             )
