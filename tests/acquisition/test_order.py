@@ -96,7 +96,9 @@ def test_refused_and_put_right(
     count = len(found.shots) - found.calibrated
     order = WRONG[wrong](np.arange(count), start)
     path, given = tmp_path / "T.zarr", made(strategy)[1]
-    with pytest.raises(AcquisitionError, match=r"^photograph \d+ shows .* order of their patterns") as told:
+    with pytest.raises(
+        AcquisitionError, match=r"^photographs? \d+ shows? .* order of their patterns"
+    ) as told:
         acquire(mixed_up(strategy, found, order), store=path, **given)
     batches = {batch for _, batch in BlockStore.open(path).written}
     first = int(np.flatnonzero(order != np.arange(count))[0])
