@@ -7,7 +7,7 @@ a pixel where
     |p - q| > max(p, q) / 2,    p = min(x_k t_{k+1} / t_k, s),    q = min(x_{k+1}, s)
 
 for neighbours of them, s being saturation, by 6 standard deviations of noise and what a black that is wrong
-by 0.005 makes. A pattern is refused where that is so at half of the pixels that could tell it: 4 of them, or
+by 0.003 makes. A pattern is refused where that is so at half of the pixels that could tell it: 4 of them, or
 fewer in two patterns of a batch; in one it is logged.
 """
 
@@ -23,7 +23,7 @@ from ltcl.acquisition.calibration import Calibration
 from ltcl.errors import AcquisitionError
 
 logger = logging.getLogger(__name__)
-_SIGMAS, _BLACK, _PART = 6.0, 0.005, 0.5
+_SIGMAS, _BLACK, _PART = 6.0, 0.003, 0.5
 _FEW = 4  # pixels, fewer of which may be faults of the sensor
 _MOST = 1 << 12  # pixels that are looked at
 
@@ -47,12 +47,13 @@ def contradiction(images: Sequence[np.ndarray], told: Calibration, lit: np.ndarr
     places = places[:: -(-max(len(places), 1) // _MOST)]
     codes = np.stack([image.reshape(-1, len(told.offset))[places] for image in images])
     light = told.response.linear(codes) - told.offset
-    variance = told.noise.variance(light, told.response.derivative(codes))
-    most = told.noise.saturation - told.offset
+    slope, most = told.response.derivative(codes), told.noise.saturation - told.offset
     ratio = np.array(told.exposures[1:]) / np.array(told.exposures[:-1])
     ratio = ratio[:, None, None]
-    p, q = np.minimum(light[:-1] * ratio, most), np.minimum(light[1:], most)
-    doubt = _SIGMAS * np.sqrt(ratio**2 * variance[:-1] + variance[1:]) + ratio * _BLACK
+    short, q = np.minimum(light[:-1], most / ratio), np.minimum(light[1:], most)
+    p = ratio * short
+    variance = ratio**2 * told.noise.variance(short, slope[:-1]) + told.noise.variance(q, slope[1:])
+    doubt = _SIGMAS * np.sqrt(variance) + ratio * _BLACK
     more = np.maximum(p, q)
     off = np.abs(p - q) > np.maximum(_PART * more, doubt)
     return Contradiction(*(int(np.count_nonzero(part.any(axis=(0, 2)))) for part in (off, more > doubt)))
