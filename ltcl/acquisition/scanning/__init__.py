@@ -5,6 +5,7 @@ pictures           a calibrated rig as a camera on the pixels of the scan
 block              blocks of projector pixels as pixels of a coarser scan
 pixel, hadamard    how the pixels of a batch are lit, and its columns found
 columns            batches of columns into a store
+exposed            exposures of a pattern that contradict each other
 order              pictures that show the patterns of their batch, or are refused
 balance            columns that add up to white
 thresholds         which entries are light, which noise; sums are tested

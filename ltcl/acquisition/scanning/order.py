@@ -270,7 +270,9 @@ def _told(found: dict[int, int | None], name: Callable[[int], str], most: int = 
     """In one line what pictures show, of the first few."""
     parts = []
     for a, b in sorted(found.items())[:most]:
-        shows = "little of its pattern" if b is None else f"the pattern of {name(b)}"
-        parts.append(f"{name(a)} shows {shows}")
+        own = name(a)
+        show = "show" if own.startswith("photographs") else "shows"
+        what = "little of the pattern asked for" if b is None else f"the pattern of {name(b)}"
+        parts.append(f"{own} {show} {what}")
     more = len(found) - len(parts)
     return "; ".join(parts) + (f"; so do {more} more of this batch" if more else "")

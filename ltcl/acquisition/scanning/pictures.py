@@ -16,7 +16,7 @@ from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.exposing import telling
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.scanning import order
+from ltcl.acquisition.scanning import exposed, order
 from ltcl.acquisition.scanning.block import Blocks
 from ltcl.store import BlockStore
 
@@ -106,20 +106,39 @@ class Pictures(Seen):
         Raises
         ------
         AcquisitionError
-            Photographs do not show their patterns (`order`).
+            Photographs do not show their patterns (`exposed`, `order`).
         """
         patterns = list(patterns)
         codes = [self._codes(pattern) for pattern in patterns]
         times, first = self.calibration.exposures, self.shots.count
         self.shots.prepare([(part, t) for part in codes for t in times])
-        found = []
+        found, contradictions = [], []
         for part in codes:
-            found.append(self._picture([self.shots.photograph(part, t) for t in times]))
+            images = [self.shots.photograph(part, t) for t in times]
+            contradictions.append(exposed.contradiction(images, self.calibration, part))
+            found.append(self._picture(images))
             tell()
-        lit = np.stack(patterns).reshape(len(found), -1)
-        value, variance = (np.stack(part) for part in zip(*found, strict=True))
-        order.check(lit, value, variance, self.ambient, self.white, lambda a: _numbered(first, a, len(times)))
+        self._check(patterns, found, contradictions, first)
         return found
+
+    def _check(
+        self,
+        patterns: list[np.ndarray],
+        found: list[Picture],
+        contradictions: list[exposed.Contradiction],
+        before: int,
+    ) -> None:
+        """Refuse what does not show its patterns; there were photographs `before`."""
+        each = len(self.calibration.exposures)
+
+        def name(a: int) -> str:
+            last = before + (a + 1) * each
+            return f"photograph {last}" if each == 1 else f"photographs {last + 1 - each} to {last}"
+
+        exposed.check(contradictions, name)
+        value, variance = (np.stack(part) for part in zip(*found, strict=True))
+        lit = np.stack(patterns).reshape(len(found), -1)
+        order.check(lit, value, variance, self.ambient, self.white, name)
 
     def _codes(self, pattern: np.ndarray) -> np.ndarray:
         return self.blocks.enlarged(np.asarray(pattern, np.float32))
@@ -137,13 +156,3 @@ class Pictures(Seen):
         known = (variance < UNKNOWN) & (self._dark.variance < UNKNOWN)
         value = np.where(known, lit.value - self._dark.value, np.float32(0.0)) / self._scale
         return Picture(value, np.where(known, variance, UNKNOWN).astype(np.float32))
-
-
-def _numbered(before: int, picture: int, each: int) -> str:
-    """The photographs of a picture of a batch, before which there were some.
-
-    >>> _numbered(10, 0, 1), _numbered(10, 1, 2)
-    ('photograph 11', 'photographs 13 to 14')
-    """
-    last = before + (picture + 1) * each
-    return f"photograph {last}" if each == 1 else f"photographs {last + 1 - each} to {last}"
