@@ -116,6 +116,18 @@ def one_of(name: str, value: Any, allowed: Iterable[str]) -> str:
     return value
 
 
+def colours(name: str, value: Any) -> int:
+    """Return a number of channels: 1 for grey, 3 for RGB.
+
+    >>> colours("channels", 2)
+    Traceback (most recent call last):
+    ltcl.errors.InputError: channels is 2; it must be 1 or 3
+    """
+    if value not in (1, 3):
+        raise InputError(f"{name} is {value!r}; it must be 1 or 3")
+    return value
+
+
 def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
     """Return `matrix` as a checked `csr_array` with sorted, unique indices.
 

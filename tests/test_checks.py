@@ -77,6 +77,7 @@ REFUSED = {
         lambda: checks.one_of("method", "magic", ["jacobi", "cg"]),
         "method is 'magic'; it must be one of jacobi, cg",
     ),
+    "channels": (lambda: checks.colours("channels", 2), "channels is 2; it must be 1 or 3"),
     "sparse vector": (
         lambda: checks.csr("T", scipy.sparse.coo_array([1.0, 2.0])),
         "T has shape (2,); it must be (M, N)",

@@ -14,7 +14,7 @@ from ltcl.device import open_device
 from ltcl.errors import FileError, InputError
 from ltcl.exact import beside
 from ltcl.solvers import Inverse
-from ltcl.store import formats
+from ltcl.store import formats, mtx
 from ltcl.transport import Transport
 
 _ROUNDING = 1e-5  # of float32, in a picture
@@ -154,8 +154,8 @@ def refuse_same(out: Path, file: Path) -> None:
 
 
 def on_disk(path: Path) -> int:
-    """Bytes of a file, or of all files in a folder."""
-    files = path.rglob("*") if path.is_dir() else [path]
+    """Bytes of a file, of all files in a folder, or of the three of a .mtx in colour."""
+    files = path.rglob("*") if path.is_dir() else [path] if path.exists() else mtx.beside(path)
     return sum(file.stat().st_size for file in files if file.is_file())
 
 

@@ -107,7 +107,8 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     ----------
     path
         .npz and .zarr (as float32) keep everything, and they alone compressed operators; .h5 and .mat all
-        else; .npy (dense only) the matrix; .mtx (one channel only) matrix and grids.
+        else; .npy (dense only) the matrix; .mtx matrix and grids, of three channels in T_r.mtx, T_g.mtx and
+        T_b.mtx for T.mtx.
     T
         A transport made of matrices, or compressed.
 

@@ -6,9 +6,11 @@ The modules say what is wrong, and here the file's name is put in front: one lin
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from ltcl.errors import FileError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
@@ -50,6 +52,14 @@ def read(path: str | Path) -> Record | Parts:
     """
     path = as_path(path)
     module = find(path)
+    if module is mtx and not path.exists() and any(one.exists() for one in mtx.beside(path)):
+        channels = [_read(mtx, one) for one in mtx.beside(path)]
+        with about(path):
+            return mtx.together(channels)
+    return _read(module, path)
+
+
+def _read(module: ModuleType, path: Path) -> Any:
     if module is not zarr_folder:
         input_file(path)
     with about(path):
@@ -82,8 +92,23 @@ def write(path: str | Path, record: Record | Parts) -> None:
     if isinstance(record, Record):
         with about(path):
             record = record.in_memory()
+    if module is mtx and isinstance(record, Record) and len(record.matrices) == 3:
+        _write_beside(path, record)
+        return
     with replace_file(path) as temporary, about(path):
         module.write(temporary, record)
+
+
+def _write_beside(path: Path, record: Record) -> None:
+    """Each channel as a .mtx file of its own."""
+    if path.exists():
+        names = ", ".join(one.name for one in mtx.beside(path))
+        raise FileError(f"{path}: is there, and would be read in place of the channels {names}; remove it")
+    with contextlib.ExitStack() as stack:
+        for one, T in zip(mtx.beside(path), record.matrices, strict=True):
+            temporary = stack.enter_context(replace_file(one))
+            with about(one):
+                mtx.write(temporary, Record((T,), record.grid, record.camera_grid))
 
 
 def find(path: Path) -> ModuleType:

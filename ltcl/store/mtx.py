@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Matrix Market text (.mtx): one channel, sparse or dense, real or integer. Values come back as float64.
+"""Matrix Market text (.mtx), sparse or dense, real or integer. Values come back as float64.
+
+A file holds one matrix, so three channels of T.mtx are T_r.mtx, T_g.mtx and T_b.mtx beside each other.
 
 The grid stands in a comment, `%ltcl grid 3 x 4` or `%ltcl grid 3 x 4, camera grid 6 x 8`. The line of sizes
 is checked against the file's length before memory is taken. SciPy writes the file but does not read it: its
@@ -10,6 +12,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +20,7 @@ import numpy as np
 import scipy.io
 
 from ltcl import checks
-from ltcl.errors import FileError, InputError
+from ltcl.errors import FileError
 from ltcl.store import sparse
 from ltcl.store.record import Matrix, Record
 
@@ -45,10 +48,29 @@ def read(path: Path) -> Record:
     return Record((T,), head.grid, head.camera_grid)
 
 
+def beside(path: Path) -> tuple[Path, ...]:
+    """Where the three channels of a transport at `path` are.
+
+    >>> [one.name for one in beside(Path("T.mtx"))]
+    ['T_r.mtx', 'T_g.mtx', 'T_b.mtx']
+    """
+    return tuple(path.with_name(f"{path.stem}_{name}{path.suffix}") for name in "rgb")
+
+
+def together(records: Sequence[Record]) -> Record:
+    """Three channels as one transport; they must agree about their grids."""
+    first = records[0]
+    for name, told in (("shape", "shapes"), ("grid", "grids"), ("camera_grid", "camera grids")):
+        values = [getattr(record, name) for record in records]
+        if len(set(values)) > 1:
+            raise FileError(f"has channels of the {told} {', '.join(map(str, values))}; all must be the same")
+    if len({record.dense for record in records}) > 1:
+        raise FileError("has dense and sparse channels; all must be one of them")
+    return Record(tuple(record.matrices[0] for record in records), first.grid, first.camera_grid)
+
+
 def write(path: Path, record: Record) -> None:
-    """Write the matrix and the grids of `record`, which must have one channel."""
-    if len(record.matrices) != 1:
-        raise InputError("T has three channels, and .mtx holds one; save it as .npz (or .npy if dense)")
+    """Write the matrix and the grids of `record`, of one channel."""
     comment = ""
     if record.grid:
         comment = "ltcl grid {} x {}".format(*record.grid)

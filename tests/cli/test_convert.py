@@ -35,6 +35,22 @@ def test_sparse_to_matrix_market(program: Program, tmp_path: Path) -> None:
     assert formats.read(target).grid == (2, 2)
 
 
+@pytest.mark.parametrize("extension", [".mtx", ".mat"])
+def test_sparse_colour_goes_there_and_back(program: Program, tmp_path: Path, extension: str) -> None:
+    T = tuple(scipy.sparse.csr_array(np.diag(np.arange(1.0, 5.0) + k)) for k in range(3))
+    source, there, back = tmp_path / "T.npz", tmp_path / f"there{extension}", tmp_path / "back.npz"
+    formats.write(source, Record(T, (2, 2)))
+    outcome = program("convert", source, there)
+    assert (outcome.code, " 0 B on disk" in outcome.out) == (0, False)
+    assert program("info", there).code == 0
+    assert program("convert", there, back).code == 0
+    found = formats.read(back)
+    assert isinstance(found, Record)
+    assert found.grid == (2, 2)
+    for one, again in zip(T, found.matrices, strict=True):
+        np.testing.assert_array_equal(one.toarray(), scipy.sparse.csr_array(again).toarray())
+
+
 def test_losing_the_grid_is_said(program: Program, transport: Path, tmp_path: Path) -> None:
     outcome = program("convert", transport, tmp_path / "T.npy")
     assert "--grid 5x10" in outcome.err

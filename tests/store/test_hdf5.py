@@ -43,7 +43,7 @@ def test_first_bounces(tmp_path: Path, extension: str, channels: int) -> None:
     np.testing.assert_array_equal(ltcl.load(tmp_path / f"T{extension}").first_bounce, F)
 
 
-@pytest.mark.parametrize(("extension", "channels"), [(".h5", 1), (".h5", 3), (".mat", 1)])
+@pytest.mark.parametrize(("extension", "channels"), [(".h5", 1), (".h5", 3), (".mat", 1), (".mat", 3)])
 def test_sparse_round_trip(tmp_path: Path, extension: str, channels: int) -> None:
     T = tuple(sparse(12, "float64", seed, pattern=seed) for seed in range(channels))
     record = Record(T, (3, 4))
@@ -168,7 +168,29 @@ def test_without_h5py_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     assert not list(tmp_path.iterdir())
 
 
-def test_what_mat_does_not_hold(tmp_path: Path) -> None:
-    T = tuple(sparse(seed=seed) for seed in range(3))
-    with pytest.raises(FileError, match=r"save it as \.h5 or \.zarr"):
-        formats.write(tmp_path / "T.mat", Record(T, (3, 4)))
+def test_sparse_colour_of_mat_is_three_variables_as_matlab_has_them(tmp_path: Path) -> None:
+    T = tuple(sparse(seed=seed, pattern=seed) for seed in range(3))
+    formats.write(tmp_path / "T.mat", Record(T, (3, 4)))
+    with h5py.File(tmp_path / "T.mat") as file:
+        assert {"LTM_r", "LTM_g", "LTM_b"} <= set(file)
+        for name, one in zip(("LTM_r", "LTM_g", "LTM_b"), T, strict=True):
+            group: Any = file[name]
+            parts = (group["data"][:], group["ir"][:].astype(int), group["jc"][:].astype(int))
+            found = scipy.sparse.csc_array(parts, shape=(int(group.attrs["MATLAB_sparse"]), 12))
+            np.testing.assert_array_equal(found.toarray(), one.toarray())
+
+
+def test_channels_of_mat_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "T.mat"
+    formats.write(path, Record(tuple(sparse(seed=seed) for seed in range(3)), (3, 4)))
+    with h5py.File(path, "r+") as file:
+        del file["LTM_g"]
+        file["LTM_g"] = np.eye(6)
+    assert "LTM_r, LTM_g, LTM_b have the shapes (12, 12), (6, 6), (12, 12)" in refusal(path, FileError)
+    with h5py.File(path, "r+") as file:
+        del file["LTM_g"]
+        file["LTM_g"] = np.eye(12)
+    assert "full and sparse" in refusal(path, FileError)
+    with h5py.File(path, "r+") as file:
+        del file["LTM_g"]
+    assert "must be the variable LTM, or of three channels LTM_r, LTM_g, LTM_b" in refusal(path, FileError)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import scipy.io
@@ -49,10 +51,43 @@ def test_files_of_others_are_read(tmp_path, make, symmetry, field):
     np.testing.assert_array_equal(as_dense(result), T)
 
 
-def test_colour_is_refused(tmp_path):
-    with pytest.raises(FileError, match=r"T\.mtx: T has three channels.*\.npz"):
+COLOURS = ["T_r.mtx", "T_g.mtx", "T_b.mtx"]
+
+
+@pytest.mark.parametrize("make", [sparse, dense])
+@pytest.mark.parametrize("grids", [(None, None), ((3, 4), (2, 6))])
+def test_colour_is_three_files(tmp_path, make, grids):
+    T = tuple(
+        make(12, dtype="float64", seed=k) if make is sparse else make(12, 12, "float64", k) for k in (1, 2, 3)
+    )
+    formats.write(tmp_path / "T.mtx", Record(T, *grids))
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(COLOURS)
+    same(record_in(tmp_path / "T.mtx"), Record(T, *grids))
+    for name, one in zip(COLOURS, T, strict=True):  # each is a file that anybody reads
+        found = scipy.io.mmread(tmp_path / name)
+        np.testing.assert_array_equal(scipy.sparse.csr_array(found).toarray(), as_dense(one))
+        same(record_in(tmp_path / name), Record((one,), *grids))
+
+
+def test_channels_that_do_not_fit_are_refused(tmp_path):
+    formats.write(tmp_path / "T.mtx", Record((sparse(), sparse(), sparse()), (3, 4)))
+    for other, text in (
+        (Record((sparse(6),)), r"channels of the shapes \(12, 12\), \(6, 6\), \(12, 12\)"),
+        (Record((sparse(),), (2, 6)), r"channels of the grids \(3, 4\), \(2, 6\), \(3, 4\)"),
+        (Record((dense(),), (3, 4)), "dense and sparse channels"),
+    ):
+        formats.write(tmp_path / "T_g.mtx", other)
+        assert re.search(text, refusal(tmp_path / "T.mtx", FileError))
+    (tmp_path / "T_g.mtx").unlink()
+    with pytest.raises(FileError, match=r"T_g\.mtx: "):
+        formats.read(tmp_path / "T.mtx")
+
+
+def test_a_grey_file_is_not_hidden_behind_colour(tmp_path):
+    formats.write(tmp_path / "T.mtx", Record((sparse(),)))
+    with pytest.raises(FileError, match=r"T\.mtx: is there, and would be read in place of .* T_r\.mtx"):
         formats.write(tmp_path / "T.mtx", Record((sparse(), sparse(), sparse())))
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["T.mtx"]
 
 
 @pytest.mark.parametrize(

@@ -165,7 +165,8 @@ def _bins(rows: np.ndarray, model: NoiseModel) -> _Bins:
     mean, variance, slope, code, low, high, freedom = rows[:, np.argsort(rows[0], kind="stable")]
     cuts = np.linspace(0, len(mean), min(_BINS, len(mean)) + 1).astype(int)[:-1]
     count = np.add.reduceat(freedom, cuts)
-    rounding = 12.0 * model.rounding(slope) * np.ones_like(mean)  # a code squared
+    # A code squared; not 0 where a response is flat.
+    rounding = np.maximum(12.0 * model.rounding(slope) * np.ones_like(mean), 1e-30)
     parts = (mean - model.black, variance, rounding, low, high)
     light, whole, step, low, high = (np.add.reduceat(part * freedom, cuts) / count for part in parts)
     # Whole bins go, and all beyond: a pixel chosen by its own noise would bias the variance.
@@ -207,9 +208,17 @@ def _line(rows: np.ndarray, model: NoiseModel) -> NoiseModel:
         scale = np.sqrt(bins.count / 2.0) / expected
         (gain, floor), _ = scipy.optimize.nnls(columns * scale[:, None], bins.found * scale)
         expected = np.maximum(columns @ (gain, floor) + bins.whole - bins.found, least)
-    told = columns * scale[:, None]
-    error = float(np.sqrt(max(np.linalg.pinv(told.T @ told)[1, 1], 0.0)))
-    # Not told from none, it may be as large as the error; and never more than whole codes could hide.
-    floor = min(floor if floor > error else floor + error, float(every.least.min()))
+    error = _error_of_floor(columns[:, 0] * scale, scale)
+    # Not told from none, it may be as large as its error, but not more than all noise of a bin, nor than what
+    # whole codes could hide.
+    most = min(float((expected + 1.0 / scale).min()), float(every.least.min()))
+    floor = min(floor if floor > error else floor + error, most)
     electrons = float(1.0 / max(gain, 1.0 / _MOST_ELECTRONS))
     return NoiseModel(electrons, float(np.sqrt(floor)), model.black, model.saturation, model.levels)
+
+
+def _error_of_floor(x: np.ndarray, w: np.ndarray) -> float:
+    """Standard deviation of b, of least squares over x a + w b; infinite where nothing tells a from b."""
+    xx, xw, ww = (float(np.sum(part)) for part in (x * x, x * w, w * w))
+    alone = ww - xw**2 / xx if xx > 0 else ww
+    return alone**-0.5 if alone > 1e-12 * ww else np.inf

@@ -126,9 +126,7 @@ class OpenCVCamera:
         seconds: float | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
-        if channels not in (1, 3):
-            raise InputError(f"channels is {channels!r}; it must be 1 or 3")
-        self.channels = channels
+        self.channels = checks.colours("channels", channels)
         self.source = _source(source)
         self.stream = not (isinstance(self.source, str) and os.path.isfile(self.source))
         self._seconds = None if seconds is None else as_seconds(seconds)

@@ -101,11 +101,9 @@ class FolderRig:
     ) -> None:
         self.folder = as_path(folder)
         self.projector_grid = checks.grid("projector_grid", projector_grid)
-        if channels not in (1, 3):
-            raise InputError(f"channels is {channels!r}; it must be 1 or 3")
         if pattern_bits not in (8, 16):
             raise InputError(f"pattern_bits is {pattern_bits!r}; it must be 8 or 16")
-        self.channels = channels
+        self.channels = checks.colours("channels", channels)
         self.bits = (
             None if camera_bits is None else checks.count("camera_bits", camera_bits, least=9, most=16)
         )

@@ -106,9 +106,7 @@ class LiveRig:
         _refuse_lacking("camera", camera, ("channels", "stream", "expose", "frame"))
         _refuse_lacking("display", display, ("grid", "period", "show"))
         self.projector_grid = checks.grid("display.grid", display.grid)
-        self.channels = camera.channels
-        if self.channels not in (1, 3):
-            raise InputError(f"camera.channels is {self.channels!r}; it must be 1 or 3")
+        self.channels = checks.colours("camera.channels", camera.channels)
         self.bits = getattr(camera, "bits", None)
         self._period = _period(period, display)
         limits = getattr(camera, "limits", (SHORTEST, LONGEST))

@@ -96,9 +96,7 @@ class MitsubaRig:
         seed: int = 0,
     ) -> None:
         self.projector_grid = checks.grid("projector_grid", projector_grid)
-        if channels not in (1, 3):
-            raise InputError(f"channels is {channels!r}; it must be 1 or 3")
-        self.channels = channels
+        self.channels = checks.colours("channels", channels)
         self._samples = checks.count("samples", samples)
         self._projector = curves.projector(projector_response, channels)
         self._sensor = Sensor(curves.camera(response, channels), bits, black, gain, read)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ltcl import checks
 from ltcl.acquisition.rig import as_seconds
 from ltcl.acquisition.rigs import extras, photographs
 from ltcl.errors import AcquisitionError, FileError, InputError
@@ -75,9 +76,7 @@ class GPhoto2Camera:
     stream = False
 
     def __init__(self, channels: int = 3) -> None:
-        if channels not in (1, 3):
-            raise InputError(f"channels is {channels!r}; it must be 1 or 3")
-        self.channels = channels
+        self.channels = checks.colours("channels", channels)
         self._gp = extras.load("gphoto2", "camera", "a camera on a cable")
         self._camera = self._gp.Camera()
         self._seconds: float | None = None

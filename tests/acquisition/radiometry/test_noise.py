@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ltcl.acquisition.radiometry import NoiseModel, estimate
+from ltcl.acquisition.radiometry import NoiseModel, Response, estimate
 from ltcl.acquisition.radiometry.noise import _undone
 from ltcl.errors import InputError
 from tests.acquisition.radiometry.cameras import Camera, corner
@@ -76,6 +76,24 @@ def test_codes_that_never_change_hide_a_fifth_of_one_at_most():
     """A scene of three even parts without any noise that the codes show."""
     shots = [np.repeat(np.array([3, 90, 200], np.uint8), 100).reshape(15, 20)] * 4
     assert 0 < estimate([shots]).read * 255 <= 0.2
+
+
+def test_a_response_that_is_flat_in_the_dark_tells_noise_without_warnings():
+    rng = np.random.default_rng(4)
+    flat = Response(np.maximum(np.linspace(-0.1, 1.0, 12), 0.0))
+    light = np.tile(np.linspace(0.0, 200.0, 64), (64, 1))
+    shots = [np.rint(light + rng.normal(0, 2.0, light.shape)).clip(0, 255).astype(np.uint8) for _ in range(6)]
+    with np.errstate(all="raise"):
+        found = estimate([shots], response=flat)
+    assert 0 < found.read < 0.02
+    assert found.electrons > 1000
+
+
+def test_few_pixels_of_one_brightness_bound_the_read_noise_by_all_their_noise():
+    """Four pixels tell no slope; 3 codes is the deviation that they have."""
+    rng = np.random.default_rng(0)
+    found = estimate([[np.rint(rng.normal(100, 3, (2, 2))).astype(np.uint8) for _ in range(8)]])
+    assert found.read * 255 < 6
 
 
 def test_what_rounding_leaves_of_a_variance_is_undone():
