@@ -179,10 +179,12 @@ class Shares:
 
     def moves(self) -> Moves:
         """What picture a shows of pattern b, against its own."""
-        weight, on = self.weight, self.lit.astype(np.float64)
+        some = self.lit.any(axis=0)  # of most batches few pixels
+        weight, share, sigma = self.weight[:, some], self.share[:, some], self.sigma[:, some]
+        on = self.lit[:, some].astype(np.float64)
         other, own = _alone(weight, on)
-        shown, kept = _alone(weight * self.share, on)
-        noise = np.sqrt(np.maximum(sum(_alone((weight * self.sigma) ** 2, on)), 0.0))  # of rounding
+        shown, kept = _alone(weight * share, on)
+        noise = np.sqrt(np.maximum(sum(_alone((weight * sigma) ** 2, on)), 0.0))  # of rounding
         there, here = shown / np.maximum(other, 1e-9), kept / np.maximum(own, 1e-9)
         clear = (there >= _CERTAIN) & (_LITTLE * there >= np.maximum(here, here.T))
         return Moves(shown - kept - 0.5 * (other - own), noise, 0.5 * (other + own), clear)
