@@ -155,7 +155,7 @@ class _Linear:
 
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
         light = self._response.linear(self._shots.photograph(codes, seconds))
-        self.sums.add(codes, light, self._shots.count)
+        self.sums.add(codes, light, self._shots.number)
         return light
 
 

@@ -39,7 +39,7 @@ def response_of(run: Taking, seconds: float) -> Response:
         raise InputError("rig.exposures has one exposure, which tells no response; give response=")
     ramps = [ramp(grid, k * max(grid) // _RAMPS) for k in range(_RAMPS)]
     lit = [*ramps[: 1 if grid[0] * grid[1] >= _MANY else _RAMPS], run.black]
-    first, taken = run.shots.count + 1, run.take([(codes, t) for t in times for codes in lit])
+    taken = run.take([(codes, t) for t in times for codes in lit])
     bad = stuck(taken[len(lit) - 1])  # under black, for the shortest time
     longest = exposing.offered(run.shots, [times[-1] * _STEP**k for k in range(1, _LONGER + 1)])
     for longer in (t for t in longest if t > times[-1]):
@@ -47,11 +47,12 @@ def response_of(run: Taking, seconds: float) -> Response:
             break
         taken, times = [*taken, *run.take([(codes, longer) for codes in lit])], (*times, longer)
     every = [_beside(taken[k : k + len(lit)], bad) for k in range(0, len(taken), len(lit))]
-    with exposing.telling(f"the response of the camera, photographs {first} to {run.shots.count}"):
+    numbers = range(run.shots.number + 1 - len(taken), run.shots.number + 1)
+    with exposing.telling(f"the response of the camera, photographs {numbers[0]} to {numbers[-1]}"):
         found = calibrate(every, times, levels=run.shots.levels, saturation=TOP)
     for k in range(len(lit)):
-        numbers = range(first + k, run.shots.count + 1, len(lit))
-        agreeing.refuse_unlike(taken[k :: len(lit)], times, numbers, found)
+        scene = slice(k, None, len(lit))
+        agreeing.refuse_unlike(taken[scene], times, numbers[scene], found)
     return found
 
 

@@ -31,7 +31,7 @@ class Rig(Protocol):
     which must be the same when a scan is resumed (but for `unchanged.PASSING`, such as "survey", where what
     is measured in each session stands); `recall(codes, seconds, image)`, told of a photograph that it took in
     an earlier session and is not asked for again; `keeps_photographs`, whether it keeps them itself;
-    `close()`.
+    `number` of the last photograph, as whoever takes them counts; `close()`.
     """
 
     @property
@@ -82,6 +82,8 @@ class Shots:
         The seconds that the camera offers, ascending; None: any from 1e-4 to 30.
     count : int
         Photographs taken.
+    number : int
+        Of the last one: the rig's, where it has numbers of its own, else `count`.
     camera_grid : (H, W), or None
         Of the camera, once there was a photograph.
     levels : int, or None
@@ -125,6 +127,11 @@ class Shots:
         self.keeper: Keeper | None = None
         self.asking = False
         self._first: tuple[tuple[int, ...], np.dtype] | None = None
+
+    @property
+    def number(self) -> int:
+        """Of the last photograph, for messages."""
+        return getattr(self.rig, "number", self.count)
 
     @property
     def camera_grid(self) -> tuple[int, int] | None:

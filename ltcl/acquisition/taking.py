@@ -37,7 +37,7 @@ class Taking:
         noise: NoiseModel = agreeing.ROUGH,
     ) -> list[np.ndarray]:
         """The same, all of one pattern; refused where they contradict each other."""
-        images, last = self.take(wanted), self.shots.count
+        images, last = self.take(wanted), self.shots.number
         numbers = range(last + 1 - len(images), last + 1)
         agreeing.refuse_unlike(images, [t for _, t in wanted], numbers, response, noise)
         return images
@@ -54,6 +54,6 @@ class Taking:
         """What the camera sees under `codes`, the ambient light still in it."""
         times = [t for t in seconds for _ in range(again)]
         images = self.agreeing([(codes, t) for t in times], response, noise)
-        last = self.shots.count
+        last = self.shots.number
         with exposing.telling(f"photographs {last + 1 - len(images)} to {last}"):
             return merge(images, times, response, noise, levels=self.shots.levels, black=offset)

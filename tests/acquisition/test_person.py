@@ -65,6 +65,28 @@ def test_all_is_photographed_once(session: tuple[Path, np.ndarray]) -> None:
     assert off(T.astype(np.float64), corner(4), (4, 8)) < 0.05
 
 
+def test_what_is_mixed_up_in_a_later_session_is_named_by_its_file(
+    session: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    """Without times in the files; the calibration was committed in the session before."""
+    folder, store = shutil.copytree(session[0], tmp_path / "photos"), tmp_path / "T.zarr"
+
+    def acquired(progress: Any = None) -> None:
+        acquire(FolderRig(folder, (4, 8), 1, in_order=False), **GIVEN, store=store, progress=progress)
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        acquired(stop)
+    last = len(list((folder / "photographs").iterdir()))
+    for number in (last - 7, last - 6):  # both exposures of a pattern, and of the next
+        swapped(*(folder / f"photographs/photo_{n:06d}.png" for n in (number, number + 2)))
+    with pytest.raises(AcquisitionError, match=rf"photographs {last - 7} to {last - 6} show") as told:
+        acquired()
+    assert f"photographs {last - 5} to {last - 4}" in str(told.value)
+
+
 def smaller(path: Path, other: Path) -> None:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     path.unlink()

@@ -115,6 +115,7 @@ class FolderRig:
         self._list = ShootingList(inside(self.folder, "shots.json"), common)
         self._asked: Counter[tuple[str, float]] = Counter()
         self._arrivals = Arrivals(self.folder)
+        self.number = 0
         self._sequence = Sequence(in_order=checks.flag("in_order", in_order))
         self._warned = False
 
@@ -166,6 +167,7 @@ class FolderRig:
         self._sequence.check(name, number, key[1], photograph)
         self._warn_of_scale(name, photograph.codes)
         self._asked[key] += 1
+        self.number = number
         return photograph.codes
 
     def missing(self) -> tuple[int, ...]:

@@ -110,7 +110,7 @@ class Pictures(Seen):
         """
         patterns = list(patterns)
         codes = [self._codes(pattern) for pattern in patterns]
-        times, first = self.calibration.exposures, self.shots.count
+        times = self.calibration.exposures
         self.shots.prepare([(part, t) for part in codes for t in times])
         found, contradictions = [], []
         for part in codes:
@@ -118,7 +118,7 @@ class Pictures(Seen):
             contradictions.append(exposed.contradiction(images, self.calibration, part))
             found.append(self._picture(images))
             tell()
-        self._check(patterns, found, contradictions, first)
+        self._check(patterns, found, contradictions)
         return found
 
     def _check(
@@ -126,10 +126,10 @@ class Pictures(Seen):
         patterns: list[np.ndarray],
         found: list[Picture],
         contradictions: list[exposed.Contradiction],
-        before: int,
     ) -> None:
-        """Refuse what does not show its patterns; there were photographs `before`."""
+        """Refuse what does not show its patterns."""
         each = len(self.calibration.exposures)
+        before = self.shots.number - each * len(found)
 
         def name(a: int) -> str:
             last = before + (a + 1) * each
@@ -146,7 +146,7 @@ class Pictures(Seen):
     def _picture(self, images: list[np.ndarray]) -> Picture:
         told = self.calibration
         levels = told.noise.levels or None
-        last = self.shots.count
+        last = self.shots.number
         with telling(f"photographs {last + 1 - len(images)} to {last}"):
             merged = merge(
                 images, told.exposures, told.response, told.noise, levels=levels, black=told.offset
