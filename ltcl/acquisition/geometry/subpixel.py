@@ -5,7 +5,8 @@ An edge lies where pattern and inverse are equal; between two camera pixels line
 a few hundredths of a pixel, and there the projector coordinate is known: n + 1/2. Every boundary of two
 projector columns is an edge of exactly one bit. A weighted least-squares plane `x = a + b u + c v` through
 the edges in a window, and faintly through the coordinates of the pixels themselves, gives x at the pixel.
-Where they spread about it, the window crosses a border, and one to a side or a smaller one gives the plane.
+Where they spread about it, the window crosses a border, and one to a side or a smaller one gives the plane;
+at the rim of the picture it is a full window that begins there, as beyond the rim there are no edges.
 Where that leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter (sharp folds), the whole
 number stays, if there are others around for which it is so; else the bits of the pixel are wrong, and it is
 dropped.
@@ -23,13 +24,14 @@ from ltcl.acquisition.geometry.decoded import Axis, Edges, strips
 LEAVES = 0.25
 COMPANY = 5  # side of a window
 SPREAD = 0.2  # of edges about a plane: more is no plane; whole numbers of pixels alone add 0.06
+FULL = 0.9  # part of a window that is valid: less is a rim
 EDGES = 8  # that tell a plane on one side
 ACROSS = 2.5  # edges on each side of a pixel that a window should hold
 SMALLEST, LARGEST = 2, 15  # reach of a window, in camera pixels
 STRIP = 1 << 16  # pixels of a strip of rows: its moments stay in the cache
 
 
-def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def refine(axis: Axis, valid: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Projector coordinate (H, W) float32 of the valid pixels, to a fraction of a pixel, and which may stay.
 
     Parameters
@@ -38,6 +40,9 @@ def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Decoded with ``edges=True``; one without edges comes back as it is.
     valid : (H, W) bool
         Pixels of width 2 at most that agree with their neighbours.
+    size : int
+        Projector pixels along the axis. What is beside them is nobody's: camera pixels that are lit in part
+        may lie there, up to a quarter.
     """
     if axis.edges is None:
         return axis.value, valid
@@ -50,7 +55,10 @@ def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         planes = _planes(axis, valid, reach)
     plane = _at_pixels(axis, valid, planes, reach)
     far = axis.width / 2
-    cell = axis.value + np.clip(plane - axis.value, -far, far)
+    low, high = axis.value - far, axis.value + far
+    low -= LEAVES * (low < 0)
+    high += LEAVES * (high > size - 1)
+    cell = np.clip(plane, low, high)
     return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32, copy=False), valid
 
 
@@ -81,32 +89,66 @@ def _at_pixels(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) ->
     Where a window crosses the border of an object, which shows as spread, windows to the sides are tried
     (Kuwahara et al. 1976), and then smaller ones.
     """
-    value = planes[0].copy()
-    v, u = np.divmod(np.flatnonzero(valid & (planes[3] > SPREAD)), valid.shape[1])
+    value, spread = _inward(axis, valid, planes, reach)
+    v, u = np.divmod(np.flatnonzero(valid & (spread > SPREAD)), valid.shape[1])
     while len(v):
-        value[v, u], spread = _best(axis, planes, reach, v, u)
+        value[v, u], least = _best(axis, planes, reach, v, u)
         if reach <= SMALLEST:
             break
-        v, u = v[spread > SPREAD], u[spread > SPREAD]
+        v, u = v[least > SPREAD], u[least > SPREAD]
         reach = max(reach // 2, SMALLEST)
         planes = _planes(axis, valid, reach)
     return value
+
+
+def _inward(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Values and spreads (H, W) of the windows about pixels; at a rim, of a full window that begins there.
+
+    A window about a pixel at the rim holds few edges, maybe on one line: the whole numbers of pixels would
+    tell the slope across it. The middle of its valid pixels lies half as far inside as a full window's.
+    """
+    value, spread = planes[0].copy(), planes[3].copy()
+    count, mean_v, mean_u = _middle(valid, 2 * reach + 1)
+    v, u = np.nonzero(valid & (count < FULL * (2 * reach + 1) ** 2))
+    j, i = np.rint(2 * (mean_v[v, u] - v)).astype(int), np.rint(2 * (mean_u[v, u] - u)).astype(int)
+    there, spread_there = _from_beside(planes, v, u, j, i)
+    fits = np.abs(there - axis.value[v, u]) <= axis.width[v, u] / 2 + LEAVES
+    some = fits & (spread_there <= SPREAD)
+    value[v[some], u[some]], spread[v[some], u[some]] = there[some], spread_there[some]
+    return value, spread
+
+
+def _middle(valid: np.ndarray, window: int) -> tuple[np.ndarray, ...]:
+    """How many pixels of the window about each are valid, and their mean row and column; (H, W) each."""
+    v, u = (part.astype(np.float32) for part in np.ogrid[: valid.shape[0], : valid.shape[1]])
+    one = valid.astype(np.float32)
+    size = (window, window)
+    count, *sums = (
+        cv2.boxFilter(part, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for part in (one, one * v, one * u)
+    )
+    return count, *(total / np.maximum(count, 1.0) for total in sums)
 
 
 def _best(
     axis: Axis, planes: np.ndarray, reach: int, v: np.ndarray, u: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values at pixels (v, u) of that window around or beside each which spreads least, and its spread."""
-    value, b, c, spread = planes
-    H, W = value.shape
     cell, far = axis.value[v, u], axis.width[v, u] / 2 + LEAVES
-    best, least = value[v, u], np.full(len(v), np.inf)
+    best, least = planes[0, v, u], np.full(len(v), np.inf)
     for j, i in ((j, i) for j in (0, -reach, reach) for i in (0, -reach, reach)):
-        row, column = np.clip(v + j, 0, H - 1), np.clip(u + i, 0, W - 1)
-        there = value[row, column] - b[row, column] * (column - u) - c[row, column] * (row - v)
-        better = (spread[row, column] < least) & (np.abs(there - cell) <= far)
-        best, least = np.where(better, there, best), np.where(better, spread[row, column], least)
+        there, spread = _from_beside(planes, v, u, j, i)
+        better = (spread < least) & (np.abs(there - cell) <= far)
+        best, least = np.where(better, there, best), np.where(better, spread, least)
     return best, least
+
+
+def _from_beside(planes: np.ndarray, v: np.ndarray, u: np.ndarray, j, i) -> tuple[np.ndarray, np.ndarray]:
+    """Values at pixels (v, u) of the planes `j` rows and `i` columns beside, and their spread."""
+    H, W = planes.shape[1:]
+    row, column = np.clip(v + j, 0, H - 1), np.clip(u + i, 0, W - 1)
+    value, b, c, spread = planes[:, row, column]
+    return value - b * (column - u) - c * (row - v), spread
 
 
 def _in_company(odd: np.ndarray) -> np.ndarray:
