@@ -22,6 +22,7 @@ import numpy as np
 from ltcl.acquisition.geometry.decoded import Axis, Edges, strips
 
 LEAVES = 0.25
+BESIDE = 1.0  # projector pixels from the picture: camera pixels further off see none of it
 COMPANY = 5  # side of a window
 SPREAD = 0.2  # of edges about a plane: more is no plane; whole numbers of pixels alone add 0.06
 FULL = 0.9  # part of a window that is valid: less is a rim
@@ -41,30 +42,34 @@ def refine(axis: Axis, valid: np.ndarray, size: int) -> tuple[np.ndarray, np.nda
     valid : (H, W) bool
         Pixels of width 2 at most that agree with their neighbours.
     size : int
-        Projector pixels along the axis. What is beside them is nobody's: camera pixels that are lit in part
-        may lie there, up to a quarter.
+        Projector pixels along the axis. Camera pixels that see a part of the outermost may lie beside them.
     """
     if axis.edges is None:
         return axis.value, valid
-    reach = _reach(axis.edges, valid)
+    cell, reach = _cell(axis, size), _reach(axis.edges, valid)
     planes = _planes(axis, valid, reach)
-    odd = valid & ~_fit(axis, planes[0])
+    odd = valid & ~_fit(cell, planes[0])
     odd &= ~_in_company(odd)
     if odd.any():  # edges beside them are none
         valid = valid & ~odd
         planes = _planes(axis, valid, reach)
-    plane = _at_pixels(axis, valid, planes, reach)
-    far = axis.width / 2
-    low, high = axis.value - far, axis.value + far
-    low -= LEAVES * (low < 0)
-    high += LEAVES * (high > size - 1)
-    cell = np.clip(plane, low, high)
-    return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32, copy=False), valid
+    plane = _at_pixels(axis, valid, cell, planes, reach)
+    place = np.where(valid & _fit(cell, plane), np.clip(plane, *cell), axis.value)
+    return place.astype(np.float32, copy=False), valid
 
 
-def _fit(axis: Axis, plane: np.ndarray) -> np.ndarray:
+def _cell(axis: Axis, size: int) -> np.ndarray:
+    """What each pixel may see, from and to; (2, H, W). Of cells at the border, what is beside them, too."""
+    low, high = axis.value - axis.width / 2, axis.value + axis.width / 2
+    low[low < 0] -= BESIDE
+    high[high > size - 1] += BESIDE
+    return np.stack([low, high])
+
+
+def _fit(cell: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """Where the plane is inside the cell, or nearly so."""
-    return np.abs(plane - axis.value) <= axis.width / 2 + LEAVES
+    low, high = cell
+    return (plane >= low - LEAVES) & (plane <= high + LEAVES)
 
 
 def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
@@ -83,16 +88,16 @@ def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
     return planes
 
 
-def _at_pixels(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) -> np.ndarray:
+def _at_pixels(axis: Axis, valid: np.ndarray, cell: np.ndarray, planes: np.ndarray, reach: int) -> np.ndarray:
     """Value of the plane of each pixel, (H, W).
 
     Where a window crosses the border of an object, which shows as spread, windows to the sides are tried
     (Kuwahara et al. 1976), and then smaller ones.
     """
-    value, spread = _inward(axis, valid, planes, reach)
+    value, spread = _inward(cell, valid, planes, reach)
     v, u = np.divmod(np.flatnonzero(valid & (spread > SPREAD)), valid.shape[1])
     while len(v):
-        value[v, u], least = _best(axis, planes, reach, v, u)
+        value[v, u], least = _best(cell[:, v, u], planes, reach, v, u)
         if reach <= SMALLEST:
             break
         v, u = v[least > SPREAD], u[least > SPREAD]
@@ -101,7 +106,9 @@ def _at_pixels(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) ->
     return value
 
 
-def _inward(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+def _inward(
+    cell: np.ndarray, valid: np.ndarray, planes: np.ndarray, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Values and spreads (H, W) of the windows about pixels; at a rim, of a full window that begins there.
 
     A window about a pixel at the rim holds few edges, maybe on one line: the whole numbers of pixels would
@@ -112,8 +119,7 @@ def _inward(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) -> tu
     v, u = np.nonzero(valid & (count < FULL * (2 * reach + 1) ** 2))
     j, i = np.rint(2 * (mean_v[v, u] - v)).astype(int), np.rint(2 * (mean_u[v, u] - u)).astype(int)
     there, spread_there = _from_beside(planes, v, u, j, i)
-    fits = np.abs(there - axis.value[v, u]) <= axis.width[v, u] / 2 + LEAVES
-    some = fits & (spread_there <= SPREAD)
+    some = _fit(cell[:, v, u], there) & (spread_there <= SPREAD)
     value[v[some], u[some]], spread[v[some], u[some]] = there[some], spread_there[some]
     return value, spread
 
@@ -131,14 +137,13 @@ def _middle(valid: np.ndarray, window: int) -> tuple[np.ndarray, ...]:
 
 
 def _best(
-    axis: Axis, planes: np.ndarray, reach: int, v: np.ndarray, u: np.ndarray
+    cell: np.ndarray, planes: np.ndarray, reach: int, v: np.ndarray, u: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values at pixels (v, u) of that window around or beside each which spreads least, and its spread."""
-    cell, far = axis.value[v, u], axis.width[v, u] / 2 + LEAVES
     best, least = planes[0, v, u], np.full(len(v), np.inf)
     for j, i in ((j, i) for j in (0, -reach, reach) for i in (0, -reach, reach)):
         there, spread = _from_beside(planes, v, u, j, i)
-        better = (spread < least) & (np.abs(there - cell) <= far)
+        better = (spread < least) & _fit(cell, there)
         best, least = np.where(better, there, best), np.where(better, spread, least)
     return best, least
 
