@@ -6,7 +6,7 @@ a few hundredths of a pixel, and there the projector coordinate is known: n + 1/
 projector columns is an edge of exactly one bit. A weighted least-squares plane `x = a + b u + c v` through
 the edges in a window, and faintly through the coordinates of the pixels themselves, gives x at the pixel.
 Where they spread about it, the window crosses a border, and one to a side or a smaller one gives the plane;
-at the rim of the picture it is a full window that begins there, as beyond the rim there are no edges.
+at the rim of the picture, beyond which there are no edges, it is one further inside.
 Where that leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter (sharp folds), the whole
 number stays, if there are others around for which it is so; else the bits of the pixel are wrong, and it is
 dropped.
@@ -26,6 +26,7 @@ BESIDE = 1.0  # projector pixels from the picture: camera pixels further off see
 COMPANY = 5  # side of a window
 SPREAD = 0.2  # of edges about a plane: more is no plane; whole numbers of pixels alone add 0.06
 FULL = 0.9  # part of a window that is valid: less is a rim
+TOLD = 0.06  # of the squared reach: edges whose places vary less lie on one line, or nearly so
 EDGES = 8  # that tell a plane on one side
 ACROSS = 2.5  # edges on each side of a pixel that a window should hold
 SMALLEST, LARGEST = 2, 15  # reach of a window, in camera pixels
@@ -73,9 +74,13 @@ def _fit(cell: np.ndarray, plane: np.ndarray) -> np.ndarray:
 
 
 def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
-    """Planes through the window about each pixel: value there, slopes b and c, spread about it; (4, H, W)."""
+    """Planes through the window about each pixel, (5, H, W).
+
+    Value there; slopes b and c; what edges spread about it; the variance of their places in that direction
+    in which it is least, in camera pixels.
+    """
     H, W = valid.shape
-    planes = np.empty((4, H, W), np.float32)
+    planes = np.empty((5, H, W), np.float32)
 
     def strip(rows: slice) -> None:
         above = min(reach, rows.start)
@@ -109,18 +114,24 @@ def _at_pixels(axis: Axis, valid: np.ndarray, cell: np.ndarray, planes: np.ndarr
 def _inward(
     cell: np.ndarray, valid: np.ndarray, planes: np.ndarray, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values and spreads (H, W) of the windows about pixels; at a rim, of a full window that begins there.
+    """Values and spreads (H, W) of the windows about pixels; at a rim, of one further inside.
 
     A window about a pixel at the rim holds few edges, maybe on one line: the whole numbers of pixels would
-    tell the slope across it. The middle of its valid pixels lies half as far inside as a full window's.
+    tell the slope across it.
     """
     value, spread = planes[0].copy(), planes[3].copy()
     count, mean_v, mean_u = _middle(valid, 2 * reach + 1)
-    v, u = np.nonzero(valid & (count < FULL * (2 * reach + 1) ** 2))
-    j, i = np.rint(2 * (mean_v[v, u] - v)).astype(int), np.rint(2 * (mean_u[v, u] - u)).astype(int)
-    there, spread_there = _from_beside(planes, v, u, j, i)
-    some = _fit(cell[:, v, u], there) & (spread_there <= SPREAD)
-    value[v[some], u[some]], spread[v[some], u[some]] = there[some], spread_there[some]
+    lacking = valid & (count < FULL * (2 * reach + 1) ** 2) & (planes[4] < TOLD * reach**2)
+    v, u = np.nonzero(lacking)
+    j, i = mean_v[v, u] - v, mean_u[v, u] - u
+    least = planes[4, v, u]
+    for further in (1, 2):  # a full window is twice as far inside as the middle of what there is
+        at = (np.rint(further * part).astype(int) for part in (j, i))
+        there, spread_there, told = _from_beside(planes, v, u, *at)
+        some = (told > least) & (least < TOLD * reach**2) & (spread_there <= SPREAD)
+        some &= _fit(cell[:, v, u], there)
+        value[v[some], u[some]], spread[v[some], u[some]] = there[some], spread_there[some]
+        least = np.where(some, told, least)
     return value, spread
 
 
@@ -142,18 +153,18 @@ def _best(
     """Values at pixels (v, u) of that window around or beside each which spreads least, and its spread."""
     best, least = planes[0, v, u], np.full(len(v), np.inf)
     for j, i in ((j, i) for j in (0, -reach, reach) for i in (0, -reach, reach)):
-        there, spread = _from_beside(planes, v, u, j, i)
+        there, spread, _ = _from_beside(planes, v, u, j, i)
         better = (spread < least) & _fit(cell, there)
         best, least = np.where(better, there, best), np.where(better, spread, least)
     return best, least
 
 
-def _from_beside(planes: np.ndarray, v: np.ndarray, u: np.ndarray, j, i) -> tuple[np.ndarray, np.ndarray]:
-    """Values at pixels (v, u) of the planes `j` rows and `i` columns beside, and their spread."""
+def _from_beside(planes: np.ndarray, v: np.ndarray, u: np.ndarray, j, i) -> tuple[np.ndarray, ...]:
+    """Values at pixels (v, u) of the planes `j` rows and `i` columns beside, and their last two parts."""
     H, W = planes.shape[1:]
     row, column = np.clip(v + j, 0, H - 1), np.clip(u + i, 0, W - 1)
-    value, b, c, spread = planes[:, row, column]
-    return value - b * (column - u) - c * (row - v), spread
+    value, b, c, *rest = planes[:, row, column]
+    return value - b * (column - u) - c * (row - v), *rest
 
 
 def _in_company(odd: np.ndarray) -> np.ndarray:
@@ -203,7 +214,7 @@ def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np
 
 
 def _plane(sums: list[np.ndarray], top: int, out: np.ndarray) -> None:
-    """Weighted least-squares planes from their ten moments: value at the pixel, b, c, spread; (4, h, W)."""
+    """Weighted least-squares planes from their ten moments: as `_planes` does."""
     h, W = sums[0].shape
     v, u = np.ogrid[float(top) : top + h, : float(W)]
     n, *means = sums
@@ -219,6 +230,7 @@ def _plane(sums: list[np.ndarray], top: int, out: np.ndarray) -> None:
     det = np.maximum(uu * vv - uv**2, 1e-9)
     b, c = (ux * vv - vx * uv) / det, (vx * uu - ux * uv) / det
     out[:3] = mean_x + b * (u - mean_u) + c * (v - mean_v), b, c
+    out[4] = det / (uu + vv)
     out[3] = np.maximum(xx - b * ux - c * vx, 0.0)
     np.sqrt(out[3], out=out[3])
     out[3][n < EDGES] = np.inf
