@@ -38,11 +38,15 @@ def consistent(value: np.ndarray, valid: np.ndarray, *, slack: float = 1.0) -> n
 def confirmed(axis: Axis, place: np.ndarray) -> Axis:
     """`axis`, and the faint numbers `place` (H, W) of undecided pixels that five decided neighbours confirm.
 
-    On an edge of the finest of narrow stripes every bit is faint; what they tell is off by one at most.
+    On an edge of the finest of narrow stripes every bit is faint; what they tell is off by one at most, and
+    where that leads out of the range of the neighbours, stripes seem to end where none does.
     """
     decided = axis.width <= 2.0
     off, _, neighbours = _compare(axis.value, decided, place.astype(np.float32))
     near = ~decided & np.isfinite(axis.width) & (neighbours >= 5) & (off <= 1.0)
+    around = np.ones((SIZE, SIZE), np.uint8)
+    near &= place >= np.floor(cv2.erode(np.where(decided, axis.value, FAR), around))
+    near &= place <= np.ceil(cv2.dilate(np.where(decided, axis.value, -FAR), around))
     value = np.where(near, place, axis.value).astype(np.float32)
     return replace(axis, value=value, width=np.where(near, np.float32(2.0), axis.width))
 

@@ -74,7 +74,7 @@ class Correspondence:
         """Decoded coordinates, less those that are not fully known or do not fit their neighbours."""
         valid = (x.width <= 2.0) & (y.width <= 2.0)
         valid &= consistent(x.value, valid) & consistent(y.value, valid)
-        (column, fits), (row, also) = refine(x, valid), refine(y, valid)
+        (column, fits), (row, also) = refine(x, valid, grid[1]), refine(y, valid, grid[0])
         return cls(column, row, np.minimum(x.confidence, y.confidence), fits & also, grid)
 
     @property

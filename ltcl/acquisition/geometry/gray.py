@@ -175,7 +175,8 @@ class _Plane:
 
     def fill(self, rows: slice, bits: classification.Bits, lit: np.ndarray) -> None:
         on, certain = bits.on, bits.certain
-        if self.narrow and self.bits > 1:
+        narrow = self.narrow and self.bits > 1
+        if narrow:
             # Exclusive or with the finest bit, a second time, gives Gray code back.
             on = np.concatenate([on[:-1] ^ on[-1], on[-1:]])
             certain = np.concatenate([certain[:-1] & certain[-1], certain[-1:]])
@@ -183,6 +184,7 @@ class _Plane:
         low = _binary(code)
         other = _binary(code ^ undecided)
         edge = (undecided != 0) & (undecided & (undecided - 1) == 0) & (np.abs(low - other) == 1)
+        edge &= not narrow  # there all bits flip: one that is faint tells nothing of where
         width = 1 + edge.astype(np.float32)
         value = np.where(edge, low + other, 2 * low) * np.float32(0.5)
         rough = (undecided != 0) & ~edge

@@ -5,7 +5,8 @@ An edge lies where pattern and inverse are equal; between two camera pixels line
 a few hundredths of a pixel, and there the projector coordinate is known: n + 1/2. Every boundary of two
 projector columns is an edge of exactly one bit. A weighted least-squares plane `x = a + b u + c v` through
 the edges in a window, and faintly through the coordinates of the pixels themselves, gives x at the pixel.
-Where they spread about it, the window crosses a border, and one to a side or a smaller one gives the plane.
+Where they spread about it, the window crosses a border, and one to a side or a smaller one gives the plane;
+at the rim of the picture, beyond which there are no edges, it is one further inside.
 Where that leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter (sharp folds), the whole
 number stays, if there are others around for which it is so; else the bits of the pixel are wrong, and it is
 dropped.
@@ -21,15 +22,18 @@ import numpy as np
 from ltcl.acquisition.geometry.decoded import Axis, Edges, strips
 
 LEAVES = 0.25
+BESIDE = 1.0  # projector pixels from the picture: camera pixels further off see none of it
 COMPANY = 5  # side of a window
 SPREAD = 0.2  # of edges about a plane: more is no plane; whole numbers of pixels alone add 0.06
+FULL = 0.9  # part of a window that is valid: less is a rim
+TOLD = 0.06  # of the squared reach: edges whose places vary less lie on one line, or nearly so
 EDGES = 8  # that tell a plane on one side
 ACROSS = 2.5  # edges on each side of a pixel that a window should hold
 SMALLEST, LARGEST = 2, 15  # reach of a window, in camera pixels
 STRIP = 1 << 16  # pixels of a strip of rows: its moments stay in the cache
 
 
-def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def refine(axis: Axis, valid: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Projector coordinate (H, W) float32 of the valid pixels, to a fraction of a pixel, and which may stay.
 
     Parameters
@@ -38,31 +42,45 @@ def refine(axis: Axis, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Decoded with ``edges=True``; one without edges comes back as it is.
     valid : (H, W) bool
         Pixels of width 2 at most that agree with their neighbours.
+    size : int
+        Projector pixels along the axis. Camera pixels that see a part of the outermost may lie beside them.
     """
     if axis.edges is None:
         return axis.value, valid
-    reach = _reach(axis.edges, valid)
+    cell, reach = _cell(axis, size), _reach(axis.edges, valid)
     planes = _planes(axis, valid, reach)
-    odd = valid & ~_fit(axis, planes[0])
+    odd = valid & ~_fit(cell, planes[0])
     odd &= ~_in_company(odd)
     if odd.any():  # edges beside them are none
         valid = valid & ~odd
         planes = _planes(axis, valid, reach)
-    plane = _at_pixels(axis, valid, planes, reach)
-    far = axis.width / 2
-    cell = axis.value + np.clip(plane - axis.value, -far, far)
-    return np.where(valid & _fit(axis, plane), cell, axis.value).astype(np.float32, copy=False), valid
+    plane = _at_pixels(axis, valid, cell, planes, reach)
+    place = np.where(valid & _fit(cell, plane), np.clip(plane, *cell), axis.value)
+    return place.astype(np.float32, copy=False), valid
 
 
-def _fit(axis: Axis, plane: np.ndarray) -> np.ndarray:
+def _cell(axis: Axis, size: int) -> np.ndarray:
+    """What each pixel may see, from and to; (2, H, W). Of cells at the border, what is beside them, too."""
+    low, high = axis.value - axis.width / 2, axis.value + axis.width / 2
+    low[low < 0] -= BESIDE
+    high[high > size - 1] += BESIDE
+    return np.stack([low, high])
+
+
+def _fit(cell: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """Where the plane is inside the cell, or nearly so."""
-    return np.abs(plane - axis.value) <= axis.width / 2 + LEAVES
+    low, high = cell
+    return (plane >= low - LEAVES) & (plane <= high + LEAVES)
 
 
 def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
-    """Planes through the window about each pixel: value there, slopes b and c, spread about it; (4, H, W)."""
+    """Planes through the window about each pixel, (5, H, W).
+
+    Value there; slopes b and c; what edges spread about it; the variance of their places in that direction
+    in which it is least, in camera pixels.
+    """
     H, W = valid.shape
-    planes = np.empty((4, H, W), np.float32)
+    planes = np.empty((5, H, W), np.float32)
 
     def strip(rows: slice) -> None:
         above = min(reach, rows.start)
@@ -75,38 +93,78 @@ def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
     return planes
 
 
-def _at_pixels(axis: Axis, valid: np.ndarray, planes: np.ndarray, reach: int) -> np.ndarray:
+def _at_pixels(axis: Axis, valid: np.ndarray, cell: np.ndarray, planes: np.ndarray, reach: int) -> np.ndarray:
     """Value of the plane of each pixel, (H, W).
 
     Where a window crosses the border of an object, which shows as spread, windows to the sides are tried
     (Kuwahara et al. 1976), and then smaller ones.
     """
-    value = planes[0].copy()
-    v, u = np.divmod(np.flatnonzero(valid & (planes[3] > SPREAD)), valid.shape[1])
+    value, spread = _inward(cell, valid, planes, reach)
+    v, u = np.divmod(np.flatnonzero(valid & (spread > SPREAD)), valid.shape[1])
     while len(v):
-        value[v, u], spread = _best(axis, planes, reach, v, u)
+        value[v, u], least = _best(cell[:, v, u], planes, reach, v, u)
         if reach <= SMALLEST:
             break
-        v, u = v[spread > SPREAD], u[spread > SPREAD]
+        v, u = v[least > SPREAD], u[least > SPREAD]
         reach = max(reach // 2, SMALLEST)
         planes = _planes(axis, valid, reach)
     return value
 
 
+def _inward(
+    cell: np.ndarray, valid: np.ndarray, planes: np.ndarray, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values and spreads (H, W) of the windows about pixels; at a rim, of one further inside.
+
+    A window about a pixel at the rim holds few edges, maybe on one line: the whole numbers of pixels would
+    tell the slope across it.
+    """
+    value, spread = planes[0].copy(), planes[3].copy()
+    count, mean_v, mean_u = _middle(valid, 2 * reach + 1)
+    lacking = valid & (count < FULL * (2 * reach + 1) ** 2) & (planes[4] < TOLD * reach**2)
+    v, u = np.nonzero(lacking)
+    j, i = mean_v[v, u] - v, mean_u[v, u] - u
+    least = planes[4, v, u]
+    for further in (1, 2):  # a full window is twice as far inside as the middle of what there is
+        at = (np.rint(further * part).astype(int) for part in (j, i))
+        there, spread_there, told = _from_beside(planes, v, u, *at)
+        some = (told > least) & (least < TOLD * reach**2) & (spread_there <= SPREAD)
+        some &= _fit(cell[:, v, u], there)
+        value[v[some], u[some]], spread[v[some], u[some]] = there[some], spread_there[some]
+        least = np.where(some, told, least)
+    return value, spread
+
+
+def _middle(valid: np.ndarray, window: int) -> tuple[np.ndarray, ...]:
+    """How many pixels of the window about each are valid, and their mean row and column; (H, W) each."""
+    v, u = (part.astype(np.float32) for part in np.ogrid[: valid.shape[0], : valid.shape[1]])
+    one = valid.astype(np.float32)
+    size = (window, window)
+    count, *sums = (
+        cv2.boxFilter(part, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for part in (one, one * v, one * u)
+    )
+    return count, *(total / np.maximum(count, 1.0) for total in sums)
+
+
 def _best(
-    axis: Axis, planes: np.ndarray, reach: int, v: np.ndarray, u: np.ndarray
+    cell: np.ndarray, planes: np.ndarray, reach: int, v: np.ndarray, u: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values at pixels (v, u) of that window around or beside each which spreads least, and its spread."""
-    value, b, c, spread = planes
-    H, W = value.shape
-    cell, far = axis.value[v, u], axis.width[v, u] / 2 + LEAVES
-    best, least = value[v, u], np.full(len(v), np.inf)
+    best, least = planes[0, v, u], np.full(len(v), np.inf)
     for j, i in ((j, i) for j in (0, -reach, reach) for i in (0, -reach, reach)):
-        row, column = np.clip(v + j, 0, H - 1), np.clip(u + i, 0, W - 1)
-        there = value[row, column] - b[row, column] * (column - u) - c[row, column] * (row - v)
-        better = (spread[row, column] < least) & (np.abs(there - cell) <= far)
-        best, least = np.where(better, there, best), np.where(better, spread[row, column], least)
+        there, spread, _ = _from_beside(planes, v, u, j, i)
+        better = (spread < least) & _fit(cell, there)
+        best, least = np.where(better, there, best), np.where(better, spread, least)
     return best, least
+
+
+def _from_beside(planes: np.ndarray, v: np.ndarray, u: np.ndarray, j, i) -> tuple[np.ndarray, ...]:
+    """Values at pixels (v, u) of the planes `j` rows and `i` columns beside, and their last two parts."""
+    H, W = planes.shape[1:]
+    row, column = np.clip(v + j, 0, H - 1), np.clip(u + i, 0, W - 1)
+    value, b, c, *rest = planes[:, row, column]
+    return value - b * (column - u) - c * (row - v), *rest
 
 
 def _in_company(odd: np.ndarray) -> np.ndarray:
@@ -156,7 +214,7 @@ def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np
 
 
 def _plane(sums: list[np.ndarray], top: int, out: np.ndarray) -> None:
-    """Weighted least-squares planes from their ten moments: value at the pixel, b, c, spread; (4, h, W)."""
+    """Weighted least-squares planes from their ten moments: as `_planes` does."""
     h, W = sums[0].shape
     v, u = np.ogrid[float(top) : top + h, : float(W)]
     n, *means = sums
@@ -172,6 +230,7 @@ def _plane(sums: list[np.ndarray], top: int, out: np.ndarray) -> None:
     det = np.maximum(uu * vv - uv**2, 1e-9)
     b, c = (ux * vv - vx * uv) / det, (vx * uu - ux * uv) / det
     out[:3] = mean_x + b * (u - mean_u) + c * (v - mean_v), b, c
+    out[4] = det / (uu + vv)
     out[3] = np.maximum(xx - b * ux - c * vx, 0.0)
     np.sqrt(out[3], out=out[3])
     out[3][n < EDGES] = np.inf

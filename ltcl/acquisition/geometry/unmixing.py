@@ -85,8 +85,9 @@ def _shares(found: Correspondence, J: np.ndarray, known: np.ndarray) -> scipy.sp
     """C, on the grid with its rim."""
     h, w = found.grid
     width, pixels = w + 2 * RIM, np.flatnonzero(known)
-    offsets = (np.arange(POINTS) + 0.5) / POINTS - 0.5
-    du, dv = (part.ravel() for part in np.meshgrid(offsets, offsets))
+    i, j = (part.ravel() for part in np.mgrid[:POINTS, :POINTS])
+    # Sheared: no two points lie on one line along a side, which a border may be, too.
+    du, dv = ((a + (b + 0.5) / POINTS) / POINTS - 0.5 for a, b in ((i, j), (j, i)))
     x, y, slopes = (part.reshape(known.size, -1)[pixels] for part in (found.x, found.y, J))
     counts = np.zeros(known.size, np.int64)
     columns, values = [], []
