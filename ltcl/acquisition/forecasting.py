@@ -14,7 +14,7 @@ do not depend on it.
 A camera that is coarse or out of focus shows part of a pixel's light at its neighbours, q_y and q_x along the
 axes (`Sharpness.errors`). A picture c is then off by about
 
-    sqrt(q_y^2 (c - mean of c above and below)^2 + q_x^2 (c - mean of c beside)^2),
+    q_y (c - mean of c above and below) + q_x (c - mean of c beside),
 
 which forecasts of pictures hold as well, and those of bounces do not.
 
@@ -170,8 +170,11 @@ def _blurs(found: BlockStore, T: Transport, columns: list[np.ndarray]) -> list[n
         return [np.zeros(part.shape) for part in columns]
     known = ~T.masked.reshape(*T.grid, 1)
     pictures = [(A @ p).reshape(*T.grid, -1) for A, p in zip(T.matrices, columns, strict=True)]
-    parts = ([q * _beside(c, known, k) for k, q in enumerate(sharp.errors)] for c in pictures)
-    return [np.hypot(y, x).reshape(p.shape) for (y, x), p in zip(parts, columns, strict=True)]
+    y, x = sharp.errors
+    return [
+        (y * _beside(c, known, 0) + x * _beside(c, known, 1)).reshape(p.shape)
+        for c, p in zip(pictures, columns, strict=True)
+    ]
 
 
 def _beside(c: np.ndarray, known: np.ndarray, axis: int) -> np.ndarray:

@@ -9,15 +9,14 @@ inverse, on the projector's grid, light from elsewhere is in both and cancels. W
 along an axis: l its direct light, and q the part of what comes out at it that is its neighbours', for camera
 pixels are too large for the grid, or out of focus. Least squares over the patterns of the axis tell q of each
 pixel; the median of |q| counts, less what the residuals say of its noise. Blocks of k x k pixels share a k-th
-of it. A picture of noise, even in [0, 1], is off by the part
+of it. A picture of noise, even in [0, 1], has a root mean square of twice its deviation, so that
 
-    sqrt((3 / 8) (q_y^2 + q_x^2)),
+    blur = sqrt(a_y a_x - 2 (1 - q_y) (1 - q_x) + 1) / 2,    a = (1 - q)^2 + q^2 / 2
 
-for a pixel less the mean of two others has 3 / 2 of the variance of each, and pixels a root mean square of
-twice their deviation. Errors of the map blur as a q of about 0.09 of the square of a camera pixel's width
-does (as measured: pictures are off by 0.5 % with a width of 0.27, 1.9 % with 0.54, 3.9 % with 0.72); of the
-two the larger counts. Known limits: where q is below 0.02, light that is uneven between stripes passes for
-it; with 1000 electrons at full scale noise makes it 0.03.
+is what it is off by, relative to it. Errors of the map blur as a q of about 0.07 of the square of a camera
+pixel's width does (as measured: pictures are off by 0.5 % with a width of 0.27, 1.9 % with 0.54, 3.9 % with
+0.72); of the two the larger counts. Known limits: where q is below 0.02, light that is uneven between stripes
+passes for it; with 1000 electrons at full scale noise makes it 0.03.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ from ltcl.errors import AcquisitionError
 
 logger = logging.getLogger(__name__)
 WIDEST = 8  # pixels of a stripe, on average, whose light from elsewhere is as that of its inverse
-BAD, HOPELESS = 0.03, 0.25  # parts that pictures of noise are off by
-OF_MAP = 0.09  # q of errors of the map, of camera pixels as wide as the projector's
+BAD, HOPELESS = 0.03, 0.3  # parts that pictures of noise are off by
+OF_MAP = 0.07  # q of errors of the map, of camera pixels as wide as the projector's
 _TOLD = 0.5  # determinant of the least squares of a pixel, at least
 _MIDDLE = 0.6745  # of a deviation, below which half of normal values are
 
@@ -63,8 +62,8 @@ class Sharpness:
     >>> one = Sharpness((0.2, 0.5), 0.25)
     >>> one.own, one.of_blocks(2).own
     (0.4, 0.675)
-    >>> round(Sharpness((0.2, 0.5), 0.25).blur, 2)
-    0.33
+    >>> round(Sharpness((0.2, 0.0), 0.0).blur, 3)  # sqrt(3 / 8) of 0.2
+    0.122
     """
 
     leak: tuple[float, float]
@@ -91,7 +90,9 @@ class Sharpness:
     @property
     def blur(self) -> float:
         """How far pictures of noise are off, relative to them."""
-        return float(np.sqrt(0.375) * np.hypot(*self.errors))
+        y, x = self.errors
+        a = ((1 - y) ** 2 + y**2 / 2) * ((1 - x) ** 2 + x**2 / 2)
+        return float(np.sqrt(max(a - 2 * (1 - y) * (1 - x) + 1, 0.0)) / 2)
 
     @property
     def errors(self) -> tuple[float, float]:
@@ -105,7 +106,7 @@ class Sharpness:
         Raises
         ------
         AcquisitionError
-            Pictures of noise are off by a quarter: most light comes out at neighbours.
+            Pictures of noise are off by 30 %: most light comes out at neighbours.
 
         Examples
         --------
