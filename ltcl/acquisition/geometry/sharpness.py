@@ -37,7 +37,7 @@ from ltcl.errors import AcquisitionError
 
 logger = logging.getLogger(__name__)
 WIDEST = 8  # pixels of a stripe, on average, whose light from elsewhere is as that of its inverse
-BAD, HOPELESS = 0.03, 0.3  # parts that pictures of noise are off by
+BAD, HOPELESS = 0.035, 0.3  # parts that pictures of noise are off by
 OF_MAP = 0.07  # q of errors of the map, of camera pixels as wide as the projector's
 _TOLD = 0.5  # determinant of the least squares of a pixel, at least
 _MIDDLE = 0.6745  # of a deviation, below which half of normal values are
