@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.geometry import Resampling
+from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiometry import NoiseModel, ProjectorResponse, Radiance, Response
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
@@ -41,6 +42,8 @@ class Calibration:
         Of the projector's colours, where there are three channels.
     resampling : Resampling
         From the camera's pixels to the projector's.
+    sharpness : Sharpness, optional
+        Of the camera on these; None of one that is aligned.
     """
 
     exposures: tuple[float, ...]
@@ -52,6 +55,7 @@ class Calibration:
     projector: ProjectorResponse
     mixing: np.ndarray | None
     resampling: Resampling
+    sharpness: Sharpness | None = None
 
     @property
     def light(self) -> np.ndarray:
@@ -72,7 +76,10 @@ class Calibration:
             "resampling.indptr": R.weights.indptr,
             "resampling.coverage": R.coverage,
             "resampling.camera_grid": np.array(R.camera_grid),
+            "resampling.doubtful": np.zeros(R.grid, bool) if R.doubtful is None else R.doubtful,
         }
+        if self.sharpness is not None:
+            found["sharpness"] = np.array([*self.sharpness.leak, self.sharpness.width])
         if self.mixing is not None:
             found["mixing"] = self.mixing
         for name, picture in (("ambient", self.ambient), ("white", self.white)):
@@ -96,6 +103,8 @@ class Calibration:
         names = [name for name in found.extras if name.startswith(PREFIX)]
         if not names:
             raise FileError(f"{found.path}: holds no calibration; ltcl.acquire writes one")
+        if PREFIX + "resampling.doubtful" not in names:
+            raise FileError(f"{found.path}: its calibration is of an earlier ltcl; it must be acquired again")
         return cls.from_arrays({name.removeprefix(PREFIX): found.extra(name) for name in names})
 
     def write(self, store: BlockStore) -> None:
@@ -110,7 +119,8 @@ class Calibration:
         grid, camera = arrays["resampling.coverage"].shape, arrays["resampling.camera_grid"].tolist()
         parts = tuple(np.array(arrays[f"resampling.{name}"]) for name in ("data", "indices", "indptr"))
         weights = scipy.sparse.csr_array(parts, shape=(grid[0] * grid[1], camera[0] * camera[1]))
-        coverage = np.array(arrays["resampling.coverage"])
+        coverage, doubtful = (np.array(arrays[f"resampling.{name}"]) for name in ("coverage", "doubtful"))
+        *leak, width = np.asarray(arrays.get("sharpness", (0.0, 0.0, 0.0))).tolist()
         return cls(
             tuple(np.asarray(arrays["exposures"]).tolist()),
             Response(np.array(arrays["response"])),
@@ -120,7 +130,8 @@ class Calibration:
             _radiance(arrays, "white"),
             ProjectorResponse(np.array(arrays["projector"])),
             np.array(arrays["mixing"]) if "mixing" in arrays else None,
-            Resampling(weights, coverage, (grid[0], grid[1]), (camera[0], camera[1])),
+            Resampling(weights, coverage, (grid[0], grid[1]), (camera[0], camera[1]), doubtful),
+            Sharpness((leak[0], leak[1]), width) if "sharpness" in arrays else None,
         )
 
 

@@ -11,8 +11,16 @@ bounces (eq. 27), with F = diag(T) and D = diag(E) F^-1, X = S^-1 = F T^-1 is of
 one product with E, which need not be formed, and one solve a bounce. The unit of light is in neither: bounces
 do not depend on it.
 
-Known limit: the response of the camera is taken for true; `Report.beside_white` shows where it is not. Light
-that an adaptive scan leaves smooth is estimated by what a coarser one would lose of it.
+A camera that is coarse or out of focus shows part of a pixel's light at its neighbours, q_y and q_x along the
+axes (`Sharpness.errors`). A picture c is then off by about
+
+    q_y (c - mean of c above and below) + q_x (c - mean of c beside),
+
+which forecasts of pictures hold as well, and those of bounces do not.
+
+Known limits: that is of the picture as it comes out, and too small where it is blurred already. The response
+of the camera is taken for true; `Report.beside_white` shows where it is not. Light that an adaptive scan
+leaves smooth is estimated by what a coarser one would lose of it.
 """
 
 from __future__ import annotations
@@ -25,6 +33,7 @@ import numpy as np
 
 from ltcl import checks, layout
 from ltcl.acquisition.scanning import again
+from ltcl.acquisition.scanning.pictures import Seen
 from ltcl.errors import FileError
 from ltcl.solvers import solve_each
 from ltcl.store import BlockStore, load
@@ -127,9 +136,9 @@ def forecast_picture(
     seed: int = 0,
     device: Any = None,
 ) -> np.ndarray:
-    """Standard deviation of T p, by the noise of the scan of T; float32, as the pattern.
+    """How far T p is off by noise of the scan of T and by blur of its camera; float32, as the pattern.
 
-    With the pattern that `ltcl.compensate` found it is how far the picture on the wall is off by that noise.
+    With the pattern that `ltcl.compensate` found it is how far the picture on the wall is off by these.
 
     Parameters
     ----------
@@ -148,7 +157,35 @@ def forecast_picture(
     if T.mixing is not None:
         columns = list(np.einsum("cd,dnk->cnk", T.mixing, np.stack(columns)))
     drawn = again.errors(found, columns, draws, seed)
-    return shape.pack([_deviation(part.product) for part in drawn], T.grid).astype(np.float32)
+    both = zip(drawn, _blurs(found, T, columns), strict=True)
+    return shape.pack([np.hypot(_deviation(part.product), off) for part, off in both], T.grid).astype(
+        np.float32
+    )
+
+
+def _blurs(found: BlockStore, T: Transport, columns: list[np.ndarray]) -> list[np.ndarray]:
+    """What pictures (N, k) of each channel are off by the blur of the camera."""
+    sharp = Seen.of(found).sharpness
+    if sharp is None:
+        return [np.zeros(part.shape) for part in columns]
+    known = ~T.masked.reshape(*T.grid, 1)
+    pictures = [(A @ p).reshape(*T.grid, -1) for A, p in zip(T.matrices, columns, strict=True)]
+    y, x = sharp.errors
+    return [
+        (y * _beside(c, known, 0) + x * _beside(c, known, 1)).reshape(p.shape)
+        for c, p in zip(pictures, columns, strict=True)
+    ]
+
+
+def _beside(c: np.ndarray, known: np.ndarray, axis: int) -> np.ndarray:
+    """Pictures (h, w, k) less the mean of the two neighbours, of those that are known."""
+    pad = [(1, 1) if k == axis else (0, 0) for k in range(3)]
+    n, total, count = c.shape[axis], np.zeros(c.shape), np.zeros(known.shape)
+    value, some = np.pad(np.where(known, c, 0.0), pad), np.pad(known.astype(float), pad)
+    for part in (range(n), range(2, n + 2)):
+        total += value.take(part, axis)
+        count += some.take(part, axis)
+    return np.where(known & (count > 0), c - total / np.maximum(count, 1.0), 0.0)
 
 
 def _ended(store: str | os.PathLike[str] | BlockStore, device: Any) -> tuple[BlockStore, Transport]:

@@ -26,6 +26,7 @@ from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.geometry import Correspondence, Resampling
 from ltcl.acquisition.geometry import measure as measure_geometry
 from ltcl.acquisition.geometry.measure import exposure
+from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiometry import (
     NoiseModel,
     ProjectorResponse,
@@ -58,6 +59,7 @@ def measure(
     response: Response | None = None,
     exposures: Any = None,
     frames: int = 16,
+    side: int = 1,
     tell: Tell | None = None,
 ) -> Calibration:
     """Measure a set-up, with about 100 photographs, 200 in colour, beside those of the geometry.
@@ -72,6 +74,8 @@ def measure(
         Seconds of each photograph of the scan; left out, they are chosen.
     frames : int
         Photographs to average for black, at each of these.
+    side : int
+        Of the blocks of the scan: the camera must tell these apart.
     tell : function of a str, optional
         Told what is measured next.
 
@@ -80,7 +84,7 @@ def measure(
     InputError
         A geometry of other pixels; one exposure only and no response.
     AcquisitionError
-        The rig fails; nothing can be decoded; the projector does not shine.
+        The rig fails; nothing can be decoded; the projector does not shine; the camera is too coarse.
 
     Examples
     --------
@@ -99,7 +103,9 @@ def measure(
     tell("response")
     response = response or response_of(run, seconds)
     tell("geometry")
-    R = _resampling(run, geometry, seconds, response)
+    R, sharpness = _resampling(run, geometry, seconds, response)
+    if sharpness is not None:
+        sharpness.check(side)
     seconds, bad = _bright(run, response, seconds)
     deep = exposing.deepest(shots, seconds, response, bad)
     tell("noise")
@@ -117,9 +123,10 @@ def measure(
     times = exposing.offered(shots, [seconds / 2, seconds, chosen[-1]])
     white = run.merged(run.white, times, *sensor, _AGAIN) - ambient
     _refuse_long(chosen, white, noise)
+    R = R.ascertained(white.value, white.valid)
     tell("projector")
     light, M = _projector(run, seconds, *sensor)
-    return Calibration(chosen, response, noise, offset, ambient, white, light, M, R)
+    return Calibration(chosen, response, noise, offset, ambient, white, light, M, R, sharpness)
 
 
 def _refuse_saturated(run: Taking, seconds: float) -> None:
@@ -152,10 +159,12 @@ class _Linear:
         self._shots, self._response = shots, response
         self.exposures, self.levels, self.prepare = shots.exposures, shots.levels, shots.prepare
         self.sums = agreeing.Complements()
+        self.taken: list[tuple[np.ndarray, np.ndarray]] = []
 
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
         light = self._response.linear(self._shots.photograph(codes, seconds))
         self.sums.add(codes, light, self._shots.number)
+        self.taken.append((codes, light))
         return light
 
 
@@ -177,16 +186,18 @@ def _refuse_other(shots: Shots, geometry: str | Correspondence) -> None:
 
 def _resampling(
     run: Taking, geometry: str | Correspondence, seconds: float, response: Response
-) -> Resampling:
+) -> tuple[Resampling, Sharpness | None]:
     if not isinstance(geometry, str):
-        return Resampling.of(geometry)
+        R = Resampling.of(geometry)
+        return R, Sharpness.of(geometry, R)
     if geometry == "aligned":
-        return Resampling.aligned(run.shots.grid)
+        return Resampling.aligned(run.shots.grid), None
     linear = _Linear(run.shots, response)
     with exposing.telling("the geometry"):
         found = measure_geometry(linear, run.shots.grid, seconds=seconds)
     linear.sums.refuse()
-    return Resampling.of(found)
+    R = Resampling.of(found)
+    return R, Sharpness.of(found, R, linear.taken)
 
 
 def _bright(run: Taking, response: Response, seconds: float) -> tuple[float, np.ndarray]:

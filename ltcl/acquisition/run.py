@@ -90,6 +90,7 @@ def _begun(
         response=response,
         exposures=wanted.exposures,
         frames=wanted.frames,
+        side=wanted.block if wanted.strategy == "block" else 1,
         tell=lambda what: logger.info("calibration: %s, from photograph %d", what, shots.count + 1),
     )
     plans = _plans(shots, told, wanted)

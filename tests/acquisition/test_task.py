@@ -380,6 +380,7 @@ def test_a_pixel_that_every_exposure_saturates(tmp_path: Path) -> None:
 
 def test_what_a_report_does_not_know_is_null() -> None:
     part: dict[str, Any] = {"coverage": 1.0, "masked": 0.0, "saturated": 0.0, "entries": 9, "unknown": 0.0}
+    part |= {"doubtful": 0.0, "sharpness": float("nan"), "blur": float("nan")}
     told = Report(
         "pixel", "as asked for", (4, 8), 1, 36, 72, [0.1, 2.0], **part, noise_direct=0.01, noise_sum=0.02,
         beside_white=float("nan"), defect=float("nan"),

@@ -7,6 +7,7 @@ consistency, subpixel  neighbours that do not fit; fractions of a pixel from the
 correspondence         the map; `decode` makes it from photographs at hand
 measure                drives a projector and a camera through the patterns
 footprints, resample   what a camera pixel covers; photographs on the projector's grid, by area
+sharpness              how much of a pixel's light comes out at its neighbours
 unmixing, centring     projector pixels told apart by smaller camera pixels; averages about the middle
 """
 

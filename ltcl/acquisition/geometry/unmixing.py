@@ -64,25 +64,30 @@ def unmix(found: Correspondence, J: np.ndarray, known: np.ndarray) -> Unmixed | 
     """
     if not np.median(np.linalg.norm(J[known], 2, axis=(1, 2))) < FINE:
         return None
-    C = _shares(found, J, known)
+    C = shares(found, J, known)
     mixed = C.copy()
     mixed.data *= 1.0 - mixed.data
     blurred = mixed.sum(axis=1) + straddling(found, J, known).ravel()
     back = (C * (1.0 / (NOISE**2 + MAP**2 * blurred))[:, None]).T.tocsr()
-    h, w = found.grid
-    inner = np.add.outer((np.arange(h) + RIM) * (w + 2 * RIM), np.arange(w) + RIM).ravel()
+    (h, w), places = found.grid, inner(found.grid)
     width = w + 2 * RIM
-    Z, told = _solved(_bands((back @ C).tocoo(), (h + 2 * RIM) * width, width), inner, width)
-    area = np.asarray((C * np.abs(np.linalg.det(J)).reshape(-1, 1)).sum(axis=0))[inner]
+    Z, told = _solved(_bands((back @ C).tocoo(), (h + 2 * RIM) * width, width), places, width)
+    area = np.asarray((C * np.abs(np.linalg.det(J)).reshape(-1, 1)).sum(axis=0))[places]
     parts = [_sharpened(Z[n : n + AT_ONCE] @ back) for n in range(0, h * w, AT_ONCE)]
     rows = scipy.sparse.vstack(parts, format="csr")
-    inside = rows.multiply(C.T.tocsr()[inner] >= PURE).tocsr()
+    inside = rows.multiply(C.T.tocsr()[places] >= PURE).tocsr()
     rest = rows - inside
     return Unmixed(centred(inside, found, rest) + rest, area, told)
 
 
-def _shares(found: Correspondence, J: np.ndarray, known: np.ndarray) -> scipy.sparse.csr_array:
-    """C, on the grid with its rim."""
+def inner(grid: tuple[int, int]) -> np.ndarray:
+    """Numbers of the projector's pixels on the grid with its rim, (N,)."""
+    h, w = grid
+    return np.add.outer((np.arange(h) + RIM) * (w + 2 * RIM), np.arange(w) + RIM).ravel()
+
+
+def shares(found: Correspondence, J: np.ndarray, known: np.ndarray) -> scipy.sparse.csr_array:
+    """C, on the grid with its rim: `inner` are the columns of the projector's pixels."""
     h, w = found.grid
     width, pixels = w + 2 * RIM, np.flatnonzero(known)
     i, j = (part.ravel() for part in np.mgrid[:POINTS, :POINTS])
@@ -117,7 +122,7 @@ def _bands(G: scipy.sparse.coo_array, pixels: int, width: int) -> np.ndarray:
     return bands
 
 
-def _solved(bands: np.ndarray, inner: np.ndarray, width: int) -> tuple[scipy.sparse.csr_array, np.ndarray]:
+def _solved(bands: np.ndarray, pixels: np.ndarray, width: int) -> tuple[scipy.sparse.csr_array, np.ndarray]:
     """Rows of (G + I)^-1 within the window of each pixel, and 1 less their diagonal: (G + I)^-1 G."""
     j, i = (part.ravel() for part in np.mgrid[:SIDE, :SIDE] - REACH)
     dj, di = (np.subtract.outer(part, part).T + REACH for part in (j, i))  # from a to b
@@ -125,13 +130,13 @@ def _solved(bands: np.ndarray, inner: np.ndarray, width: int) -> tuple[scipy.spa
     dj, di = np.where(near, dj, 0), np.where(near, di, 0)
     centre, one = SIDE * SIDE // 2, np.zeros((SIDE * SIDE, 1))
     one[centre] = 1.0
-    rows, places = [], inner[:, None] + j * width + i
-    for start in range(0, len(inner), AT_ONCE):
+    rows, places = [], pixels[:, None] + j * width + i
+    for start in range(0, len(pixels), AT_ONCE):
         G = bands[places[start : start + AT_ONCE][..., None], dj, di] * near
         rows.append(np.linalg.solve(G + np.eye(SIDE * SIDE), one)[..., 0])
     Z = np.concatenate(rows)
     indptr = np.arange(0, Z.size + 1, SIDE * SIDE)
-    matrix = scipy.sparse.csr_array((Z.ravel(), places.ravel(), indptr), shape=(len(inner), len(bands)))
+    matrix = scipy.sparse.csr_array((Z.ravel(), places.ravel(), indptr), shape=(len(pixels), len(bands)))
     return matrix, 1.0 - Z[:, centre]
 
 

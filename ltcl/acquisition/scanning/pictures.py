@@ -47,6 +47,8 @@ class Seen:
         Under all of the projector: row sums of T.
     seen : (M,) bool
         Pixels that the camera sees.
+    sharpness : Sharpness or None
+        Of the camera on these.
     """
 
     def __init__(self, calibration: Calibration, side: int = 1) -> None:
@@ -55,6 +57,8 @@ class Seen:
         self.grid = self.blocks.grid
         self._scale = calibration.light.astype(np.float32)[:, None]
         self.seen = self.blocks.sum(calibration.resampling.seen.astype(np.float32)).ravel() > 0
+        sharp = calibration.sharpness
+        self.sharpness = None if sharp is None else sharp.of_blocks(side)
         self._dark = self._on_grid(calibration.ambient)
         self.ambient = np.where(self._dark.variance < UNKNOWN, self._dark.variance, 0.0) / self._scale**2
         white = self._on_grid(calibration.white)

@@ -37,6 +37,14 @@ class Report:
         Seconds.
     coverage : float
         Part of the projector's pixels that the camera sees.
+    doubtful : float
+        Part of them that few and dark camera pixels see, of which errors of photographs and map would be most
+        (`acquisition.geometry.resample`): not counted as seen, and masked.
+    sharpness : float
+        Part of what comes out at a pixel that is its own light, and not that of its neighbours
+        (`acquisition.geometry.sharpness`); NaN of a camera that is aligned, where nothing tells it.
+    blur : float
+        How far a picture of noise is off by that, relative to it; NaN where it is not told.
     masked : float
         Part of the pixels that have no first bounce in some channel.
     saturated : float
@@ -75,6 +83,9 @@ class Report:
     photographs: int
     exposures: list[float]
     coverage: float
+    doubtful: float
+    sharpness: float
+    blur: float
     masked: float
     saturated: float
     entries: int
@@ -102,6 +113,7 @@ class Report:
             raise FileError(f"{found.path}: {state}; a report is of a scan that has ended")
         exposures = np.asarray(found.extra("calibration.exposures")).tolist()
         part = _of_cells(found) if found.layout.kind == "compressed" else _of_blocks(found)
+        sharp = Seen.of(found).sharpness
         return cls(
             strategy=told["strategy"],
             why=told["why"],
@@ -111,6 +123,9 @@ class Report:
             photographs=int(told["patterns"]) * len(exposures),
             exposures=exposures,
             coverage=float(np.mean(found.extra("calibration.resampling.coverage") > 0)),
+            doubtful=float(np.mean(found.extra("calibration.resampling.doubtful"))),
+            sharpness=sharp.own if sharp else float("nan"),
+            blur=sharp.blur if sharp else float("nan"),
             saturated=1.0 - float(np.mean(found.extra("calibration.white.valid"))),
             levels=told.get("levels", []),
             **part,
@@ -129,7 +144,11 @@ class Report:
             f"{self.strategy} ({self.why}), {h} x {w} pixels, {self.channels} channel(s)",
             f"{self.photographs} photographs: {self.patterns} patterns at "
             + ", ".join(f"{t:.3g} s" for t in self.exposures),
-            f"seen {self.coverage:.1%}, masked {self.masked:.2%}, saturated {self.saturated:.2%}",
+            f"seen {self.coverage:.1%}, masked {self.masked:.2%}, saturated {self.saturated:.2%}"
+            + (f"; {self.doubtful:.2%} too dark beside bright pixels to be told" if self.doubtful else ""),
+            "sharpness not told"
+            if np.isnan(self.sharpness)
+            else f"{self.sharpness:.0%} of a pixel is its own light; fine patterns: off by {self.blur:.1%}",
             f"{self.entries} entries kept, {self.unknown:.2%} of them not told by any photograph",
             f"noise of the first bounce {self.noise_direct:.2%}, of what white shows {self.noise_sum:.2%}"
             + ("" if np.isnan(self.beside_white) else f"; columns were {self.beside_white:.2%} beside it"),
