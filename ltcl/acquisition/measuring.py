@@ -211,11 +211,13 @@ def _black(
     run: Taking, response: Response, noise: NoiseModel, exposures: tuple[float, ...], frames: int
 ) -> tuple[np.ndarray, Radiance]:
     times = [t for t in sorted(set(exposures)) for _ in range(frames)]
-    images = run.agreeing([(run.black, t) for t in times], response, noise)
+    images = run.take([(run.black, t) for t in times])
     if times[0] < times[-1]:
         with exposing.telling("black"):
             found = black.measure(images, times, response, noise, levels=run.shots.levels)
+        run.refuse_unlike(images, times, response, noise, found.offset)
         return found.offset, found.ambient
+    run.refuse_unlike(images, times, response, noise)
     offset = np.zeros(run.shots.channels)  # one exposure does not tell it from ambient light, nor need it
     return offset, merge(images, times, response, noise, levels=run.shots.levels, black=offset)
 

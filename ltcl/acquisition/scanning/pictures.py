@@ -130,7 +130,8 @@ class Pictures(Seen):
         levels = told.noise.levels or None
         last = self.shots.count
         first = last + 1 - len(images)
-        agreeing.refuse_unlike(images, told.exposures, range(first, last + 1), told.response, told.noise)
+        sensor = (told.response, told.noise, told.offset)
+        agreeing.refuse_unlike(images, told.exposures, range(first, last + 1), *sensor)
         with telling(f"photographs {first} to {last}"):
             merged = merge(
                 images, told.exposures, told.response, told.noise, levels=levels, black=told.offset
