@@ -168,7 +168,7 @@ def _piled(codes: np.ndarray, least: float, following: float) -> bool:
     step = following - least
     noisy = np.ptp(codes, axis=0) > 2.5 * step  # else all may be within a code
     count = np.count_nonzero(codes[:, noisy] == least)
-    return count > max(_FEW, np.count_nonzero(codes[:, noisy] <= least + 1.5 * step) - count)
+    return bool(count > max(_FEW, np.count_nonzero(codes[:, noisy] <= least + 1.5 * step) - count))
 
 
 @dataclass(frozen=True)
