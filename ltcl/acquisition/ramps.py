@@ -36,7 +36,7 @@ def response_of(run: Taking, seconds: float) -> Response:
     span = bracket(seconds / _SPAN, seconds * _SPAN, _BRACKET)
     times, grid = exposing.offered(run.shots, span), run.shots.grid
     if len(times) == 1:
-        raise InputError("rig.exposures has one exposure, which tells no response; give response=")
+        raise InputError(exposing.ONE)
     ramps = [ramp(grid, k * max(grid) // _RAMPS) for k in range(_RAMPS)]
     lit = [*ramps[: 1 if grid[0] * grid[1] >= _MANY else _RAMPS], run.black]
     first, taken = run.shots.count + 1, run.take([(codes, t) for t in times for codes in lit])

@@ -26,6 +26,7 @@ from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.columns import Code
 from ltcl.acquisition.scanning.log import Log
 from ltcl.acquisition.scanning.pictures import Picture, Pictures
+from ltcl.acquisition.settings import Settings
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.store import BlockStore, zarr_folder
 from ltcl.store.blocks import creating
@@ -35,20 +36,6 @@ logger = logging.getLogger(__name__)
 _NOISY, _WRONG = 0.05, 0.3  # parts of white that columns may mostly be beside it
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What decides which photographs are taken, and what becomes of them."""
-
-    strategy: str
-    geometry: str
-    exposures: tuple[float, ...] | None
-    block: int
-    order: int
-    threshold: float
-    sigmas: float
-    frames: int
 
 
 @dataclass(frozen=True)
