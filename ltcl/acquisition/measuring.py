@@ -48,6 +48,7 @@ _QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so th
 _BURST = 6  # photographs that tell the noise
 _CODES = 17  # of the projector's response
 _AGAIN = 16  # photographs of white
+_CLEAR = 3.0  # standard deviations without light that white must be
 _OWN = 0.5  # of what white shows at a pixel, that its own light is at least, in most scenes
 
 
@@ -116,7 +117,7 @@ def measure(
     # The longest is for what is dim beside the brightest, and told by the scan at that exposure.
     times = exposing.offered(shots, [seconds / 2, seconds, chosen[-1]])
     white = run.merged(run.white, times, *sensor, _AGAIN) - ambient
-    _refuse_long(chosen, white, noise)
+    _refuse_exposures(chosen, white, noise)
     tell("projector")
     light, M = _projector(run, seconds, *sensor)
     return Calibration(chosen, response, noise, offset, ambient, white, light, M, R)
@@ -134,14 +135,23 @@ def _refuse_saturated(run: Taking, seconds: float) -> None:
         )
 
 
-def _refuse_long(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
-    """Refuse exposures of which the shortest saturates where a pixel is lit."""
+def _refuse_exposures(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
+    """Refuse exposures of which the shortest saturates where a pixel is lit, or the longest tells nothing."""
     lit = white.value[white.valid & (white.value > 0)]
-    most = noise.saturation / (_OWN * float(np.median(lit))) if lit.size else np.inf
+    level = float(np.median(lit)) if lit.size else 0.0
+    if not level:
+        return
+    most = noise.saturation / (_OWN * level)
     if exposures[0] > most:
         raise InputError(
             f"exposures is {exposures}, but half of what white shows saturates at {exposures[0]:g} s; the "
             f"shortest must be at most {0.7 * most:.2g} s"
+        )
+    least = _CLEAR * float(np.sqrt(noise.variance(0.0))) / level
+    if exposures[-1] < least:
+        raise InputError(
+            f"exposures is {exposures}, but half of what white shows is lost in noise at {exposures[-1]:g} "
+            f"s; the longest must be some {4 * least:.2g} s"
         )
 
 

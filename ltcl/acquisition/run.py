@@ -27,7 +27,7 @@ from ltcl.acquisition.scanning.columns import Code
 from ltcl.acquisition.scanning.log import Log
 from ltcl.acquisition.scanning.pictures import Picture, Pictures
 from ltcl.acquisition.settings import Settings
-from ltcl.errors import AcquisitionError, FileError, InputError
+from ltcl.errors import FileError, InputError, ScanRefused
 from ltcl.store import BlockStore, zarr_folder
 from ltcl.store.blocks import creating
 from ltcl.store.compressed import Parts
@@ -200,9 +200,10 @@ def _compare(path: Path, off: float) -> None:
         return
     told = f"{path}: columns of T add up to light that is {off:.0%} beside what white showed"
     if off > _WRONG:
-        raise AcquisitionError(
-            f"{told}; photographs must be in the order of their patterns, and the light, the camera and the "
-            "scene must stay as they were. Put that right, and acquire into another store"
+        raise ScanRefused(
+            f"{told}; photographs must be in the order of their patterns and exposed for long enough to "
+            "stand out of noise, and the light, the camera and the scene must stay as they were. Put that "
+            "right, and acquire into another store"
         )
     logger.warning("%s: noise, photographs in another order, or a set-up that changed", told)
 
