@@ -48,6 +48,8 @@ _QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so th
 _BURST = 6  # photographs that tell the noise
 _CODES = 17  # of the projector's response
 _AGAIN = 16  # photographs of white
+_FEWER = tuple(1 << k for k in range(9, 16))  # codes of cameras whose files have 16 bits
+_ENDING = 0.01  # of the pixels
 _CLEAR = 3.0  # standard deviations without light that white must be
 _OWN = 0.5  # of what white shows at a pixel, that its own light is at least, in most scenes
 
@@ -94,7 +96,7 @@ def measure(
     checks.count("frames", frames)
     run, tell = Taking(shots), tell or (lambda _: None)
     tell("exposure")
-    seconds = exposure(shots, shots.grid)
+    seconds = exposure(_Whole(shots), shots.grid)
     _refuse_other(shots, geometry)
     _refuse_saturated(run, seconds)
     tell("response")
@@ -153,6 +155,24 @@ def _refuse_exposures(exposures: tuple[float, ...], white: Radiance, noise: Nois
             f"exposures is {exposures}, but half of what white shows is lost in noise at {exposures[-1]:g} "
             f"s; the longest must be some {4 * least:.2g} s"
         )
+
+
+class _Whole:
+    """A rig whose photographs of white may not end at fewer bits than they have."""
+
+    def __init__(self, shots: Shots) -> None:
+        self._shots, self.exposures = shots, shots.exposures
+
+    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
+        image, levels = self._shots.photograph(codes, seconds), self._shots.levels or 0
+        last = round(float(image.max()) * (levels - 1))
+        if last + 1 < levels and last + 1 in _FEWER and np.mean(image == image.max()) > _ENDING:
+            bits = last.bit_length()
+            raise AcquisitionError(
+                f"photograph {self._shots.count}, of white, ends at code {last} of {levels - 1}: the camera "
+                f"has {bits} bits; bits of the rig, or camera_bits of a folder, must be {bits}"
+            )
+        return image
 
 
 class _Linear:

@@ -103,3 +103,17 @@ def test_a_map_of_other_pixels_is_refused() -> None:
     up = VirtualRig(np.eye(4), (2, 2), camera_grid=(4, 2), camera_map=np.kron(np.eye(4), np.ones((2, 1))))
     with pytest.raises(InputError, match="geometry is 'aligned', but photographs are"):
         measure(Shots(up), geometry="aligned")
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_fewer_bits_than_a_file_has_are_named(bits: int) -> None:
+    class Sixteen:
+        projector_grid, channels = (4, 8), 1
+        made = rig(4, bits=bits)
+
+        def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
+            return self.made.photograph(codes, seconds)
+
+    text = f"of white, ends at code {(1 << bits) - 1} of 65535: the camera has {bits} bits"
+    with pytest.raises(AcquisitionError, match=text):
+        measure(Shots(Sixteen()), geometry="aligned")
