@@ -48,7 +48,7 @@ _QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so th
 _BURST = 6  # photographs that tell the noise
 _CODES = 17  # of the projector's response
 _AGAIN = 16  # photographs of white
-_FEWER = tuple(1 << k for k in range(9, 16))  # codes of cameras whose files have 16 bits
+_FEWER = tuple(1 << k for k in range(9, 15))  # codes of cameras whose files have 16 bits
 _ENDING = 0.01  # of the pixels
 _CLEAR = 3.0  # standard deviations without light that white must be
 _OWN = 0.5  # of what white shows at a pixel, that its own light is at least, in most scenes
@@ -158,19 +158,22 @@ def _refuse_exposures(exposures: tuple[float, ...], white: Radiance, noise: Nois
 
 
 class _Whole:
-    """A rig whose photographs of white may not end at fewer bits than they have."""
+    """A rig whose photographs of white may not end at fewer bits than they have, at two exposures."""
 
     def __init__(self, shots: Shots) -> None:
         self._shots, self.exposures = shots, shots.exposures
+        self._ends: dict[int, float] = {}
 
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
         image, levels = self._shots.photograph(codes, seconds), self._shots.levels or 0
         last = round(float(image.max()) * (levels - 1))
-        if last + 1 < levels and last + 1 in _FEWER and np.mean(image == image.max()) > _ENDING:
+        ends = last + 1 < levels and last + 1 in _FEWER and np.mean(image == image.max()) > _ENDING
+        if ends and self._ends.setdefault(last, seconds) < seconds:
             bits = last.bit_length()
             raise AcquisitionError(
-                f"photograph {self._shots.count}, of white, ends at code {last} of {levels - 1}: the camera "
-                f"has {bits} bits; bits of the rig, or camera_bits of a folder, must be {bits}"
+                f"photograph {self._shots.count}, of white, ends at code {last} of {levels - 1}, as one of a "
+                f"shorter exposure does: the camera has {bits} bits; bits of the rig, or camera_bits of a "
+                f"folder, must be {bits}"
             )
         return image
 
