@@ -41,6 +41,8 @@ def run(folder: options.Acquisition, device: options.Device = None, json: option
     project = Project.open(folder)
     if project.state == "begun":
         raise InputError(f"{project.store}: is begun; {project.next} goes on")
+    if project.state == "new" and kept.busy(project.store):
+        raise FileError(f"{kept.place(project.store)}: another process is at work there; one must end first")
     if project.state == "new" and project.kept:
         raise InputError(
             f"{kept.place(project.store)}: holds {project.kept} photographs of a calibration that has not "

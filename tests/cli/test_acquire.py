@@ -18,6 +18,7 @@ from ltcl import images
 from ltcl.acquisition import FolderRig, VirtualRig
 from ltcl.cli import console
 from ltcl.store import BlockStore
+from ltcl.store.blocks.shelf import Shelf
 
 from .conftest import Program
 
@@ -245,6 +246,18 @@ def test_settings_are_refused_by_file_and_table(program: Program, scan: Path, ac
             program("acquire", command, scan).refused(f"{path}: {part}")
     assert not (scan / "transport.zarr").exists()
     program("acquire", "plan", scan / "nowhere").refused("acquisition.toml: no such file; 'ltcl simulate'")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="folders are not locked there")
+def test_a_calibration_that_another_process_is_at_is_not_said_to_have_ended(
+    program: Program, scan: Path
+) -> None:
+    place = scan / "transport.zarr.calibration"
+    with Shelf(place, {"rig": {}}) as shelf:
+        shelf.put("shot", np.zeros(2))
+        for command in ("run", "resume"):
+            program("acquire", command, scan).refused(f"{place}: another process is at work there")
+    program("acquire", "run", scan).refused("holds 1 photographs of a calibration that has not ended")
 
 
 def test_a_file_with_a_byte_order_mark_is_read(program: Program, scan: Path) -> None:
