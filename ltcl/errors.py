@@ -46,6 +46,10 @@ class AcquisitionError(LtclError, RuntimeError):
     """A photograph is missing, stale or unusable, or the rig failed; the message says which and why."""
 
 
+class ScanRefused(AcquisitionError):
+    """Photographs that are in a store already cannot be used: what goes on with it would end as it did."""
+
+
 class PhotographMissing(AcquisitionError):
     """A photograph has yet to be taken by a person; `number` is its place in the shooting list."""
 

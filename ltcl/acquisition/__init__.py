@@ -10,6 +10,7 @@
                 for how many seconds, from photographs that do not contradict each other
     scanning/   which pixels are lit when, and T from the pictures; plan before, report after
     task, run   acquire: all of it, into a store, stopped and resumed; kept: photographs of a calibration
+    settings    what acquire is asked for, checked
     forecasting how far pictures and bounces are off by the noise of the scan
     finishing   finalize: the transport of a store whose photographs are all there
     setup       Setup: codes for a pattern, and the ambient light, on the pixels of a transport

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -41,6 +41,7 @@ def refuse_unlike(
     numbers: Sequence[int],
     response: Response,
     noise: NoiseModel = ROUGH,
+    offset: Any = 0.0,
 ) -> None:
     """Refuse photographs of one pattern that contradict each other.
 
@@ -49,6 +50,8 @@ def refuse_unlike(
     images : (H, W) or (H, W, 3) each
         In [0, 1] of full scale.
     seconds, numbers : of each
+    offset : float or (channels,)
+        Linear value without light.
 
     Raises
     ------
@@ -64,7 +67,7 @@ def refuse_unlike(
     ltcl.errors.AcquisitionError: photographs 6 (1 s) and 7 (2 s) are of one pattern, but show ...
     """
     order = sorted(range(len(images)), key=lambda k: seconds[k])
-    seen = [_seen(images[k], response, noise) for k in order]
+    seen = [_seen(images[k], response, noise, offset) for k in order]
     for (i, a), (j, b) in pairwise(zip(order, seen, strict=True)):
         if _differ(a, b, seconds[j] / seconds[i]):
             one, other = (f"{numbers[k]} ({seconds[k]:.3g} s)" for k in sorted((i, j)))
@@ -111,8 +114,8 @@ class Complements:
                 )
 
 
-def _seen(image: np.ndarray, response: Response, noise: NoiseModel) -> _Seen:
-    light, full = _cells(response.linear(image)), _cells(np.asarray(image >= _FULL, np.float32)) > 0
+def _seen(image: np.ndarray, response: Response, noise: NoiseModel, offset: Any) -> _Seen:
+    light, full = _cells(response.linear(image)) - offset, _cells(np.asarray(image >= _FULL, np.float32)) > 0
     each = max(1.0, image.shape[0] * image.shape[1] / (light.shape[0] * light.shape[1]))
     return _Seen(light, full, np.sqrt(noise.variance(light) / each))
 

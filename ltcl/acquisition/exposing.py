@@ -23,6 +23,8 @@ DEEPEST = 64.0  # times the exposure of white: further in one photograph costs m
 _AMBIENT = 0.3  # of full scale that light without the projector may take
 WHITE = 0.7  # of the range, for the brightest pixels under white
 _SNR, _MOST = 100.0, 3  # of these, and photographs at most to reach it
+ONE = "rig.exposures has one exposure, which tells no response; give response="
+_ABOUT = 0.05  # relative difference of seconds that are written down shortly: 0.017 for 1/60
 _FINE = 1 << 10  # levels from which two exposures span the range; fewer take one in between
 
 
@@ -52,6 +54,22 @@ def offered(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
         return tuple(sorted({float(min(max(t, SHORTEST), LONGEST)) for t in seconds}))
     have = shots.exposures
     return tuple(sorted({min(have, key=lambda given: abs(math.log(given / t))) for t in seconds}))
+
+
+def refuse_absent(shots: Shots, seconds: Iterable[float]) -> None:
+    """Refuse exposures that the camera does not have.
+
+    >>> from ltcl.acquisition import VirtualRig
+    >>> refuse_absent(Shots(VirtualRig(np.eye(1), (1, 1))), [0.5, 40.0])
+    Traceback (most recent call last):
+    ltcl.errors.InputError: exposures has 40 s; the rig takes 0.0001 to 30 s
+    """
+    have = shots.exposures
+    for t in seconds:
+        (nearest,) = offered(shots, [t])
+        if abs(nearest - t) > (0.0 if have is None else _ABOUT * t):
+            takes = f"{SHORTEST:g} to {LONGEST:g} s" if have is None else f"{nearest:g} s at the nearest"
+            raise InputError(f"exposures has {t:g} s; the rig takes {takes}")
 
 
 def deepest(shots: Shots, white: float, response: Response, bad: np.ndarray) -> float:

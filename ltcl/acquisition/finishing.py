@@ -12,7 +12,8 @@ import numpy as np
 from ltcl.acquisition import run
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.run import Progress, Settings
+from ltcl.acquisition.run import Progress
+from ltcl.acquisition.settings import Settings
 from ltcl.errors import AcquisitionError, FileError
 from ltcl.files import as_path
 from ltcl.store import BlockStore

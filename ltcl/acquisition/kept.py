@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
+import os
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -40,6 +41,17 @@ def count(store: Path) -> int:
     """How many there are."""
     folder = place(store)
     return len(aside.versions(folder, "extra")) if (folder / "extra").is_dir() else 0
+
+
+def busy(store: Path) -> bool:
+    """Whether another process is at work on them."""
+    folder = place(store) / "extra"
+    if not folder.is_dir():
+        return False
+    lock = aside.try_lock(folder)
+    if lock is not None and lock >= 0:
+        os.close(lock)
+    return lock is None
 
 
 def forget(store: Path) -> None:

@@ -49,6 +49,9 @@ _QUIETEST = 1e-6  # of full scale: the read noise of a camera without any, so th
 _BURST = 6  # photographs that tell the noise
 _CODES = 17  # of the projector's response
 _AGAIN = 16  # photographs of white
+_FEWER = tuple(1 << k for k in range(9, 15))  # codes of cameras whose files have 16 bits
+_ENDING = 0.01  # of the pixels
+_CLEAR = 3.0  # standard deviations without light that white must be
 _OWN = 0.5  # of what white shows at a pixel, that its own light is at least, in most scenes
 
 
@@ -97,7 +100,7 @@ def measure(
     checks.count("frames", frames)
     run, tell = Taking(shots), tell or (lambda _: None)
     tell("exposure")
-    seconds = exposure(shots, shots.grid)
+    seconds = exposure(_Whole(shots), shots.grid)
     _refuse_other(shots, geometry)
     _refuse_saturated(run, seconds)
     tell("response")
@@ -122,7 +125,7 @@ def measure(
     # The longest is for what is dim beside the brightest, and told by the scan at that exposure.
     times = exposing.offered(shots, [seconds / 2, seconds, chosen[-1]])
     white = run.merged(run.white, times, *sensor, _AGAIN) - ambient
-    _refuse_long(chosen, white, noise)
+    _refuse_exposures(chosen, white, noise)
     R = R.ascertained(white.value, white.valid)
     tell("projector")
     light, M = _projector(run, seconds, *sensor)
@@ -141,15 +144,45 @@ def _refuse_saturated(run: Taking, seconds: float) -> None:
         )
 
 
-def _refuse_long(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
-    """Refuse exposures of which the shortest saturates where a pixel is lit."""
+def _refuse_exposures(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
+    """Refuse exposures of which the shortest saturates where a pixel is lit, or the longest tells nothing."""
     lit = white.value[white.valid & (white.value > 0)]
-    most = noise.saturation / (_OWN * float(np.median(lit))) if lit.size else np.inf
+    level = float(np.median(lit)) if lit.size else 0.0
+    if not level:
+        return
+    most = noise.saturation / (_OWN * level)
     if exposures[0] > most:
         raise InputError(
             f"exposures is {exposures}, but half of what white shows saturates at {exposures[0]:g} s; the "
             f"shortest must be at most {0.7 * most:.2g} s"
         )
+    least = _CLEAR * float(np.sqrt(noise.variance(0.0))) / level
+    if exposures[-1] < least:
+        raise InputError(
+            f"exposures is {exposures}, but half of what white shows is lost in noise at {exposures[-1]:g} "
+            f"s; the longest must be some {4 * least:.2g} s"
+        )
+
+
+class _Whole:
+    """A rig whose photographs of white may not end at fewer bits than they have, at two exposures."""
+
+    def __init__(self, shots: Shots) -> None:
+        self._shots, self.exposures = shots, shots.exposures
+        self._ends: dict[int, float] = {}
+
+    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
+        image, levels = self._shots.photograph(codes, seconds), self._shots.levels or 0
+        last = round(float(image.max()) * (levels - 1))
+        ends = last + 1 < levels and last + 1 in _FEWER and np.mean(image == image.max()) > _ENDING
+        if ends and self._ends.setdefault(last, seconds) < seconds:
+            bits = last.bit_length()
+            raise AcquisitionError(
+                f"photograph {self._shots.number}, of white, ends at code {last} of {levels - 1}, as one of a "
+                f"shorter exposure does: the camera has {bits} bits; bits of the rig, or camera_bits of a "
+                f"folder, must be {bits}"
+            )
+        return image
 
 
 class _Linear:
@@ -222,11 +255,13 @@ def _black(
     run: Taking, response: Response, noise: NoiseModel, exposures: tuple[float, ...], frames: int
 ) -> tuple[np.ndarray, Radiance]:
     times = [t for t in sorted(set(exposures)) for _ in range(frames)]
-    images = run.agreeing([(run.black, t) for t in times], response, noise)
+    images = run.take([(run.black, t) for t in times])
     if times[0] < times[-1]:
         with exposing.telling("black"):
             found = black.measure(images, times, response, noise, levels=run.shots.levels)
+        run.refuse_unlike(images, times, response, noise, found.offset)
         return found.offset, found.ambient
+    run.refuse_unlike(images, times, response, noise)
     offset = np.zeros(run.shots.channels)  # one exposure does not tell it from ambient light, nor need it
     return offset, merge(images, times, response, noise, levels=run.shots.levels, black=offset)
 

@@ -16,6 +16,7 @@ and photographs there, too. Nothing is opened before it is asked for, least of a
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import tomllib
 from collections.abc import Iterator
@@ -33,6 +34,7 @@ from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.rigs import curves
 from ltcl.acquisition.scanning.plan import Light
+from ltcl.acquisition.settings import Settings
 from ltcl.acquisition.task import acquire
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
@@ -196,6 +198,19 @@ class Project:
         except (InputError, InputTypeError) as error:
             raise type(error)(f"{self.path}: [{table}] {error}") from None
 
+    def check(self) -> Settings:
+        """What `acquire` would refuse before the first photograph; no camera is opened.
+
+        Raises
+        ------
+        InputError, InputTypeError, FileError, AcquisitionError
+            As `rig` and `ltcl.acquire`.
+        """
+        given = {name: p.default for name, p in inspect.signature(acquire).parameters.items()}
+        given = {name: value for name, value in given.items() if name not in _OURS} | self.settings
+        with self.described() as rig, self.naming("acquire"):
+            return Settings.of(Shots(rig), **given)
+
     def outlook(self) -> Outlook:
         """Pixels, channels and guesses of the rest, for a plan before the first photograph.
 
@@ -219,8 +234,7 @@ class Project:
     ) -> tuple[float, ...]:
         given = self.settings.get("exposures")
         if given is not None:
-            listed = checks.finite("exposures", checks.real("exposures", given)).ravel()
-            return tuple(sorted(checks.number("exposures", float(t), above=0.0) for t in listed))
+            return tuple(sorted(float(t) for t in given))
         unseen: Any = _Unseen(grid, channels, self.tables.rig.get("exposures"))
         white, deep = exposing.guess(light.direct + light.indirect, light.ambient)
         return exposing.for_scan(Shots(unseen), white, deep, noise)
@@ -247,7 +261,7 @@ def _parsed(path: Path) -> dict[str, Any]:
     if input_file(path).stat().st_size > _LARGEST:
         raise FileError(f"{path}: has {checks.size(path.stat().st_size)}; it must be a short text")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FileError(f"{path}: is no TOML: {error}") from None
 

@@ -20,7 +20,7 @@ TOP = 0.995  # of the codes: the unit of a curve is what it reaches at the last 
 _BRACKET, _SPAN = 8, 16.0  # exposures to find the response from, and how far from that of white
 _LONGER, _STEP = 4, 2.0  # more of them at most, where a colour stays dark; times the one before
 _DARKER = 0.99  # share of the pixels: the others must reach the last code in each colour
-_RAMPS, _MANY = 4, 4096  # scenes of them where there are fewer pixels
+_RAMPS, _MANY, _FEW = 4, 4096, 64  # scenes of them where there are fewer pixels; for so many pixels at least
 
 
 def response_of(run: Taking, seconds: float) -> Response:
@@ -36,9 +36,8 @@ def response_of(run: Taking, seconds: float) -> Response:
     span = bracket(seconds / _SPAN, seconds * _SPAN, _BRACKET)
     times, grid = exposing.offered(run.shots, span), run.shots.grid
     if len(times) == 1:
-        raise InputError("rig.exposures has one exposure, which tells no response; give response=")
-    ramps = [ramp(grid, k * max(grid) // _RAMPS) for k in range(_RAMPS)]
-    lit = [*ramps[: 1 if grid[0] * grid[1] >= _MANY else _RAMPS], run.black]
+        raise InputError(exposing.ONE)
+    lit = [*_ramps(grid), run.black]
     taken = run.take([(codes, t) for t in times for codes in lit])
     bad = stuck(taken[len(lit) - 1])  # under black, for the shortest time
     longest = exposing.offered(run.shots, [times[-1] * _STEP**k for k in range(1, _LONGER + 1)])
@@ -61,6 +60,17 @@ def ramp(grid: tuple[int, int], shift: int = 0) -> np.ndarray:
     h, w = grid
     long = np.roll(np.linspace(0.0, 1.0, max(h, w), dtype=np.float32), shift)
     return np.ascontiguousarray(np.broadcast_to(long if w >= h else long[:, None], grid))
+
+
+def _ramps(grid: tuple[int, int]) -> list[np.ndarray]:
+    """As many as it takes for some hundred pixels; in further rounds with other brightnesses."""
+    pixels = grid[0] * grid[1]
+    count = 1 if pixels >= _MANY else max(_RAMPS, -(-_FEW // pixels))
+    rounds = -(-count // _RAMPS)
+    return [
+        ramp(grid, k % _RAMPS * max(grid) // _RAMPS) * np.float32(1.0 - k // _RAMPS / (2.0 * rounds))
+        for k in range(count)
+    ]
 
 
 def _beside(images: list[np.ndarray], bad: np.ndarray) -> np.ndarray:

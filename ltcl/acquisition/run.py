@@ -26,7 +26,8 @@ from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.columns import Code
 from ltcl.acquisition.scanning.log import Log
 from ltcl.acquisition.scanning.pictures import Picture, Pictures
-from ltcl.errors import AcquisitionError, FileError, InputError
+from ltcl.acquisition.settings import Settings
+from ltcl.errors import FileError, InputError, ScanRefused
 from ltcl.store import BlockStore, zarr_folder
 from ltcl.store.blocks import creating
 from ltcl.store.compressed import Parts
@@ -35,20 +36,6 @@ logger = logging.getLogger(__name__)
 _NOISY, _WRONG = 0.05, 0.3  # parts of white that columns may mostly be beside it
 
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What decides which photographs are taken, and what becomes of them."""
-
-    strategy: str
-    geometry: str
-    exposures: tuple[float, ...] | None
-    block: int
-    order: int
-    threshold: float
-    sigmas: float
-    frames: int
 
 
 @dataclass(frozen=True)
@@ -214,9 +201,10 @@ def _compare(path: Path, off: float) -> None:
         return
     told = f"{path}: columns of T add up to light that is {off:.0%} beside what white showed"
     if off > _WRONG:
-        raise AcquisitionError(
-            f"{told}; photographs must be in the order of their patterns, and the light, the camera and the "
-            "scene must stay as they were. Put that right, and acquire into another store"
+        raise ScanRefused(
+            f"{told}; photographs must be in the order of their patterns and exposed for long enough to "
+            "stand out of noise, and the light, the camera and the scene must stay as they were. Put that "
+            "right, and acquire into another store"
         )
     logger.warning("%s: noise, photographs in another order, or a set-up that changed", told)
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ltcl.acquisition import agreeing, exposing
@@ -35,12 +37,17 @@ class Taking:
         wanted: list[tuple[np.ndarray, float]],
         response: Response,
         noise: NoiseModel = agreeing.ROUGH,
+        offset: Any = 0.0,
     ) -> list[np.ndarray]:
         """The same, all of one pattern; refused where they contradict each other."""
-        images, last = self.take(wanted), self.shots.number
-        numbers = range(last + 1 - len(images), last + 1)
-        agreeing.refuse_unlike(images, [t for _, t in wanted], numbers, response, noise)
+        images = self.take(wanted)
+        self.refuse_unlike(images, [t for _, t in wanted], response, noise, offset)
         return images
+
+    def refuse_unlike(self, images: list[np.ndarray], seconds: list[float], *sensor: Any) -> None:
+        """Refuse the latest photographs, all of one pattern, where they contradict each other."""
+        last = self.shots.number
+        agreeing.refuse_unlike(images, seconds, range(last + 1 - len(images), last + 1), *sensor)
 
     def merged(
         self,
@@ -53,7 +60,7 @@ class Taking:
     ) -> Radiance:
         """What the camera sees under `codes`, the ambient light still in it."""
         times = [t for t in seconds for _ in range(again)]
-        images = self.agreeing([(codes, t) for t in times], response, noise)
+        images = self.agreeing([(codes, t) for t in times], response, noise, offset)
         last = self.shots.number
         with exposing.telling(f"photographs {last + 1 - len(images)} to {last}"):
             return merge(images, times, response, noise, levels=self.shots.levels, black=offset)

@@ -20,9 +20,9 @@ from ltcl.acquisition import kept, run
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Rig, Shots
-from ltcl.acquisition.run import Progress, Settings
+from ltcl.acquisition.run import Progress
 from ltcl.acquisition.scanning import plan
-from ltcl.acquisition.scanning.hadamard import Hadamard
+from ltcl.acquisition.settings import Settings
 from ltcl.errors import InputError, InputTypeError
 from ltcl.files import as_path
 from ltcl.store import BlockStore, StoredRows, load
@@ -67,7 +67,7 @@ def acquire(
         Told after each pattern how many have been photographed, and of how many in all at most; those
         of an earlier run count at once.
     exposures : sequence of float, optional
-        Seconds of the photographs of each pattern; left out, they are chosen.
+        Seconds of the photographs of each pattern, which the rig must have; left out, they are chosen.
     response : Response, optional
         Of the camera, where it is known.
     frames : int
@@ -111,19 +111,22 @@ def acquire(
     >>> bool(abs(T @ p - truth @ p).max() < 0.02)
     True
     """
-    wanted = Settings(
-        checks.one_of("strategy", strategy, ("auto", *plan.STRATEGIES)),
-        _named(geometry),
-        _seconds(exposures),
-        checks.count("block", block, least=2),
-        Hadamard(order).size,
-        checks.number("threshold", threshold, above=0.0, below=1.0),
-        checks.number("sigmas", sigmas, least=0.0),
-        checks.count("frames", frames),
-    )
     checks.flag("resume", resume)
-    _refuse_kinds(response, progress)
+    if progress is not None and not callable(progress):
+        raise InputTypeError(f"progress is {progress!r}; it must be a function of two ints, or None")
     shots = Shots(rig)
+    wanted = Settings.of(
+        shots,
+        geometry=geometry,
+        strategy=strategy,
+        exposures=exposures,
+        response=response,
+        frames=frames,
+        block=block,
+        order=order,
+        threshold=threshold,
+        sigmas=sigmas,
+    )
     with _place(store) as path:
         found = _found(path, resume)
         if found is not None:
@@ -137,33 +140,6 @@ def acquire(
             run.scan(begun, progress or (lambda done, total: None))
         T = load(path, on_dark="mask", device=device)
         return T if store is not None else _in_memory(T, device)
-
-
-def _named(geometry: str | Correspondence) -> str:
-    if isinstance(geometry, str):
-        return checks.one_of("geometry", geometry, ("graycode", "aligned"))
-    if not isinstance(geometry, Correspondence):
-        kind = type(geometry).__name__
-        raise InputTypeError(
-            f"geometry is a {kind}; it must be 'graycode', 'aligned' or a measured Correspondence"
-        )
-    return "given"
-
-
-def _seconds(exposures: Any) -> tuple[float, ...] | None:
-    if exposures is None:
-        return None
-    found = checks.finite("exposures", checks.real("exposures", exposures))
-    if found.ndim != 1 or found.size == 0 or found.min() <= 0:
-        raise InputError(f"exposures is {exposures!r}; it must be a sequence of positive seconds")
-    return tuple(found.astype(float).tolist())
-
-
-def _refuse_kinds(response: Any, progress: Any) -> None:
-    if not isinstance(response, Response | None):
-        raise InputTypeError(f"response is a {type(response).__name__}; it must be a Response, or None")
-    if progress is not None and not callable(progress):
-        raise InputTypeError(f"progress is {progress!r}; it must be a function of two ints, or None")
 
 
 @contextlib.contextmanager

@@ -32,15 +32,13 @@ def run(folder: options.Acquisition, overhead: _Overhead = 0.0, json: options.Js
     from ltcl.acquisition.scanning import plan
 
     project = Project.open(folder)
+    wanted = project.check()
     known = _measured(project) if project.state != "new" else _guessed(project)
-    settings = {name: project.settings[name] for name in _SETTINGS if name in project.settings}
+    settings = {name: getattr(wanted, name) for name in _SETTINGS}
     with project.naming("acquire"):
-        wanted = checks.one_of(
-            "strategy", project.settings.get("strategy", "auto"), ("auto", *plan.STRATEGIES)
-        )
         plans = plan.plans(**known, **settings, overhead=overhead)
     chosen, why = plan.choose(plans)
-    told = {"measured": project.state != "new", "asked_for": wanted, "auto": chosen, "why": why}
+    told = {"measured": project.state != "new", "asked_for": wanted.strategy, "auto": chosen, "why": why}
     if json:
         found = {name: dataclasses.asdict(one) for name, one in plans.items()}
         shown = {name: known[name] for name in ("exposures", "noise", "light", "channels")}

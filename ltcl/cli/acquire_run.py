@@ -12,7 +12,7 @@ import typer
 
 from ltcl.cli import acquire_report, console, options
 from ltcl.device import open_device
-from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
+from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing, ScanRefused
 
 if TYPE_CHECKING:
     from ltcl.acquisition import Project
@@ -41,6 +41,8 @@ def run(folder: options.Acquisition, device: options.Device = None, json: option
     project = Project.open(folder)
     if project.state == "begun":
         raise InputError(f"{project.store}: is begun; {project.next} goes on")
+    if project.state == "new" and kept.busy(project.store):
+        raise FileError(f"{kept.place(project.store)}: another process is at work there; one must end first")
     if project.state == "new" and project.kept:
         raise InputError(
             f"{kept.place(project.store)}: holds {project.kept} photographs of a calibration that has not "
@@ -103,6 +105,9 @@ def _ending(project: Project, rig: Any) -> Iterator[None]:
         yield
     except PhotographMissing as error:
         raise _asking(project, rig, error) from None
+    except ScanRefused as error:
+        anew = f"once {project.store} is removed, 'ltcl acquire run {project.folder}' begins anew"
+        raise ScanRefused(f"{error}; {anew}") from error
     except AcquisitionError as error:
         raise AcquisitionError(f"{error}; {_left(project)}") from error
     except KeyboardInterrupt:

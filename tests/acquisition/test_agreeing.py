@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ltcl.acquisition import VirtualRig, camera_map
+from ltcl.acquisition import VirtualRig, acquire, camera_map
 from ltcl.acquisition.agreeing import Complements, refuse_unlike
 from ltcl.acquisition.measuring import measure
 from ltcl.acquisition.radiometry import NoiseModel, Response
@@ -63,6 +63,28 @@ def test_white_among_black_is_named() -> None:
     frames = [np.full((8, 8), x) for x in (0.004, 0.004, 1.0, 0.004)]
     with pytest.raises(AcquisitionError, match=r"photographs 2 \(1 s\) and 3 \(1 s\)"):
         refuse_unlike(frames, [1.0] * 4, (1, 2, 3, 4), LINE)
+
+
+@pytest.mark.parametrize("lit", [0.0, 0.1])
+def test_what_a_camera_gives_without_light_is_no_contradiction(lit: float) -> None:
+    rng, light = np.random.default_rng(3), np.zeros((24, 36))
+    light[:, :4] = lit
+    images = [0.125 + 0.875 * photograph(light, t, rng) for t in TIMES]
+    refuse_unlike(images, TIMES, range(3), LINE, offset=np.array([0.125]))
+    with pytest.raises(AcquisitionError, match="other light"):
+        refuse_unlike(images, TIMES, range(3), LINE)
+
+
+@pytest.mark.parametrize("black", [0.0, 0.06, 0.125])
+def test_a_known_response_and_a_black_level_are_no_contradiction(black: float) -> None:
+    """The scan as well as the calibration, in a dark room."""
+    T = 0.5 * np.eye(16) + 0.01
+    made = VirtualRig(T, (4, 4), response="linear", bits=14, black=black)
+    found = acquire(made, geometry="aligned", strategy="pixel", response=LINE)
+    p = np.linspace(0, 1, 16).reshape(4, 4)
+    light, truth = np.asarray(found @ p), (T @ p.ravel()).reshape(4, 4)
+    scale = float(np.vdot(light, truth) / np.vdot(truth, truth))
+    assert np.linalg.norm(light - scale * truth) < 0.03 * np.linalg.norm(light)
 
 
 def test_patterns_without_inverses_say_nothing() -> None:

@@ -20,7 +20,7 @@ import ltcl
 from ltcl.acquisition import Report, Shots, VirtualRig, acquire, kept
 from ltcl.acquisition.geometry import Correspondence
 from ltcl.acquisition.measuring import measure
-from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
+from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError, ScanRefused
 from ltcl.store import BlockStore
 
 from .stopping import LINE, made, scene
@@ -118,6 +118,12 @@ def test_hot_pixels_decide_nothing(tmp_path: Path, pixels: list[int]) -> None:
     assert np.linalg.norm(ours - theirs) < 0.02 * np.linalg.norm(theirs)
 
 
+def test_exposures_at_which_all_is_noise() -> None:
+    rig = VirtualRig(scene(GRID), GRID, **CAMERA)
+    text = r"exposures is \(0.0001,\), but half of what white shows is lost in noise at 0.0001 s; the longest"
+    refused(InputError, text, rig, **{**SHORT, "exposures": [1e-4]})
+
+
 def test_exposures_at_which_lit_pixels_saturate() -> None:
     rig = VirtualRig(scene(GRID), GRID, **CAMERA)
     text = r"exposures is \(30.0,\), but half of what white shows saturates at 30 s; the shortest must be at"
@@ -161,7 +167,7 @@ def test_light_that_changes_behind_the_calibration(tmp_path: Path) -> None:
     text = (
         "columns of T add up to light that is .* beside what white showed; photographs must be in the order"
     )
-    refused(AcquisitionError, text, Dimmed(_calibrating() + 1), **SHORT, store=tmp_path / "T.zarr")
+    refused(ScanRefused, text, Dimmed(_calibrating() + 1), **SHORT, store=tmp_path / "T.zarr")
     assert not BlockStore.open(tmp_path / "T.zarr").final
 
 

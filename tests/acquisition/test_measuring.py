@@ -10,6 +10,7 @@ from ltcl.acquisition import Shots, VirtualRig, exposing
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.measuring import measure
 from ltcl.errors import AcquisitionError, InputError
+from ltcl.images import to_srgb
 
 from .scanning.helpers import corner, rig
 
@@ -103,3 +104,30 @@ def test_a_map_of_other_pixels_is_refused() -> None:
     up = VirtualRig(np.eye(4), (2, 2), camera_grid=(4, 2), camera_map=np.kron(np.eye(4), np.ones((2, 1))))
     with pytest.raises(InputError, match="geometry is 'aligned', but photographs are"):
         measure(Shots(up), geometry="aligned")
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_fewer_bits_than_a_file_has_are_named(bits: int) -> None:
+    class Sixteen:
+        projector_grid, channels = (4, 8), 1
+        made = rig(4, bits=bits)
+
+        def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
+            return self.made.photograph(codes, seconds)
+
+    text = f"of white, ends at code {(1 << bits) - 1} of 65535, .* the camera has {bits} bits"
+    with pytest.raises(AcquisitionError, match=text):
+        measure(Shots(Sixteen()), geometry="aligned")
+
+
+@pytest.mark.parametrize("grid", [(1, 2), (2, 4), (3, 3), (2, 5)])
+@pytest.mark.parametrize("bits", [8, 12])
+def test_a_few_pixels_are_measured(grid: tuple[int, int], bits: int) -> None:
+    """2 x 5 of 12 bits happen to be at code 511 in the first photograph."""
+    n = grid[0] * grid[1]
+    found = measure(Shots(VirtualRig(0.5 * np.eye(n) + 0.02, grid, bits=bits)), geometry="aligned", frames=2)
+    np.testing.assert_allclose(found.white.value, np.mean(found.white.value), rtol=0.05)
+    light = np.linspace(0.1, 0.9, 9)
+    codes = 0.004 + 0.996 * to_srgb(light)
+    value = found.response.linear(codes)
+    np.testing.assert_allclose(value / light, np.mean(value / light), rtol=0.1)

@@ -198,7 +198,7 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
         ({"strategy": "spiral"}, InputError, "strategy is 'spiral'"),
         ({"geometry": "stripes"}, InputError, "geometry is 'stripes'"),
         ({"geometry": 3}, InputTypeError, "geometry is a int"),
-        ({"order": 64}, InputError, "size is 64"),
+        ({"order": 64}, InputError, "order is 64"),
         ({"block": 1}, InputError, "block is 1"),
         ({"threshold": 0.0}, InputError, "threshold is 0"),
         ({"frames": 0}, InputError, "frames is 0"),
@@ -208,6 +208,20 @@ def test_other_settings_are_refused(tmp_path: Path) -> None:
 def test_bad_arguments_are_refused(options: dict[str, Any], error: type[Exception], part: str) -> None:
     with pytest.raises(error, match=part):
         acquire(rig(), **{"geometry": "aligned", "strategy": "pixel", **options})
+
+
+@pytest.mark.parametrize(
+    ("offered", "asked", "part"),
+    [
+        (None, [0.5, 40.0], "exposures has 40 s; the rig takes 0.0001 to 30 s"),
+        (None, [1e-5], "exposures has 1e-05 s"),
+        ([0.1, 1.0], [0.1, 0.5], "exposures has 0.5 s; the rig takes 1 s at the nearest"),
+    ],
+)
+def test_exposures_that_the_rig_does_not_have_are_refused(offered: Any, asked: Any, part: str) -> None:
+    made = rig(exposures=offered)
+    with pytest.raises(InputError, match=part):
+        acquire(made, geometry="aligned", strategy="pixel", exposures=asked)
 
 
 def test_one_exposure_tells_no_response() -> None:

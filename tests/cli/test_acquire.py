@@ -18,6 +18,7 @@ from ltcl import images
 from ltcl.acquisition import FolderRig, VirtualRig
 from ltcl.cli import console
 from ltcl.store import BlockStore
+from ltcl.store.blocks.shelf import Shelf
 
 from .conftest import Program
 
@@ -225,14 +226,44 @@ def test_settings_are_refused_by_file_and_table(program: Program, scan: Path, ac
     for old, new, part in (
         ("bits = 12", "bits = 99", "[rig] bits is 99"),
         ('geometry = "aligned"', 'geometry = "stripes"', "[acquire] geometry is 'stripes'"),
-        ('strategy = "pixel"', "order = 64", "[acquire] size is 64"),
+        ("bits = 12", "bits = 12.0", "[rig] bits is 12.0"),
+        ("bits = 12", "bits = 12\ncamera_grid = [8, 8]", "[rig] camera_grid is 8 x 8"),
+        ("bits = 12", "bits = 12\nblack = 1.0", "[rig] black is 1.0"),
+        ("bits = 12", "bits = 12\nexposures = [0.5]", "[acquire] rig.exposures has one exposure"),
+        ("ambient = 0.02", "ambient = nan", "[rig] ambient has 1 NaN"),
+        ('strategy = "pixel"', "order = 64", "[acquire] order is 64"),
+        ('strategy = "pixel"', 'strategy = "spiral"', "[acquire] strategy is 'spiral'"),
+        ('strategy = "pixel"', "exposures = []", "[acquire] exposures is []"),
+        ('strategy = "pixel"', "exposures = [0.5, 40]", "[acquire] exposures has 40 s; the rig takes 0.0001"),
+        ('strategy = "pixel"', "threshold = 1.5", "[acquire] threshold is 1.5"),
+        ('strategy = "pixel"', "frames = 1.5", "[acquire] frames is 1.5"),
+        ('strategy = "pixel"', "sigmas = -1", "[acquire] sigmas is -1"),
+        ('geometry = "aligned"', 'geometry = "given"', "[acquire] geometry is 'given'"),
     ):
+        assert old in text
         path.write_text(text.replace(old, new))
-        program("acquire", "run", scan).refused(f"{path}: {part}")
-    path.write_text(text.replace('strategy = "pixel"', 'strategy = "spiral"'))
-    program("acquire", "plan", scan).refused(f"{path}: [acquire] strategy is 'spiral'")
+        for command in ("plan", "run"):
+            program("acquire", command, scan).refused(f"{path}: {part}")
     assert not (scan / "transport.zarr").exists()
     program("acquire", "plan", scan / "nowhere").refused("acquisition.toml: no such file; 'ltcl simulate'")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="folders are not locked there")
+def test_a_calibration_that_another_process_is_at_is_not_said_to_have_ended(
+    program: Program, scan: Path
+) -> None:
+    place = scan / "transport.zarr.calibration"
+    with Shelf(place, {"rig": {}}) as shelf:
+        shelf.put("shot", np.zeros(2))
+        for command in ("run", "resume"):
+            program("acquire", command, scan).refused(f"{place}: another process is at work there")
+    program("acquire", "run", scan).refused("holds 1 photographs of a calibration that has not ended")
+
+
+def test_a_file_with_a_byte_order_mark_is_read(program: Program, scan: Path) -> None:
+    path = scan / "acquisition.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert program("acquire", "plan", scan).code == 0
 
 
 def test_other_settings_than_begun_with(

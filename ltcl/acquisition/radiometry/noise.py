@@ -32,6 +32,7 @@ from ltcl.acquisition.radiometry.stack import BLACK, NO_LIGHT, levels_of, normal
 from ltcl.errors import InputError
 
 _BINS, _ROUNDS = 64, 10
+_FEW = 10  # samples that tell no distribution
 _MOST_CLIPPED = 0.002  # share of a bin's samples at either end
 _MOST_ELECTRONS = 1e9
 _DITHERED, _HIDDEN = 0.4, 0.2  # codes: V is s^2 + 1/12 from there at any mean; what one code can hide
@@ -141,10 +142,33 @@ def _moments(shots: tuple[np.ndarray, ...], response: Response, levels: int, sat
     linear = response.linear(codes).astype(np.float64)
     mean, variance = linear.mean(axis=0), linear.var(axis=0, ddof=1)
     code = codes.mean(axis=0)
-    low, high = np.mean((codes <= 0) & (levels > 0), axis=0), np.mean(linear > saturation, axis=0)
+    low, high = np.mean(_lowest(codes, levels), axis=0), np.mean(linear > saturation, axis=0)
     slope, freedom = response.derivative(code), np.full(mean.shape, len(shots) - 1.0)
     parts = (mean, variance, slope, code, low, high, freedom)
     return np.stack([part.ravel() for part in parts])
+
+
+def _lowest(codes: np.ndarray, levels: int) -> np.ndarray:
+    """Samples (shots, H, W) or (shots, H, W, channels) whose noise the camera has clipped.
+
+    Those of code 0; and of the lowest value where noise piles up, for an offset may be added behind the end.
+    """
+    found = (codes <= 0) & (levels > 0)
+    for c in np.ndindex(codes.shape[3:]):
+        part = codes[..., *c]
+        least = part.min()
+        above = part[part > least]
+        if above.size and _piled(part, float(least), float(above.min())):
+            found[..., *c] |= part == least
+    return found
+
+
+def _piled(codes: np.ndarray, least: float, following: float) -> bool:
+    """Whether the lowest value of noisy pixels is commoner than the next; a tail would grow rarer."""
+    step = following - least
+    noisy = np.ptp(codes, axis=0) > 2.5 * step  # else all may be within a code
+    count = np.count_nonzero(codes[:, noisy] == least)
+    return bool(count > max(_FEW, np.count_nonzero(codes[:, noisy] <= least + 1.5 * step) - count))
 
 
 @dataclass(frozen=True)

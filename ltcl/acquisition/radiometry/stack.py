@@ -20,6 +20,8 @@ from ltcl.errors import InputError
 BLACK = 0.05  # of full scale: photographs that reach no more at any exposure show no scene
 NO_LIGHT = "is the lens cap on, the projector off or showing something else, or every exposure far too short?"
 _SEEN = 1 << 14  # pixels that the order of two photographs is told by
+_OFFSET = 0.18  # codes without light that a camera may have: what is darkest may be without light
+_LIT, _PART = 0.03, 0.02  # codes above those, that are light; part of the pixels, for fewer may be stuck
 _CLIPPED = 0.98  # codes above tell nothing of an order
 _RATIO = 1.2  # of seconds, below which two photographs may look alike
 _CHANCE = 3e-5  # of refusing photographs in order: 4 standard deviations where pixels are many
@@ -143,21 +145,36 @@ def _check_order(made: Stack, order: np.ndarray) -> None:
     part = slice(None, None, max(1, made.pixels // _SEEN))
     for k in range(len(made.images) - 1):
         ratio = made.seconds[k + 1] / made.seconds[k]
-        short, long = made.codes(k, part), made.codes(k + 1, part)
-        seen = np.maximum(short, long) < _CLIPPED
-        rise = (long - short)[seen].astype(np.float64)
-        if ratio == 1.0 or len(rise) < 2:
+        if ratio == 1.0:
             continue
-        mean, error = rise.mean(), _error(rise, made.levels)
-        falls = mean < -error
-        # Codes rise more than the fourth root of light, or the noise may be all that hides it.
-        least = short[seen].mean() * (ratio**0.25 - 1.0)
-        stays = ratio > _RATIO and short[seen].mean() > 0.1 and np.median(rise) <= 0 and mean + error < least
-        if falls or stays:
+        short, long = (made.codes(j, part).astype(np.float64) for j in (k, k + 1))
+        seen = np.maximum(short, long) < _CLIPPED
+        short, long = short[seen], long[seen]
+        if _falls(long - short, made.levels) or (ratio > _RATIO and _stays(short, long, ratio, made.levels)):
             raise InputError(
                 f"images[{order[k + 1]}] has {made.seconds[k + 1]:g} s and is not brighter than "
                 f"images[{order[k]}] of {made.seconds[k]:g} s; brightness must rise with the seconds"
             )
+
+
+def _falls(rise: np.ndarray, levels: int) -> bool:
+    return len(rise) > 1 and rise.mean() < -_error(rise, levels)
+
+
+def _stays(short: np.ndarray, long: np.ndarray, ratio: float, levels: int) -> bool:
+    """Whether what is lit does not rise; beside it a picture may be as dark at any exposure."""
+    if len(short) < 2:
+        return False
+    darkest = float(np.quantile(short, 0.01))
+    dark = darkest if darkest < _OFFSET else 0.0
+    noise = 4.0 * float(np.median(np.abs(long - short)))  # about 4 standard deviations of one of them
+    lit = np.minimum(short, long) - dark > max(_LIT, noise)
+    if lit.sum() < max(2, _PART * len(lit)):
+        return False
+    rise = (long - short)[lit]
+    # Codes rise more than the fourth root of light, or the noise may be all that hides it.
+    least = (short[lit].mean() - dark) * (ratio**0.25 - 1.0)
+    return bool(np.median(rise) < 0.1 * least and rise.mean() + _error(rise, levels) < least)
 
 
 def _error(rise: np.ndarray, levels: int) -> float:

@@ -57,6 +57,16 @@ class Arrivals:
         self._files: dict[int, list[Path]] = {}
         self.strangers: list[str] = []
 
+    def strange(self) -> str:
+        """What there is beside the photographs on the list, of which the first is named; or nothing."""
+        if not self.strangers:
+            return ""
+        name = self.strangers[0]
+        if _NAME.fullmatch(Path(name).stem) and Path(name).suffix.lower() not in photographs.SUFFIXES:
+            known = ", ".join(photographs.SUFFIXES)
+            return f"{name!r} there is of a kind that is not read; photographs are {known}"
+        return f"{name!r} there is the name of no photograph on the list"
+
     def make(self) -> None:
         """Make the folder, so that a person finds it."""
         path = inside(self._folder, "photographs")

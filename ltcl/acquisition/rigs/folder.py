@@ -228,9 +228,8 @@ class FolderRig:
             f"patterns/{pattern_name(self._list.pattern(digest))}, expose for {seconds:.6g} s, "
             f"save as photographs/{photo_name(number)} in {self.folder}"
         )
-        if self._arrivals.strangers:
-            text += f"; {self._arrivals.strangers[0]!r} there is the name of no photograph on the list"
-        return PhotographMissing(text, number)
+        strange = self._arrivals.strange()
+        return PhotographMissing(f"{text}; {strange}" if strange else text, number)
 
     def _warn_of_scale(self, name: str, codes: np.ndarray) -> None:
         """Once, of float codes that cannot have 1 for what the sensor holds at most."""

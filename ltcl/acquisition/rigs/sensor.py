@@ -59,7 +59,7 @@ class Sensor:
     read: float
 
     def __post_init__(self) -> None:
-        if self.bits != "float" and self.bits not in range(8, 17):
+        if self.bits != "float" and (type(self.bits) is not int or self.bits not in range(8, 17)):
             raise InputError(f'bits is {self.bits!r}; it must be 8 to 16, or "float"')
         checks.number("black", self.black, least=0.0, below=1.0)
         checks.number("read", self.read, least=0.0, below=1.0)

@@ -198,6 +198,41 @@ def test_a_few_pixels_tell_a_wrong_order_where_noise_is_small(clear):
         merge([codes[1], codes[1]], [1.0, 2.0])
 
 
+@pytest.mark.parametrize("bits", [8, 12, 14])
+@pytest.mark.parametrize("black", [0.004, 0.0625, 0.13, 0.16])
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_what_lies_beside_the_light_is_as_dark_at_any_exposure(bits, black, gamma):
+    """Black cloth about a few pixels that are lit, or about none, for a camera of any offset."""
+    rng, full = np.random.default_rng(7), 2**bits - 1
+    for lit in (0.0, 0.01, 0.1, 0.3):
+        light = np.zeros((40, 60))
+        light.flat[: int(lit * light.size)] = 0.03 * rng.random(int(lit * light.size))
+        for ratio in (1.5, 4.0, 60.0):
+            shots = []
+            for t in (1.0, ratio):
+                value = rng.poisson(light * t * 1e4) / 1e4 + rng.normal(0, 5e-4, light.shape)
+                codes = black + (1 - black) * np.clip(value, 0, 1) ** (1 / gamma)
+                shots.append(np.rint(full * codes).astype(np.uint16))
+            merge(shots, [1.0, ratio], levels=full + 1)
+
+
+def test_stuck_pixels_tell_no_order():
+    shots = [np.full((20, 20), 2, np.uint8) for _ in range(2)]
+    for shot in shots:
+        shot.flat[:4] = 128
+    merge(shots, [1.0, 4.0])
+
+
+@pytest.mark.parametrize("black", [0.0, 0.13])
+def test_light_that_stays_is_refused_in_a_dark_picture(black):
+    rng = np.random.default_rng(8)
+    shot = black + rng.normal(0, 0.002, (40, 60))
+    shot[:, :6] += 0.3
+    again = shot + rng.normal(0, 0.002, (40, 60))
+    with pytest.raises(InputError, match=r"images\[1\] has 4 s and is not brighter"):
+        merge([shot, again], [1.0, 4.0])
+
+
 def test_photographs_in_the_wrong_order_are_refused():
     with pytest.raises(InputError, match=r"images\[1\] has 2 s and is not brighter than images\[0\] of 1 s"):
         merge([np.full((4, 4), 0.2), np.full((4, 4), 0.1)], [1.0, 2.0])

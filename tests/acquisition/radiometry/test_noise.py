@@ -72,6 +72,24 @@ def test_read_noise_is_found_where_black_frames_are_clipped_or_rounded_to_one_co
     assert 0.5 * read < found.read < 1.5 * read
 
 
+@pytest.mark.parametrize("levels", [4096, 16384, 0])
+@pytest.mark.parametrize("offset", [0.0, 0.004])
+def test_noise_that_is_clipped_before_an_offset_is_added_does_not_count(levels, offset):
+    rng = np.random.default_rng(4)
+    light = np.geomspace(1e-3, 2, 9600).reshape(80, 120)
+
+    def shoot(value):
+        value = rng.poisson(value * 1e4) / 1e4 + rng.normal(0, 5e-4, value.shape)
+        code = offset + (1 - offset) * np.clip(value, 0, 1)
+        return np.rint(code * (levels - 1)).astype(np.uint16) if levels else code
+
+    bursts = [[shoot(light * t) for _ in range(6)] for t in (0.05, 0.3, 0.0)]
+    response = Response((np.linspace(0, 1, 16385) - offset) / (1 - offset))
+    found = estimate(bursts, response=response, levels=levels or None)
+    assert found.electrons == pytest.approx(10000.0, rel=0.03)
+    assert found.read == pytest.approx(5e-4, rel=0.1)
+
+
 def test_codes_that_never_change_hide_a_fifth_of_one_at_most():
     """A scene of three even parts without any noise that the codes show."""
     shots = [np.repeat(np.array([3, 90, 200], np.uint8), 100).reshape(15, 20)] * 4

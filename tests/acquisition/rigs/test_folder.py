@@ -293,7 +293,15 @@ def test_two_files_for_one_number_are_refused(tmp_path: Path) -> None:
     assert "photo_000001.jpg and photo_000001.png; keep one" in refusal(rig, SHOTS[0])
 
 
-@pytest.mark.parametrize("name", ["IMG_0001.png", "photo_000007.png", "photo_1.gif", "photo_000001 (1).png"])
+@pytest.mark.parametrize("name", ["photo_000001.webp", "photo_1.gif", "PHOTO_000001.heic"])
+def test_kinds_that_are_not_read_are_told(tmp_path: Path, name: str) -> None:
+    rig = prepared(tmp_path, 1)
+    shutil.move(put(tmp_path, 1), tmp_path / "photographs" / name)
+    with pytest.raises(PhotographMissing, match=f"'{name}' there is of a kind that is not read; photographs"):
+        rig.photograph(*SHOTS[0])
+
+
+@pytest.mark.parametrize("name", ["IMG_0001.png", "photo_000007.png", "notes.txt", "photo_000001 (1).png"])
 def test_names_that_mean_nothing_are_told(tmp_path: Path, name: str) -> None:
     rig = prepared(tmp_path, 1)
     shutil.move(put(tmp_path, 1), tmp_path / "photographs" / name)
