@@ -12,7 +12,7 @@ is unknown, too. Entries below a thousandth of a row's largest are dropped, and 
 not quite even within a pixel, camera pixels inside it are weighted so that their middle is its own.
 
 Known limits, measured with maps that Gray code found of a corner of 16 x 16 pixels (`bench/geometry.py`):
-with 1.5 camera pixels to a projector pixel's side noise and stripes come out to 4 %, with 2 to 2 %, with 3
+with 1.5 camera pixels to a projector pixel's side noise and stripes come out to 5.4 %, with 2 to 2 %, with 3
 and 4 to 1 %; with 500 electrons at full scale and 3 pixels to 3.5 %. With camera pixels as large as the
 projector's nothing finer than two pixels is told.
 """
