@@ -110,7 +110,7 @@ class Sharpness:
 
         Examples
         --------
-        >>> Sharpness((0.4, 0.4), 0.9).check()
+        >>> Sharpness((0.4, 0.4), 0.9).check()  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ltcl.errors.AcquisitionError: the camera does not tell the projector's pixels apart: ...
         """
