@@ -125,10 +125,11 @@ def measure(
     # The longest is for what is dim beside the brightest, and told by the scan at that exposure.
     times = exposing.offered(shots, [seconds / 2, seconds, chosen[-1]])
     white = run.merged(run.white, times, *sensor, _AGAIN) - ambient
-    _refuse_exposures(chosen, white, noise)
+    _refuse_long(chosen, white, noise)
     R = R.ascertained(white.value, white.valid)
     tell("projector")
     light, M = _projector(run, seconds, *sensor)
+    _refuse_short(chosen, white, noise)
     return Calibration(chosen, response, noise, offset, ambient, white, light, M, R, sharpness)
 
 
@@ -144,23 +145,29 @@ def _refuse_saturated(run: Taking, seconds: float) -> None:
         )
 
 
-def _refuse_exposures(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
-    """Refuse exposures of which the shortest saturates where a pixel is lit, or the longest tells nothing."""
+def _lit(white: Radiance) -> float:
+    """What half of the pixels that are lit show at least; 0 where none is."""
     lit = white.value[white.valid & (white.value > 0)]
-    level = float(np.median(lit)) if lit.size else 0.0
-    if not level:
-        return
-    most = noise.saturation / (_OWN * level)
-    if exposures[0] > most:
+    return float(np.median(lit)) if lit.size else 0.0
+
+
+def _refuse_long(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
+    """Refuse exposures of which the shortest saturates where a pixel is lit."""
+    level = _lit(white)
+    if exposures[0] * _OWN * level > noise.saturation:
         raise InputError(
             f"exposures is {exposures}, but half of what white shows saturates at {exposures[0]:g} s; the "
-            f"shortest must be at most {0.7 * most:.2g} s"
+            f"shortest must be at most {0.7 * noise.saturation / (_OWN * level):.2g} s"
         )
-    least = _CLEAR * float(np.sqrt(noise.variance(0.0))) / level
-    if exposures[-1] < least:
+
+
+def _refuse_short(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
+    """Refuse exposures of which the longest tells nothing."""
+    level, least = _lit(white), _CLEAR * float(np.sqrt(noise.variance(0.0)))
+    if 0 < exposures[-1] * level < least:
         raise InputError(
             f"exposures is {exposures}, but half of what white shows is lost in noise at {exposures[-1]:g} "
-            f"s; the longest must be some {4 * least:.2g} s"
+            f"s; the longest must be some {4 * least / level:.2g} s"
         )
 
 

@@ -149,8 +149,9 @@ def _check_order(made: Stack, order: np.ndarray) -> None:
             continue
         short, long = (made.codes(j, part).astype(np.float64) for j in (k, k + 1))
         seen = np.maximum(short, long) < _CLIPPED
-        short, long = short[seen], long[seen]
-        if _falls(long - short, made.levels) or (ratio > _RATIO and _stays(short, long, ratio, made.levels)):
+        rise = (long - short)[seen]
+        above = (np.minimum(short, long) - _dark(short, seen))[seen]
+        if _falls(rise, made.levels) or (ratio > _RATIO and _stays(rise, above, ratio, made.levels)):
             raise InputError(
                 f"images[{order[k + 1]}] has {made.seconds[k + 1]:g} s and is not brighter than "
                 f"images[{order[k]}] of {made.seconds[k]:g} s; brightness must rise with the seconds"
@@ -161,19 +162,24 @@ def _falls(rise: np.ndarray, levels: int) -> bool:
     return len(rise) > 1 and rise.mean() < -_error(rise, levels)
 
 
-def _stays(short: np.ndarray, long: np.ndarray, ratio: float, levels: int) -> bool:
+def _dark(short: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Codes (channels,) that may be without light, where other channels have offsets of their own."""
+    parts = [part[here] for part, here in zip(short.T, seen.T, strict=True)]
+    darkest = np.array([np.quantile(part, 0.01) if part.size else 0.0 for part in parts])
+    return np.where(darkest < _OFFSET, darkest, 0.0)
+
+
+def _stays(rise: np.ndarray, above: np.ndarray, ratio: float, levels: int) -> bool:
     """Whether what is lit does not rise; beside it a picture may be as dark at any exposure."""
-    if len(short) < 2:
+    if len(rise) < 2:
         return False
-    darkest = float(np.quantile(short, 0.01))
-    dark = darkest if darkest < _OFFSET else 0.0
-    noise = 4.0 * float(np.median(np.abs(long - short)))  # about 4 standard deviations of one of them
-    lit = np.minimum(short, long) - dark > max(_LIT, noise)
+    noise = 4.0 * float(np.median(np.abs(rise)))  # about 4 standard deviations of one of them
+    lit = above > max(_LIT, noise)
     if lit.sum() < max(2, _PART * len(lit)):
         return False
-    rise = (long - short)[lit]
+    rise, above = rise[lit], above[lit]
     # Codes rise more than the fourth root of light, or the noise may be all that hides it.
-    least = (short[lit].mean() - dark) * (ratio**0.25 - 1.0)
+    least = above.mean() * (ratio**0.25 - 1.0)
     return bool(np.median(rise) < 0.1 * least and rise.mean() + _error(rise, levels) < least)
 
 
