@@ -185,8 +185,8 @@ class _Whole:
         if ends and self._ends.setdefault(last, seconds) < seconds:
             bits = last.bit_length()
             raise AcquisitionError(
-                f"photograph {self._shots.number}, of white, ends at code {last} of {levels - 1}, as one of a "
-                f"shorter exposure does: the camera has {bits} bits; bits of the rig, or camera_bits of a "
+                f"photograph {self._shots.number}, of white, ends at code {last} of {levels - 1}, as one of "
+                f"a shorter exposure does: the camera has {bits} bits; bits of the rig, or camera_bits of a "
                 f"folder, must be {bits}"
             )
         return image
