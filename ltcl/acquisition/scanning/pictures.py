@@ -18,6 +18,7 @@ from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.scanning import exposed, order
 from ltcl.acquisition.scanning.block import Blocks
+from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore
 
 UNKNOWN = np.float32(1e12)
@@ -120,29 +121,28 @@ class Pictures(Seen):
         for part in codes:
             images = [self.shots.photograph(part, t) for t in times]
             contradictions.append(exposed.contradiction(images, self.calibration, part))
-            found.append(self._picture(images))
+            try:
+                found.append(self._picture(images))
+            except AcquisitionError:
+                exposed.check(contradictions, self._names(len(contradictions)))  # may name an earlier one
+                raise
             tell()
-        self._check(patterns, found, contradictions)
+        exposed.check(contradictions, self._names(len(found)))
+        value, variance = (np.stack(part) for part in zip(*found, strict=True))
+        lit = np.stack(patterns).reshape(len(found), -1)
+        order.check(lit, value, variance, self.ambient, self.white, self._names(len(found)))
         return found
 
-    def _check(
-        self,
-        patterns: list[np.ndarray],
-        found: list[Picture],
-        contradictions: list[exposed.Contradiction],
-    ) -> None:
-        """Refuse what does not show its patterns."""
+    def _names(self, count: int) -> Callable[[int], str]:
+        """What the photographs of each of the last `count` pictures are called."""
         each = len(self.calibration.exposures)
-        before = self.shots.number - each * len(found)
+        before = self.shots.number - each * count
 
         def name(a: int) -> str:
             last = before + (a + 1) * each
             return f"photograph {last}" if each == 1 else f"photographs {last + 1 - each} to {last}"
 
-        exposed.check(contradictions, name)
-        value, variance = (np.stack(part) for part in zip(*found, strict=True))
-        lit = np.stack(patterns).reshape(len(found), -1)
-        order.check(lit, value, variance, self.ambient, self.white, name)
+        return name
 
     def _codes(self, pattern: np.ndarray) -> np.ndarray:
         return self.blocks.enlarged(np.asarray(pattern, np.float32))

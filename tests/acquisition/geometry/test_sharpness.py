@@ -105,12 +105,15 @@ def wrong(made: Calibration, C: Any) -> float:
 
 @pytest.mark.parametrize(("size", "blur"), [(3.5, 0.0), (1.4, 0.0), (3.5, 0.9), (2.5, 0.9)])
 def test_what_is_told_is_how_far_pictures_are_off(size: float, blur: float, caplog: Any) -> None:
-    """Sharp, coarse, out of focus; and there is a warning of each that is bad, none of the first."""
+    """Sharp, coarse, out of focus; and there is a warning of each that is bad, none of the first.
+
+    Uneven light passes for a q of up to 0.02, which blurs by 2 %.
+    """
     with caplog.at_level(logging.WARNING):
         found = measuring.measure(Shots(camera(size, blur)), response=LINE)
     assert found.sharpness is not None
     truth = wrong(found, view(size, blur)[0])
-    assert 0.6 * truth < found.sharpness.blur < 1.6 * truth + 0.01
+    assert 0.6 * truth < found.sharpness.blur < 1.6 * truth + 0.02
     assert ("fine detail are off" in caplog.text) == (truth > 0.02)
 
 
