@@ -125,11 +125,11 @@ def measure(
     # The longest is for what is dim beside the brightest, and told by the scan at that exposure.
     times = exposing.offered(shots, [seconds / 2, seconds, chosen[-1]])
     white = run.merged(run.white, times, *sensor, _AGAIN) - ambient
-    _refuse_long(chosen, white, noise)
+    _refuse_long(chosen, _lit(white, R), noise)
     R = R.ascertained(white.value, white.valid)
     tell("projector")
     light, M = _projector(run, seconds, *sensor)
-    _refuse_short(chosen, white, noise)
+    _refuse_short(chosen, _lit(white, R), noise)
     return Calibration(chosen, response, noise, offset, ambient, white, light, M, R, sharpness)
 
 
@@ -145,15 +145,17 @@ def _refuse_saturated(run: Taking, seconds: float) -> None:
         )
 
 
-def _lit(white: Radiance) -> float:
-    """What half of the pixels that are lit show at least; 0 where none is."""
-    lit = white.value[white.valid & (white.value > 0)]
+def _lit(white: Radiance, R: Resampling) -> float:
+    """What half of the camera's pixels that see the projector's show under white; 0 where none is lit."""
+    seen = np.unique(R.weights.indices)
+    pixels = white.value.shape[0] * white.value.shape[1]
+    value, valid = (part.reshape(pixels, -1)[seen] for part in (white.value, white.valid))
+    lit = value[valid & (value > 0)]
     return float(np.median(lit)) if lit.size else 0.0
 
 
-def _refuse_long(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
+def _refuse_long(exposures: tuple[float, ...], level: float, noise: NoiseModel) -> None:
     """Refuse exposures of which the shortest saturates where a pixel is lit."""
-    level = _lit(white)
     if exposures[0] * _OWN * level > noise.saturation:
         raise InputError(
             f"exposures is {exposures}, but half of what white shows saturates at {exposures[0]:g} s; the "
@@ -161,9 +163,9 @@ def _refuse_long(exposures: tuple[float, ...], white: Radiance, noise: NoiseMode
         )
 
 
-def _refuse_short(exposures: tuple[float, ...], white: Radiance, noise: NoiseModel) -> None:
+def _refuse_short(exposures: tuple[float, ...], level: float, noise: NoiseModel) -> None:
     """Refuse exposures of which the longest tells nothing."""
-    level, least = _lit(white), _CLEAR * float(np.sqrt(noise.variance(0.0)))
+    least = _CLEAR * float(np.sqrt(noise.variance(0.0)))
     if 0 < exposures[-1] * level < least:
         raise InputError(
             f"exposures is {exposures}, but half of what white shows is lost in noise at {exposures[-1]:g} "

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ltcl.acquisition import Shots, VirtualRig, exposing
+from ltcl.acquisition import Shots, VirtualRig, camera_map, exposing
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.measuring import measure
 from ltcl.errors import AcquisitionError, InputError
@@ -33,6 +33,21 @@ def test_camera_and_projector(found: Calibration) -> None:
     np.testing.assert_allclose(found.white.value.ravel() / scale, corner().sum(axis=1), rtol=0.03)
     assert found.mixing is None
     assert found.light.tolist() == [1.0]
+
+
+def test_a_dark_room_around_the_picture_decides_no_exposure() -> None:
+    """Three quarters of what the camera sees: 0 but for noise, of which half is above it."""
+    grid, size = (6, 8), (48, 64)
+    sees = camera_map(lambda u, v: ((u - 20) / 3.2, (v - 14) / 3.2), size, grid)
+    made = VirtualRig(
+        0.4 * np.eye(48) + 0.002, grid, camera_map=sees, camera_grid=size, bits=12, ambient=0.01
+    )
+    seen = measure(Shots(made))
+    white = seen.resampling.apply(seen.white.value)[seen.resampling.seen]
+    assert len(white) >= 44
+    np.testing.assert_allclose(white / np.median(white), 1.0, atol=0.1)
+    with pytest.raises(InputError, match="half of what white shows saturates at 30 s"):
+        measure(Shots(made), exposures=[30.0])
 
 
 def test_exposures(found: Calibration) -> None:
