@@ -26,14 +26,15 @@ from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.columns import Code
 from ltcl.acquisition.scanning.log import Log
 from ltcl.acquisition.scanning.pictures import Picture, Pictures
+from ltcl.acquisition.scanning.sums import compare
 from ltcl.acquisition.settings import Settings
-from ltcl.errors import FileError, InputError, ScanRefused
+from ltcl.errors import FileError, InputError
 from ltcl.store import BlockStore, zarr_folder
 from ltcl.store.blocks import creating
 from ltcl.store.compressed import Parts
 
 logger = logging.getLogger(__name__)
-_NOISY, _WRONG = 0.05, 0.3  # parts of white that columns may mostly be beside it
+_NOISY = 0.05  # of white: columns may mostly be as far beside it
 
 Progress = Callable[[int, int], None]
 
@@ -184,7 +185,8 @@ def _finish(run: Run, patterns: int) -> None:
     store, white = run.store, run.pictures.white
     if balance.SUMS not in store.extras:  # of a run that was killed behind it
         sums = np.stack([balance.sums(store, c) for c in range(run.pictures.channels)])
-        _compare(store.path, balance.mostly_beside(sums, white))
+        off = balance.mostly_beside(sums, white)
+        compare(f"{store.path}: columns of T", off, "what white showed", much=_NOISY)
         store.extra(balance.SUMS, sums)
     store.update(patterns=patterns)
 
@@ -193,20 +195,6 @@ def _finish(run: Run, patterns: int) -> None:
         return balance.rows(matrix, variance, Picture(white.value[c, here], white.variance[c, here]))
 
     store.finalize(sigmas=run.wanted.sigmas, change=add_up)
-
-
-def _compare(path: Path, off: float) -> None:
-    """Warn of columns that do not add up to white; refuse such that have little to do with it."""
-    if not off > _NOISY:
-        return
-    told = f"{path}: columns of T add up to light that is {off:.0%} beside what white showed"
-    if off > _WRONG:
-        raise ScanRefused(
-            f"{told}; photographs must be in the order of their patterns and exposed for long enough to "
-            "stand out of noise, and the light, the camera and the scene must stay as they were. Put that "
-            "right, and acquire into another store"
-        )
-    logger.warning("%s: noise, photographs in another order, or a set-up that changed", told)
 
 
 def _scan_cells(run: Run, progress: Progress) -> None:

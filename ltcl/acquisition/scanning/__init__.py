@@ -7,6 +7,7 @@ pixel, hadamard    how the pixels of a batch are lit, and its columns found
 columns            batches of columns into a store
 exposed            exposures of a pattern that contradict each other
 order              pictures that show the patterns of their batch, or are refused
+sums               light that has to add up, and does not
 balance            columns that add up to white
 thresholds         which entries are light, which noise; sums are tested
 adaptive           cells of a quad-tree (cells), those lit together that do not conflict (colouring)

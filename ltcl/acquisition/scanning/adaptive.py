@@ -20,7 +20,6 @@ under white may be; details below it are lost, sums are not.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
@@ -32,13 +31,12 @@ from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.colouring import colour
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Seen
 from ltcl.acquisition.scanning.pixel import all_but_one
-from ltcl.errors import AcquisitionError
+from ltcl.acquisition.scanning.sums import compare
 
-logger = logging.getLogger(__name__)
 AT_ONCE = 16  # patterns of a batch
 _TRUST = 0.1  # relative error of what is subtracted for cells that are lit beside
 _SURE, _FEW = 0.05, 8  # relative noise below which cells tell whether they add up, and how many must
-_ODD, _WRONG = 0.1, 0.3  # relative: what is beside their parents then
+_ODD = 0.1  # relative: what is beside their parents then
 
 
 class Source(Protocol):
@@ -182,7 +180,8 @@ def _divide(
     energy, variance = _measured(found, level, parents, place, kids, groups, pictures, source)
     own = kids[:, place]
     copied = only[place]
-    _compare(level, mostly_beside(energy[:, :, ~copied], variance[:, :, ~copied], parents.where(~copied)))
+    off = mostly_beside(energy[:, :, ~copied], variance[:, :, ~copied], parents.where(~copied))
+    compare(f"cells of level {level - 1}", off, f"that of level {level}", much=_ODD)
     energy, variance = _balanced(energy, variance, parents)
     energy[:, :, copied] = np.where(own >= 0, 1.0, 0.0)[:, None, copied] * parents.energy[:, copied]
     variance[:, :, copied] = parents.variance[:, copied]
@@ -254,19 +253,6 @@ def mostly_beside(energy: np.ndarray, variance: np.ndarray, parents: Entries) ->
     if np.count_nonzero(sure) < _FEW:
         return float("nan")
     return float(np.median(np.abs(energy.sum(axis=0) / np.where(sure, parents.energy, 1.0) - 1.0)[sure]))
-
-
-def _compare(level: int, off: float) -> None:
-    """Warn of children that do not add up to their parents; refuse such that have little to do with them."""
-    if not off > _ODD:
-        return
-    told = f"cells of level {level - 1} add up to light that is {off:.0%} beside that of level {level}"
-    if off > _WRONG:
-        raise AcquisitionError(
-            f"{told}; photographs must be in the order of their patterns, and the light, the camera and the "
-            "scene must stay as they were. Put that right, and acquire into another store"
-        )
-    logger.warning("%s: photographs in another order, or a set-up that changed", told)
 
 
 def _balanced(energy: np.ndarray, variance: np.ndarray, parents: Entries) -> tuple[np.ndarray, np.ndarray]:
