@@ -15,10 +15,9 @@ from rich.console import Console
 import ltcl
 from _harness import Options
 from _kept import bisect
-from ltcl.compression.coefficients import Coefficients, coefficients
-from ltcl.compression.iteration import Iterated, invert_coefficients
-from ltcl.compression.thresholds import above
-from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Tiles, Wavelet, on_active
+from ltcl.compression import SparseInverse, invert_coefficients
+from ltcl.compression.coefficients import Coefficients, coefficients, drop_below
+from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Tiles, Wavelet, restrict_to_support
 from ltcl.scenes import CornerRows, landscape
 
 ALBEDO, REFERENCE = (0.8, 0.65, 0.5), 0.5
@@ -54,7 +53,7 @@ class Built:
     """What was made on the way to T; `lighter` is T of the `fewer` numbers that patterns need."""
 
     A: Coefficients
-    R: list[Iterated]
+    R: list[SparseInverse]
     fewer: list[Any]
     T: ltcl.Transport
     lighter: ltcl.Transport
@@ -110,7 +109,7 @@ def transport(given: Options, corner: Corner, cores: list[Any]) -> ltcl.Transpor
     """T = (I + R) F of R on coefficients."""
     W, systems = Wavelet(given.device, corner.rows.grid, "db2"), []
     for C in cores:
-        core, V = on_active(C, W)
+        core, V = restrict_to_support(C, W)
         systems.append(IdentityPlus(Compressed(Tiles(given.device, core, 8, "float16"), V, V)))
     F = np.repeat(np.array(ALBEDO)[:, None], corner.pixels, axis=1)
     scaled = [ScaledColumns(S, f) for S, f in zip(systems, F, strict=True)]
@@ -126,12 +125,12 @@ def enough(given: Options, corner: Corner, cores: list[Any]) -> list[Any]:
         truth = exact[:, channel]
 
         def error(threshold: float, C: Any = C, truth: np.ndarray = truth) -> float:
-            core, V = on_active(above(C, threshold)[0], W)
+            core, V = restrict_to_support(drop_below(C, threshold)[0], W)
             S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
             x = ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x
             return float(np.linalg.norm(x - truth) / np.linalg.norm(truth))
 
-        found.append(above(C, bisect(error, SHARE * ERROR, float(np.abs(C.data).max())))[0])
+        found.append(drop_below(C, bisect(error, SHARE * ERROR, float(np.abs(C.data).max())))[0])
     return found
 
 

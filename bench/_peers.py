@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Sparse products of others, in float32 with 32-bit indices: what the extra `bench` brings, and PyTorch.
+"""Sparse products of others, in float32 with 32-bit indices: what the extra `bench` brings, PyTorch and CuPy.
 
 A peer that is not installed is named and left out; SciPy and NumPy are always there.
 """
@@ -17,7 +17,13 @@ from typing import Any
 import numpy as np
 
 Product = Callable[[], np.ndarray]
-PEERS = {"scipy": "scipy", "numba": "numba", "sparse_dot_mkl": "sparse_dot_mkl", "torch": "torch"}
+PEERS = {
+    "scipy": "scipy",
+    "numba": "numba",
+    "sparse_dot_mkl": "sparse_dot_mkl",
+    "torch": "torch",
+    "cupy": "cupy",
+}
 
 
 def missing() -> list[str]:
@@ -27,7 +33,7 @@ def missing() -> list[str]:
 
 def sparse_products(A: Any, x: np.ndarray) -> dict[str, Product]:
     """A @ x by every peer that is there, for a csr_array A of float32 and x (N,) or (N, k)."""
-    makers = {"scipy": _scipy, "numba": _numba, "sparse_dot_mkl": _mkl, "torch": _torch}
+    makers = {"scipy": _scipy, "numba": _numba, "sparse_dot_mkl": _mkl, "torch": _torch, "cupy": _cupy}
     absent = missing()
     return {name: make(A, x) for name, make in makers.items() if name not in absent}
 
@@ -60,6 +66,21 @@ def _torch(A: Any, x: np.ndarray) -> Product:
         matrix = torch.sparse_csr_tensor(pointers, columns, torch.from_numpy(A.data), size=A.shape)
     operand = torch.from_numpy(x if x.ndim == 2 else x[:, None])
     return lambda: (matrix @ operand).numpy().reshape(A.shape[0], *x.shape[1:])
+
+
+def _cupy(A: Any, x: np.ndarray) -> Product:
+    cupy: Any = importlib.import_module("cupy")  # in no extra: it needs CUDA
+    sparse: Any = importlib.import_module("cupyx.scipy.sparse")
+
+    parts = (cupy.asarray(A.data), cupy.asarray(A.indices), cupy.asarray(A.indptr))
+    matrix, operand = sparse.csr_matrix(parts, shape=A.shape), cupy.asarray(x, order="F")
+
+    def run() -> np.ndarray:
+        product = matrix @ operand  # cuSPARSE, on the device as ours is
+        cupy.cuda.Device().synchronize()
+        return product
+
+    return run
 
 
 def _numba(A: Any, x: np.ndarray) -> Product:

@@ -21,11 +21,20 @@ import ltcl
 from _corner import interreflection
 from _harness import Options
 from _kept import bisect
-from ltcl.compression.coefficients import coefficients
-from ltcl.compression.iteration import invert_coefficients
+from ltcl.compression import invert_coefficients
+from ltcl.compression.coefficients import coefficients, drop_below
 from ltcl.compression.sources import source
-from ltcl.compression.thresholds import above
-from ltcl.operators import CSR, Basis, Compressed, Dense, IdentityPlus, Operator, Tiles, Wavelet, on_active
+from ltcl.operators import (
+    CSR,
+    Basis,
+    Compressed,
+    Dense,
+    IdentityPlus,
+    Operator,
+    Tiles,
+    Wavelet,
+    restrict_to_support,
+)
 from ltcl.scenes import CornerRows, landscape
 from ltcl.solvers import matrix_series
 
@@ -175,9 +184,9 @@ def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
         return IdentityPlus(Compressed(core, V if both else None, V))
 
     def error(threshold: float) -> float:
-        return at.error(iterated(system(CSR(given.device, above(C, threshold)[0])), at, DROPPED / 10).x)
+        return at.error(iterated(system(CSR(given.device, drop_below(C, threshold)[0])), at, DROPPED / 10).x)
 
     threshold = bisect(error, DROPPED, float(np.abs(C.data).max()))
-    kept, _ = above(C, threshold)
-    core, V = on_active(kept, W) if both else (kept, W)
+    kept, _ = drop_below(C, threshold)
+    core, V = restrict_to_support(kept, W) if both else (kept, W)
     return by_steps(system(Tiles(given.device, core, 1, "float16"), V), at, core.nnz / len(at.l_out))

@@ -25,7 +25,6 @@ from _harness import Options, options
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
 from ltcl.separation import LARGEST_NEGATIVE
-from ltcl.single_view import negative_bounces
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,7 +109,7 @@ def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device
         off_diagonal=_digits(norms(by_diagonal - truth) / norms(truth)),
         negative=_digits(-np.minimum(found, 0).sum(axis=(1, 2)) / np.abs(found).sum(axis=(1, 2))),
         defect=_digits(T.reciprocity_defect),
-        taken=_digits(max(negative_bounces(T))),
+        taken=_digits(max(T.negative_bounces)),
         warned=warned,
         radius=_digits(radius),
         iterations=iterations,

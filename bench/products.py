@@ -27,7 +27,7 @@ from _peers import missing, sparse_products
 from ltcl import plots
 from ltcl.compression.coefficients import coefficients
 from ltcl.compression.sources import source
-from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, on_active
+from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_to_support
 from ltcl.plots.page import INK
 from ltcl.scenes import landscape
 
@@ -75,7 +75,7 @@ class Form:
         if self.into is None:
             core = CSR(given.device, numbers)
             return [(core, core)]
-        numbers, basis = (numbers, self.into) if self.out is None else on_active(numbers, self.into)
+        numbers, basis = (numbers, self.into) if self.out is None else restrict_to_support(numbers, self.into)
         cores = CSR(given.device, numbers), Tiles(given.device, numbers, 8, "float16")
         return [(core, Compressed(core, basis if self.out else None, basis)) for core in cores]
 

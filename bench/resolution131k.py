@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BOUNCES, PROBES = 2, 64
-PAPER_PRODUCT, PAPER_PICTURE, TARGET = 33.0, 3000.0, 17.0  # ms; the paper's of one colour channel
+PAPER_PRODUCT, PAPER_PICTURE = 33.0, 3000.0  # ms; of one colour channel
+TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
 
 
 def relative(found: np.ndarray, exact: np.ndarray) -> float:
@@ -137,9 +138,11 @@ def claims(found: Pictures, ms: dict[str, float], smoke: bool) -> list[Claim]:
         )
         for name, error, limit in zip(names, found.errors, limits, strict=True)
     ]
-    solve = ms["solve in colour"]
-    fast = Claim("solve in colour, 1 %", f"{solve:.3g} ms", f"at most {TARGET:g} ms", solve <= TARGET)
-    return [] if smoke else [*of_errors, fast]
+    of_times = [
+        Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most)
+        for name, most in TARGETS.items()
+    ]
+    return [] if smoke else [*of_errors, *of_times]
 
 
 def draw(found: Pictures) -> Figure:

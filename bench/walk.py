@@ -26,9 +26,7 @@ import _pays as pays
 from _harness import Options, Row, options, report, seconds
 from ltcl import plots
 from ltcl.operators import CSR
-from ltcl.operators.alias import Tables, tables
-from ltcl.operators.links import links
-from ltcl.operators.walks import Walker, geometric
+from ltcl.operators.walks import Lengths, Tables, Walker, linked, tables
 
 NUMPY_TARGET, NUMBA_TARGET, LOADS_TARGET = 10.0, 1.5, 0.6
 GO_ON = 0.5
@@ -119,15 +117,15 @@ def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
         data = R.data * rows * random.uniform(0.9, 1.1, R.nnz)
         host = scipy.sparse.csr_array((data.astype(np.float32), R.indices, R.indptr), shape=R.shape)
         Rs.append(CSR(given.device, host, Rs[0].pattern if Rs else None))
-    b, lengths = random.random((n, 3), dtype=np.float32), geometric(GO_ON, -1.0)
-    together = Walker(links(Rs, (1.0, 1.0, 1.0)), lengths, "collision", 0), given.device.upload(b)
+    b, lengths = random.random((n, 3), dtype=np.float32), Lengths.geometric(GO_ON, -1.0)
+    together = Walker(linked(Rs, (1.0, 1.0, 1.0)), lengths, "collision", 0), given.device.upload(b)
     apart = [
         (Walker(tables(M), lengths, "collision", 0), given.device.upload(column))
         for M, column in zip(Rs, b.T, strict=True)
     ]
     actions = {
-        "one walk": lambda: together[0].rows(together[1], np.arange(n), 0, samples),
-        "three walks": lambda: [walker.rows(b_c, np.arange(n), 0, samples) for walker, b_c in apart],
+        "one walk": lambda: together[0].rows(together[1], np.arange(n), samples),
+        "three walks": lambda: [walker.rows(b_c, np.arange(n), samples) for walker, b_c in apart],
     }
     times = seconds(actions)
     rate = {name: 3 * samples * n * STEPS / time / 1e6 for name, time in times.items()}
@@ -146,7 +144,7 @@ def rows(given: Options, n: int, per_row: int, samples: int) -> tuple[list[Row],
     R, b = matrix(n, per_row), np.random.default_rng(2).random(n, dtype=np.float32)
     M, device = CSR(given.device, R), given.device
     made, b_there, pixels = Tables(M), device.upload(b), np.arange(n)
-    walker = Walker(made, geometric(GO_ON, -1.0), "collision", 0)
+    walker = Walker(made, Lengths.geometric(GO_ON, -1.0), "collision", 0)
     numpy_walker, theirs = NumpyWalker(R, b), numba_walker(R, b, made)
     few, loads, out = max(1, samples // 16), 512, device.empty((4096,), np.uint64)
     kernel = device.kernel("random", "random_loads")
@@ -156,7 +154,7 @@ def rows(given: Options, n: int, per_row: int, samples: int) -> tuple[list[Row],
         device.finish()
 
     actions: dict[str, Callable[[], Any]] = {
-        "ours": lambda: walker.rows(b_there, pixels, 0, samples).mean,
+        "ours": lambda: walker.rows(b_there, pixels, samples).mean,
         "NumPy searchsorted": lambda: numpy_walker(few),
         "random loads": random_loads,
         "tables": lambda: (Tables(M), device.finish()),

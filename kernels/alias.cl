@@ -1,25 +1,23 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Tables for drawing the entries of a row in proportion to |R_ij| (eq. 25), built once after acquisition.
+// Alias tables for drawing the entries of a row in proportion to |R_ij| (eq. 25), built once after acquisition.
 //
-//   alias_csr, alias_dense   one work-item a row
+//   alias_rows   one work-item a row
 //
-// Alias tables (Walker 1974) by one sweep with a pointer to the next light entry, one to the next heavy entry
-// and the mass that the heavy one has left: no stacks and no memory beside the table. L. Huebschle-Schneider
-// and P. Sanders, Parallel Weighted Random Sampling, ESA 2019.
+// Walker's tables (1974) by one sweep with a pointer to the next light entry, one to the next heavy entry and
+// the mass that the heavy one has left: no stacks and no memory beside the table. L. Huebschle-Schneider and
+// P. Sanders, Parallel Weighted Random Sampling, ESA 2019.
 //
 // All arithmetic is in integers, so that tables are the same to the bit on every device. A row is scaled by
 // the power of two that makes its sum C as large as its length n allows; each of n bins has room for C, and
 // entry t has the mass n |R_it|. What rounding moves is below 2^-18 of a row's probability, in total variation,
 // in rows of up to 2^20 entries: half a unit of 2^-18 a bin by the threshold, the rest by scaling.
 //
-// Required define: TABLE, see common/table.h for it and for what is written.
-// Layout: a slab of `rows` rows, the first of which is row `first` of the matrix; the table entries of the
-// slab begin at `base`. Values are read as the bits of reals.
+// No defines. Layout: see common/table.h; row `row` of a slab has its record at first + row.
 
 #include "common/table.h"
 
 // |value| 2^(150 + shift) of the bits of a real, rounded to the nearest integer.
-inline ulong scaled(uint value, int shift)
+static inline ulong scaled(uint value, int shift)
 {
     const uint bits = value & 0x7fffffffu, exponent = bits >> 23;
     const ulong significand = exponent ? (bits & 0x7fffffu) | 0x800000u : bits;
@@ -29,7 +27,7 @@ inline ulong scaled(uint value, int shift)
     return left < -25 ? 0 : ((significand >> (-left - 1)) + 1) >> 1;
 }
 
-inline ulong row_sum(global const uint *values, uint n, int shift)
+static inline ulong row_sum(global const uint *values, uint n, int shift)
 {
     ulong sum = 0;
     for (uint t = 0; t < n; ++t)
@@ -37,22 +35,19 @@ inline ulong row_sum(global const uint *values, uint n, int shift)
     return sum;
 }
 
-inline int bit_length(ulong x)
-{
-    return 64 - (int)clz(x);
-}
+#define BIT_LENGTH(x) (64 - (int)clz((ulong)(x)))
 
 // The shift that gives the sum of a row, not all of which is 0, as many bits as fit: n C must be below 2^63,
-// C 2^18 as well. CDF entries have 41 bits.
-inline int best_shift(global const uint *values, uint n, uint largest)
+// C 2^18 as well.
+static inline int best_shift(global const uint *values, uint n, uint largest)
 {
-    const int budget = TABLE == TABLE_CDF ? 41 : min(45, 63 - bit_length(n));
+    const int budget = min(45, 63 - BIT_LENGTH(n));
     const int rough = 7 - (int)max(largest >> 23, 1u);  // the largest entry becomes a number of 31 bits
-    return rough + budget - 1 - bit_length(row_sum(values, n, rough) + n);
+    return rough + budget - 1 - BIT_LENGTH(row_sum(values, n, rough) + n);
 }
 
 // sum 2^-(150 + shift) as the bits of a real; infinite beyond its range, 0 below 2^-126.
-inline uint real_bits(ulong sum, int shift)
+static inline uint real_bits(ulong sum, int shift)
 {
     const uint bits = as_uint(convert_float(sum));
     const int exponent = (int)(bits >> 23) - (150 + shift);
@@ -61,21 +56,14 @@ inline uint real_bits(ulong sum, int shift)
     return exponent <= 0 ? 0 : ((uint)exponent << 23) | (bits & 0x7fffffu);
 }
 
-inline ulong target(global const uint *values, global const int *columns, uint t)
-{
-    const uint column = columns ? (uint)columns[t] : t;
-    return (ulong)column << 1 | values[t] >> 31;
-}
-
-#if TABLE == TABLE_ALIAS
-
+#define TARGET(t) ((ulong)(columns ? (uint)columns[t] : t) << 1 | values[t] >> 31)
 #define MASS(t) (n * scaled(values[t], shift))
 #define NEXT(t, test) \
     do \
         ++t; \
     while (t < n && !(MASS(t) test capacity))
 
-inline void fill(
+static inline void fill(
     global const uint *values, global const int *columns, uint n, int shift, ulong capacity, global ulong *out)
 {
     uint light = ~0u, heavy = ~0u;
@@ -86,8 +74,7 @@ inline void fill(
         uint own, other;
         ulong mass = capacity;
         if (heavy < n && left > capacity) {  // the light one's bin is filled up by the heavy one
-            own = light;
-            other = heavy;
+            own = light, other = heavy;
             mass = MASS(light);
             left -= capacity - mass;
             NEXT(light, <=);
@@ -108,33 +95,22 @@ inline void fill(
             other = own;
             threshold = 0;
         }
-        out[own] = threshold << (2 * TARGET_BITS) | target(values, columns, own) << TARGET_BITS
-            | target(values, columns, other);
+        out[own] = threshold << (2 * TARGET_BITS) | TARGET(own) << TARGET_BITS | TARGET(other);
     }
 }
 
-#else
-
-inline void fill(
-    global const uint *values, global const int *columns, uint n, int shift, ulong capacity, global ulong *out)
+// Of dense rows `pointers` and `columns` are 0.
+kernel void alias_rows(
+    int rows, int first, ulong base, int width, global const int *pointers, global const int *columns,
+    global const uint *values, global uint4 *records, global ulong *entries)
 {
-    ulong sum = 0;
-    for (uint t = 0; t < n; ++t) {
-        sum += scaled(values[t], shift);
-#if TABLE == TABLE_CDF
-        out[t] = sum << TARGET_BITS | target(values, columns, t);
-#else
-        out[t] = (ulong)values[t] << 32 | target(values, columns, t) >> 1;
-#endif
-    }
-}
-
-#endif
-
-inline void build(
-    global const uint *values, global const int *columns, uint n, ulong start, global uint4 *record,
-    global ulong *entries)
-{
+    const int row = get_global_id(0);
+    if (row >= rows)
+        return;
+    const ulong begin = pointers ? (ulong)pointers[row] : (ulong)row * width, start = base + begin;
+    const uint n = pointers ? pointers[row + 1] - pointers[row] : width;
+    values += begin;
+    columns = columns ? columns + begin : 0;
     uint largest = 0, sum = 0;
     for (uint t = 0; t < n; ++t)
         largest = max(largest, values[t] & 0x7fffffffu);
@@ -144,28 +120,5 @@ inline void build(
         fill(values, columns, n, shift, capacity, entries + start);
         sum = real_bits(capacity, shift);
     }
-    *record = (uint4)((uint)start, (uint)(start >> 32), sum ? n : 0, sum);
-}
-
-kernel void alias_csr(
-    int rows, int first, ulong base, global const int *pointers, global const int *columns,
-    global const uint *values, global uint4 *records, global ulong *entries)
-{
-    const int row = get_global_id(0);
-    if (row >= rows)
-        return;
-    const int begin = pointers[row];
-    build(
-        values + begin, columns + begin, pointers[row + 1] - begin, base + begin, records + first + row, entries);
-}
-
-kernel void alias_dense(
-    int rows, int first, ulong base, int width, global const uint *values, global uint4 *records,
-    global ulong *entries)
-{
-    const int row = get_global_id(0);
-    if (row >= rows)
-        return;
-    const ulong begin = (ulong)row * width;
-    build(values + begin, 0, width, base + begin, records + first + row, entries);
+    records[first + row] = (uint4)((uint)start, (uint)(start >> 32), sum ? n : 0, sum);
 }

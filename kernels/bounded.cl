@@ -1,89 +1,133 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// What least squares within bounds do between two products (`ltcl/solvers/bounded.py`).
+// Least squares within bounds between two products (`ltcl/solvers/bounded.py`): x is (rows, k), r is (height, k).
 //
-//   bounded_look       sums that certify x and choose the next direction
-//   bounded_direction  d = clip(x + alpha (z + beta d)) - x, its sums, and how far x may go along it
-//   bounded_move       x = clip(x + step d)
+//   bounded_direction  d = clip(x + alpha (z + beta d)) - x, with its sums and how far x may go along it
+//   bounded_weigh      v = w v and u = w v, with the sums of v v
+//   bounded_move       x = clip(x + lambda d), r = r - lambda A d
+//   bounded_look       the gradient g, and sums that certify x and choose the next direction
 //
-// g is the gradient at x and z the part of -g that may be followed: 0 where x is at a bound and -g points out.
-//
-// No defines. x, g, d and h are row-major with k columns; lower and upper hold one value a row. A group takes
-// one slice of the rows of column get_global_id(1), a work-item every get_global_size(0)-th row, and leaves its
-// numbers at out[(slice * k + column) * numbers]; the host adds up the slices.
+// z is the part of -g that may be followed: 0 where x is at a bound and -g points out. lower and upper hold one
+// value a row. w counts where weighted == 1. Items, groups and partial sums are those of common/columns.h.
+// Required define: ADJACENT, 0 or 1. `numbers` holds k columns by rows: alpha, the curvature <A d, A d> of the last d, or 0
+// where it tells nothing of the next, lambda; from row 4 on the 2 sums of bounded_look by slices; then those of r r.
+// `scratch` holds a real an item and those that are named.
 
-#include "common/real.h"
-#include "common/reduce.h"
+#include "common/columns.h"
 
-inline real bounded_free(real x, real g, real lower, real upper)
+#define STRAIGHT 0.5f  // of d: a shorter step tells that clipping has bent d far from p, and conjugacy is lost
+#define NUMBER(row) numbers[(row) * k + s.origin + j]
+
+static inline real bounded_free(real x, real g, real lower, real upper)
 {
     return (g > 0 ? x <= lower : x >= upper) ? 0 : -g;
 }
 
-// Of each column: the Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), z.z, z.h and z.d.
-kernel void bounded_look(
-    int rows, int k, global const real *lower, global const real *upper, global const real *x,
-    global const real *g, global const real *d, global const real *h, global real *out, local real *scratch)
-{
-    const int column = get_global_id(1);
-    real gap = 0, zz = 0, zh = 0, zd = 0;
-    for (int row = get_global_id(0); row < rows; row += get_global_size(0)) {
-        const int i = row * k + column;
-        const real z = bounded_free(x[i], g[i], lower[row], upper[row]);
-        gap += g[i] * (x[i] - (g[i] > 0 ? lower[row] : upper[row]));
-        zz += z * z;
-        zh += z * h[i];
-        zd += z * d[i];
-    }
-    gap = group_sum(gap, scratch);
-    zz = group_sum(zz, scratch);
-    zh = group_sum(zh, scratch);
-    zd = group_sum(zd, scratch);
-    if (get_local_id(0) == 0) {
-        global real *own = out + (get_group_id(0) * k + column) * 4;
-        own[0] = gap;
-        own[1] = zz;
-        own[2] = zh;
-        own[3] = zd;
-    }
-}
-
-// Of each column: g.d, d.d and the largest share of the way to its bound that an entry of x + d has gone, at
-// most 1: x may move along d by one over it. alpha is in ab[0 .. k - 1], beta in ab[k .. 2 k - 1].
+// Sums: g.d, d.d; and the largest share of the way to its bound that an entry of x + d has gone. Columns rest where
+// rest[column]. scratch: 2 more a column.
 kernel void bounded_direction(
-    int rows, int k, global const real *ab, global const real *lower, global const real *upper,
-    global const real *x, global const real *g, global real *d, global real *out, local real *scratch)
+    int rows, int k, int slices, global const int *rest, global const real *numbers, global const real *lower,
+    global const real *upper, global const real *x, global const real *g, global real *d, global real *sums,
+    global real *shares, local real *scratch)
 {
-    const int column = get_global_id(1);
-    const real alpha = ab[column], beta = ab[k + column];
-    real gd = 0, dd = 0, share = 0;
-    for (int row = get_global_id(0); row < rows; row += get_global_size(0)) {
-        const int i = row * k + column;
+    const share s = columns_share(rows, k);
+    local real *totals = scratch + get_local_size(0), *alphas = totals, *betas = totals + s.width;
+    columns_totals(numbers + 4 * k, slices, 2, 0, k, s, totals, scratch);
+    EACH_COLUMN(j) {
+        betas[j] = NUMBER(1) > 0 ? -betas[j] / NUMBER(1) : 0;  // -z.h / <A d, A d>
+        alphas[j] = rest[s.origin + j] ? 0 : NUMBER(0);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const real alpha = alphas[s.column], beta = betas[s.column];
+    real gd = 0, dd = 0, most = 0;
+    EACH_VALUE(i, row) {
         const real z = bounded_free(x[i], g[i], lower[row], upper[row]);
         const real p = z == 0 ? 0 : z + beta * d[i];
-        const real step = clamp(x[i] + alpha * p, lower[row], upper[row]) - x[i];
+        const real step = alpha == 0 ? 0 : clamp(x[i] + alpha * p, lower[row], upper[row]) - x[i];
         d[i] = step;
         gd += g[i] * step;
         dd += step * step;
         if (step != 0)
-            share = fmax(share, step / ((step > 0 ? upper[row] : lower[row]) - x[i]));
+            most = fmax(most, step / ((step > 0 ? upper[row] : lower[row]) - x[i]));
     }
-    gd = group_sum(gd, scratch);
-    dd = group_sum(dd, scratch);
-    share = group_max(share, scratch);
-    if (get_local_id(0) == 0) {
-        global real *own = out + (get_group_id(0) * k + column) * 3;
-        own[0] = gd;
-        own[1] = dd;
-        own[2] = share;
-    }
+    columns_sum(gd, sums + get_group_id(0) * 2 * k, 0, s, scratch);
+    columns_sum(dd, sums + (get_group_id(0) * 2 + 1) * k, 0, s, scratch);
+    columns_sum(most, shares + get_group_id(0) * k, 1, s, scratch);
 }
 
-// step holds one number a column; one work-item an entry.
-kernel void bounded_move(
-    int count, int k, global const real *step, global const real *lower, global const real *upper,
-    global const real *d, global real *x)
+// weighted == 2 makes u as well.
+kernel void bounded_weigh(
+    int rows, int k, int weighted, global const real *w, global real *v, global real *u, global real *sums,
+    local real *scratch)
 {
-    const int i = get_global_id(0);
-    if (i < count)
-        x[i] = clamp(x[i] + step[i % k] * d[i], lower[i / k], upper[i / k]);
+    const share s = columns_share(rows, k);
+    real sum = 0;
+    EACH_VALUE(i, row) {
+        const real value = weighted ? w[i] * v[i] : v[i];
+        if (weighted)
+            v[i] = value;
+        if (weighted == 2)
+            u[i] = w[i] * value;
+        sum += value * value;
+    }
+    columns_sum(sum, sums + get_group_id(0) * k, 0, s, scratch);
+}
+
+// `sums` and `shares` are of bounded_direction, `curvatures` the sums of Ad Ad. u = w r. scratch: 4 more a column.
+kernel void bounded_move(
+    int rows, int k, int height, int slices, int weighted, global real *numbers, global const real *sums,
+    global const real *shares, global const real *curvatures, global const real *lower, global const real *upper,
+    global const real *d, global real *x, global const real *w, global const real *Ad, global real *r,
+    global real *u, local real *scratch)
+{
+    share s = columns_share(rows, k);
+    local real *totals = scratch + get_local_size(0), *lambdas = totals;
+    columns_totals(sums, slices, 2, 0, k, s, totals, scratch);
+    columns_totals(shares, slices, 1, 1, k, s, totals + 2 * s.width, scratch);
+    columns_totals(curvatures, slices, 1, 0, k, s, totals + 3 * s.width, scratch);
+    EACH_COLUMN(j) {
+        const real gd = totals[j], dd = totals[s.width + j], curvature = totals[3 * s.width + j];
+        const bool moves = gd < 0 && curvature > 0 && isfinite(curvature);
+        const real exact = fmin(-gd / curvature, fmax(1 / totals[2 * s.width + j], 1));
+        lambdas[j] = moves ? exact : 0;
+        if (get_group_id(0) == 0) {
+            NUMBER(0) = moves ? dd / curvature : NUMBER(0);  // Barzilai and Borwein
+            NUMBER(1) = lambdas[j] >= STRAIGHT ? curvature : 0;
+            NUMBER(2) = lambdas[j];
+        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const real lambda = lambdas[s.column];
+    EACH_VALUE(i, row)
+        x[i] = lambda == 0 ? x[i] : clamp(x[i] + lambda * d[i], lower[row], upper[row]);
+    s = columns_share(height, k);
+    real rr = 0;
+    EACH_VALUE(i, row) {
+        const real left = lambda == 0 ? r[i] : r[i] - lambda * Ad[i];
+        r[i] = left;
+        if (weighted)
+            u[i] = w[i] * left;
+        rr += left * left;
+    }
+    columns_sum(rr, numbers + (4 + 2 * slices + get_group_id(0)) * k, 0, s, scratch);
+}
+
+// g = -q, q = A^T w r; h = (g - last g) / lambda = A^T w^2 A d, which anew == 1 leaves as it is. Sums: the
+// Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), and z.h.
+kernel void bounded_look(
+    int rows, int k, int anew, global const real *lower, global const real *upper, global const real *x,
+    global const real *q, global real *g, global real *h, global real *numbers,
+    local real *scratch)
+{
+    const share s = columns_share(rows, k);
+    const real lambda = s.first < s.end ? numbers[2 * k + s.origin + s.column] : 0;
+    real gap = 0, zh = 0;
+    EACH_VALUE(i, row) {
+        if (!anew)
+            h[i] = lambda == 0 ? 0 : (-q[i] - g[i]) / lambda;
+        g[i] = -q[i];
+        gap += g[i] * (x[i] - (g[i] > 0 ? lower[row] : upper[row]));
+        zh += bounded_free(x[i], g[i], lower[row], upper[row]) * h[i];
+    }
+    columns_sum(gap, numbers + (4 + 2 * get_group_id(0)) * k, 0, s, scratch);
+    columns_sum(zh, numbers + (5 + 2 * get_group_id(0)) * k, 0, s, scratch);
 }

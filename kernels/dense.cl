@@ -1,112 +1,98 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Product of a dense row-major matrix with K right-hand sides: out = scale * (A x) + add, and with A^T.
+// Product of a dense row-major matrix with K right-hand sides, steps of an iteration along one (see
+// common/product.h), and products with its transpose.
 //
 // Three kernels do the same; the device layer times them and takes the fastest:
 //   dense_matvec         one work-item a row, as it reads in a textbook
 //   dense_matvec_stream  one work-item a row, in wide loads (common/row_sums.h); for CPUs
 //   dense_matvec_group   one work-group a row, its items side by side along the row; for GPUs
-// dense_rmatvec          the transpose: one work-item LANES neighbouring columns, down the rows of a slab
+// The transpose reads rows, too, and is cut in both directions:
+//   dense_rmatvec        one work-item a strip of columns, down the rows of chunk get_global_id(1)
+//   dense_rmatvec_sum    adds up the chunks, where there are several
 //
-// Required defines: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8; LANES: 1 or 8.
-// Optional: PACKED, see common/lanes.h.
-// Layout: a slab of `rows` rows of `width` reals, the first of which is row `first` of the matrix. x and
-// out are row-major with `stride` reals a row; the launch works on their columns offset .. offset + K - 1.
+// Required defines: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8; LANES: 8 on CPUs, 1 on GPUs, where
+// neighbouring columns are those of neighbouring items. Optional: STEP, PACKED.
+// Layout: a slab of `rows` rows of `width` reals.
 
-#include "common/lanes.h"
-#include "common/reduce.h"
 #include "common/row_sums.h"
+#include "common/product.h"
 #include "common/stretch.h"
 
-kernel void dense_matvec(
-    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
-    global const real *x, global const real *add, global real *out)
+#define SLAB_ARGUMENTS int width, global const real *matrix
+
+kernel void dense_matvec(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    stride = STRIDE(stride);
-    const int row = get_global_id(0);
-    if (row >= rows)
-        return;
-    global const real *a = matrix + (size_t)row * width;
-    real sum[K];
-    for (int c = 0; c < K; ++c)
-        sum[c] = 0;
-    dense_add(sum, a, x + offset, stride, 0, width, 1);
-    const int i = (first + row) * stride + offset;
-    for (int c = 0; c < K; ++c)
-        LTCL_STORE(out, i + c, sum[c], scale, adds, add);
+    ITEM_ROW;
+    if (inside)
+        dense_add(sum.item, matrix + (size_t)row * width, x + offset, stride, 0, width, 1);
+    FINISH_ITEMS(sum);
 }
 
-kernel void dense_matvec_stream(
-    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
-    global const real *x, global const real *add, global real *out)
+kernel void dense_matvec_stream(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    stride = STRIDE(stride);
-    const int row = get_global_id(0);
-    if (row >= rows)
-        return;
-    const sums sum = dense_sum(matrix + (size_t)row * width, x + offset, stride, 0, width);
-    const int i = (first + row) * stride + offset;
-    for (int c = 0; c < K; ++c)
-        LTCL_STORE(out, i + c, sum.item[c], scale, adds, add);
+    ITEM_ROW;
+    if (inside)
+        sum = dense_sum(matrix + (size_t)row * width, x + offset, stride, 0, width);
+    FINISH_ITEMS(sum);
 }
 
-kernel void dense_matvec_group(
-    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
-    global const real *x, global const real *add, global real *out, local real *scratch)
+kernel void dense_matvec_group(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    stride = STRIDE(stride);
-    const int row = get_group_id(0);  // one group a row exactly: no row is beyond the last
-    global const real *a = matrix + (size_t)row * width;
-    real sum[K];
-    for (int c = 0; c < K; ++c)
-        sum[c] = 0;
-    dense_add(sum, a, x + offset, stride, get_local_id(0), width, get_local_size(0));
-    const int i = (first + row) * stride + offset;
-    for (int c = 0; c < K; ++c) {
-        const real total = group_sum(sum[c], scratch);
-        if (get_local_id(0) == 0)
-            LTCL_STORE(out, i + c, total, scale, adds, add);
-    }
+    GROUP_ROW;
+    dense_add(sum.item, matrix + (size_t)row * width, x + offset, stride, me, width, items);
+    FINISH_GROUP(sum);
 }
 
-// out = scale * (slab^T x) + add, where x is read from row `first` on. The host adds the slabs up, one
-// launch after the other, so the sum has one order.
+#ifndef STEP
+#define STRIP (LANES == 1 ? 1 : 256)  // neighbouring columns of a work-item: long enough to be read as a stream
+
+// out (width, stride) of each chunk = a (its rows)^T x + b y + c x, where x is multiplied from row `first` on.
 kernel void dense_rmatvec(
-    int rows, int first, int stride, int offset, real scale, int adds, int width, global const real *matrix,
-    global const real *x, global const real *add, global real *out)
+    int rows, int first, int stride, int offset, real a, real b, real c, global const real *x,
+    global const real *y, global real *out, int width, global const real *matrix)
 {
     stride = STRIDE(stride);
-    const int item = get_global_id(0) * LANES;
-    if (item >= width)
+    const int column = get_global_id(0) * STRIP;
+    const int count = min(STRIP, width - column), whole = count / LANES;
+    if (count <= 0)
         return;
-    // The last item moves back to a full stretch where it can; what it shares it does not store again.
-    const int column = width < LANES ? 0 : min(item, width - LANES);
-    const int lanes_here = min(LANES, width);
-    global const real *a = matrix + column;
-    x += first * stride + offset;
-    stretch_items sum[K];
-    for (int c = 0; c < K; ++c)
-        for (int lane = 0; lane < LANES; ++lane)
-            sum[c].item[lane] = 0;
-    if (lanes_here == LANES) {
-        stretch s[K];
-        for (int c = 0; c < K; ++c)
-            s[c] = 0;
-        for (int row = 0; row < rows; ++row) {
-            const stretch v = LOAD_STRETCH(a + (size_t)row * width);
-            for (int c = 0; c < K; ++c)
-                s[c] = v * x[row * stride + c] + s[c];
+    const int size = (rows + (int)get_global_size(1) - 1) / (int)get_global_size(1);
+    const int begin = get_global_id(1) * size, end = min(rows, begin + size);
+    global const real *of = x + first * stride + offset;
+    stretch_items sum[STRIP / LANES][K];
+    for (int s = 0; s < STRIP / LANES; ++s)
+        for (int k = 0; k < K; ++k)
+            sum[s][k].vector = 0;
+    for (int row = begin; row < end; ++row) {
+        global const real *from = matrix + (size_t)row * width + column;
+        for (int s = 0; s < whole; ++s) {
+            const stretch v = LOAD_STRETCH(from + s * LANES);
+            for (int k = 0; k < K; ++k)
+                sum[s][k].vector += v * of[row * stride + k];
         }
-        for (int c = 0; c < K; ++c)
-            sum[c].vector = s[c];
-    } else {
-        for (int row = 0; row < rows; ++row)
-            for (int lane = 0; lane < lanes_here; ++lane)
-                for (int c = 0; c < K; ++c)
-                    sum[c].item[lane] = a[(size_t)row * width + lane] * x[row * stride + c] + sum[c].item[lane];
+        for (int lane = whole * LANES; lane < count; ++lane)
+            for (int k = 0; k < K; ++k)
+                sum[whole][k].item[lane - whole * LANES] += from[lane] * of[row * stride + k];
     }
-    for (int lane = item - column; lane < lanes_here; ++lane)
-        for (int c = 0; c < K; ++c) {
-            const int i = (column + lane) * stride + offset + c;
-            LTCL_STORE(out, i, sum[c].item[lane], scale, adds, add);
+    out += (size_t)get_global_id(1) * width * stride;
+    for (int lane = 0; lane < count; ++lane)
+        for (int k = 0; k < K; ++k) {
+            const real total = sum[lane / LANES][k].item[lane % LANES];
+            finish((column + lane) * stride + offset + k, total, a, b, c, x, y, out);
         }
 }
+
+// out = sum of the chunks + b y + c x, one work-item a number of `count`.
+kernel void dense_rmatvec_sum(
+    int count, int chunks, real b, real c, global const real *x, global const real *y, global real *out,
+    global const real *sums)
+{
+    const int i = get_global_id(0);
+    if (i >= count)
+        return;
+    real value = 0;
+    for (int chunk = 0; chunk < chunks; ++chunk)
+        value += sums[(size_t)chunk * count + i];
+    finish(i, value, 1, b, c, x, y, out);
+}
+#endif

@@ -1,14 +1,13 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Product of a matrix of form factors that is never stored: every entry is computed where it is used.
 //
-//     out = scale * diag(left) G diag(right) x + add,    G_ij = mean of  cos(t_i) cos(t_j) / (pi r^2)
+//     A = diag(left) G diag(right),    G_ij = mean of  cos(t_i) cos(t_j) / (pi r^2)
 //
 // over pairs of points on the patches i and j. G is symmetric: with left = albedo and right = area this is
-// one bounce A, and with the two swapped its transpose. cos(t) r is a dot product with a normal, so there is
-// no square root.
+// one bounce, and with the two swapped its transpose.
 //
 //   form_factor_weigh   z = diag(right) x, each right-hand side as a row of its own; one work-item a patch
-//   form_factor_matvec  the product; one work-item a row, LANES patches j at a time
+//   form_factor_matvec  out = a (A x) + b y + c x, as in common/product.h; one work-item a row
 //   form_factor_pairs   G_ij of listed pairs; one work-item a pair. The host corrects near pairs with it
 //
 // A pair is taken at its two centres where they are OUTER sizes of it or more apart; nearer, the curvature of
@@ -16,15 +15,13 @@
 // is taken at eight pairs of points: exact for polynomials of degree 3 in the four coordinates on the two
 // patches. Pairs of points whose way is blocked by a box add nothing.
 //
-// Required defines: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8; LANES: 1 or 8; BLOCKS, see
-// common/blocks.h. Optional: PACKED, see common/lanes.h.
+// Required defines: K, see common/lanes.h; LANES and BLOCKS, see common/spots.h. Optional: PACKED.
 // Layout: geometry is 13 rows of `pitch` reals, a multiple of LANES, one column a patch: centre, right edge,
 // down edge, normal (three rows each) and squared size, (right^2 + down^2) / 4; that of a pair is the sum.
 // Lengths are parts of the scene's size. Columns beyond the last patch hold patches without a normal. z has a
 // row of `pitch` reals for each right-hand side.
 
-#include "common/blocks.h"
-#include "common/lanes.h"
+#include "common/product.h"
 #include "common/spots.h"
 
 enum { CENTRE, RIGHT, DOWN, NORMAL, SIZE };
@@ -36,8 +33,6 @@ enum { CENTRE, RIGHT, DOWN, NORMAL, SIZE };
 // Calculation of Multiple Integrals, 1971, C_n 3-1 for n = 4.
 #define RADIUS 0.40824829f
 #define DIAGONAL 0.28867513f  // RADIUS / sqrt(2)
-// Heights above a plane below this are rounding errors: such points do not see each other.
-#define GRAZING 1e-6f
 
 // A point of a patch: its centre moved by a part of each edge.
 INLINE spots moved(spots centre, real a, spots right, real b, spots down)
@@ -48,18 +43,10 @@ INLINE spots moved(spots centre, real a, spots right, real b, spots down)
     return s;
 }
 
-INLINE spots between(spots p, spots q)
-{
-    spots s = {q.x - p.x, q.y - p.y, q.z - p.z};
-    return s;
-}
-
 INLINE stretch unless_blocked(stretch value, spots p, spots q, global const real *blocks)
 {
-#if BLOCKS
-    if (ANY(value > 0))
-        return ltcl_blocked(p, q, blocks) ? (stretch)(0) : value;
-#endif
+    if (BLOCKS && ANY(value > 0))
+        return blocked(p, q, blocks) ? (stretch)(0) : value;
     return value;
 }
 
@@ -111,8 +98,7 @@ INLINE stretch curved(couple c, spots d, stretch r2, global const real *blocks)
 }
 
 // G of a couple that is not far apart.
-INLINE stretch nearby(
-    couple c, spots d, stretch r2, global const real *blocks)
+INLINE stretch nearby(couple c, spots d, stretch r2, global const real *blocks)
 {
     // How far the patches rise above each other's planes, at most and at least.
     const stretch q_rise = 0.5f * (magnitude(dot3(c.p_normal, c.q_right)) + magnitude(dot3(c.p_normal, c.q_down)));
@@ -128,27 +114,39 @@ INLINE stretch nearby(
     return value;
 }
 
-// G of patch i, given in all lanes, and of patches j .. j + LANES - 1.
-INLINE stretch entries(
-    int i, spots p, spots p_normal, stretch p_size, int j, global const real *geometry, int pitch,
-    global const real *blocks)
+// Patch i, in all lanes: what entries() needs of it for all its pairs.
+typedef struct {
+    int number;
+    spots centre, normal;
+    stretch size;
+} patch;
+
+INLINE patch patch_of(int i, global const real *geometry, int pitch)
+{
+    const patch p = {
+        i, spread_spots(geometry, pitch, CENTRE, i), spread_spots(geometry, pitch, NORMAL, i),
+        (stretch)(geometry[3 * SIZE * pitch + i])};
+    return p;
+}
+
+// G of patch p and of patches j .. j + LANES - 1.
+INLINE stretch entries(patch p, int j, global const real *geometry, int pitch, global const real *blocks)
 {
     const spots q = load_spots(geometry, pitch, CENTRE, j), q_normal = load_spots(geometry, pitch, NORMAL, j);
-    const spots d = between(p, q);
-    const stretch r2 = dot3(d, d), sizes = p_size + LOAD_STRETCH(geometry + 3 * SIZE * pitch + j);
+    const spots d = between(p.centre, q);
+    const stretch r2 = dot3(d, d), sizes = p.size + LOAD_STRETCH(geometry + 3 * SIZE * pitch + j);
     const flags close = r2 < OUTER * OUTER * sizes;
-    const stretch far = exchange(p, p_normal, q, q_normal, blocks);
+    const stretch far = exchange(p.centre, p.normal, q, q_normal, blocks);
     if (!ANY(close))
         return far;
     const couple c = {
-        p, p_normal, spread_spots(geometry, pitch, RIGHT, i), spread_spots(geometry, pitch, DOWN, i),
+        p.centre, p.normal, spread_spots(geometry, pitch, RIGHT, p.number), spread_spots(geometry, pitch, DOWN, p.number),
         q, q_normal, load_spots(geometry, pitch, RIGHT, j), load_spots(geometry, pitch, DOWN, j), sizes};
     return close ? nearby(c, d, r2, blocks) : far;
 }
 
 kernel void form_factor_weigh(
-    int count, int pitch, int stride, int offset, global const real *right, global const real *x,
-    global real *z)
+    int count, int pitch, int stride, int offset, global const real *right, global const real *x, global real *z)
 {
     stride = STRIDE(stride);
     const int j = get_global_id(0);
@@ -158,27 +156,24 @@ kernel void form_factor_weigh(
 }
 
 kernel void form_factor_matvec(
-    int rows, int first, int pitch, int stride, int offset, real scale, int adds, global const real *geometry,
-    global const real *blocks, global const real *left, global const real *z, global const real *add,
-    global real *out)
+    PRODUCT_ARGUMENTS, int pitch, global const real *geometry, global const real *blocks, global const real *left,
+    global const real *z)
 {
-    stride = STRIDE(stride);
-    const int row = get_global_id(0);
-    if (row >= rows)
+    ITEM_ROW;
+    if (!inside)
         return;
-    const int i = first + row;
-    const spots p = spread_spots(geometry, pitch, CENTRE, i), normal = spread_spots(geometry, pitch, NORMAL, i);
-    const stretch size = (stretch)(geometry[3 * SIZE * pitch + i]);
-    stretch sum[K];
-    for (int c = 0; c < K; ++c)
-        sum[c] = 0;
+    const patch p = patch_of(first + row, geometry, pitch);
+    stretch part[K];
+    for (int k = 0; k < K; ++k)
+        part[k] = 0;
     for (int j = 0; j < pitch; j += LANES) {
-        const stretch g = entries(i, p, normal, size, j, geometry, pitch, blocks);
-        for (int c = 0; c < K; ++c)
-            sum[c] = g * LOAD_STRETCH(z + c * pitch + j) + sum[c];
+        const stretch g = entries(p, j, geometry, pitch, blocks);
+        for (int k = 0; k < K; ++k)
+            part[k] = g * LOAD_STRETCH(z + k * pitch + j) + part[k];
     }
-    for (int c = 0; c < K; ++c)
-        LTCL_STORE(out, i * stride + offset + c, left[i] * TOTAL(sum[c]), scale, adds, add);
+    for (int k = 0; k < K; ++k)
+        sum.item[k] = left[first + row] * TOTAL(part[k]);
+    FINISH_ITEMS(sum);
 }
 
 kernel void form_factor_pairs(
@@ -189,10 +184,8 @@ kernel void form_factor_pairs(
     if (n >= count)
         return;
     // The stretch that the product computes, by the same code, and its lane.
-    const int i = from[n], start = to[n] / LANES * LANES;
-    const spots p = spread_spots(geometry, pitch, CENTRE, i), normal = spread_spots(geometry, pitch, NORMAL, i);
-    const stretch size = (stretch)(geometry[3 * SIZE * pitch + i]);
+    const int start = to[n] / LANES * LANES;
     stretch_items g;
-    g.vector = entries(i, p, normal, size, start, geometry, pitch, blocks);
+    g.vector = entries(patch_of(from[n], geometry, pitch), start, geometry, pitch, blocks);
     out[n] = g.item[to[n] - start];
 }

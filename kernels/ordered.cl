@@ -1,32 +1,20 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Pixels in another order, or some of them: out = scale * (P x) + add, where row i of P x is row order[i] of x.
-// Its transpose writes the rows order[i] of out, each once, and leaves others as they are.
+// Pixels in another order, or some of them: out = a (P x) + b y, where row i of P x is row order[i] of x, or 0 where
+// that is negative.
 //
-// Work-items stride through pieces of K right-hand sides (dimension 0) and through pixels (1), as many as there
-// are: a CPU takes one item a pixel, a GPU one a piece.
+// Work-items stride through pieces of K right-hand sides (dimension 0) and through pixels (1).
 //
 // Required define: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8.
 
 #include "common/pieces.h"
 
 kernel void ordered_gather(
-    int rows, int k, real scale, int adds, global const int *order, global const real *x, global const real *add,
+    int rows, int k, real a, real b, global const int *order, global const real *x, global const real *y,
     global real *out)
 {
-    for (int row = get_global_id(1); row < rows; row += get_global_size(1))
-        for (int p = get_global_id(0); p < pieces_of(k); p += get_global_size(0)) {
-            const piece q = piece_of(p, k);
-            put(out, row * k + q.at, LOAD(x + order[row] * k + q.at), q.skip, scale, adds, add);
-        }
-}
-
-kernel void ordered_scatter(
-    int rows, int k, real scale, int adds, global const int *order, global const real *x, global const real *add,
-    global real *out)
-{
-    for (int row = get_global_id(1); row < rows; row += get_global_size(1))
-        for (int p = get_global_id(0); p < pieces_of(k); p += get_global_size(0)) {
-            const piece q = piece_of(p, k);
-            put(out, order[row] * k + q.at, LOAD(x + row * k + q.at), q.skip, scale, adds, add);
-        }
+    const piece p = piece_of(get_global_id(0), k);
+    for (int row = get_global_id(1); row < rows; row += get_global_size(1)) {
+        const lanes v = order[row] < 0 ? (lanes)(0) : LOAD(x + order[row] * k + p.at);
+        put(out, row * k + p.at, v, p.skip, a, b, y);
+    }
 }

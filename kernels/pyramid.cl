@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // A quad-tree over a picture: level 0 is its pixels, and a cell of each further level covers 2 x 2 of the one
-// before, fewer at the edges, until one cell is left.
+// before, fewer at the edges, until one cell is left. out = a (W x) + b y, where W is
 //
-//   pyramid_gather  sums of the pixels in each cell of one level, from those of the level before
-//   pyramid_spread  to each cell of one level, the sum of those that it lies in, from those of the level after
+//   pyramid_gather  sums of the pixels in each cell, a level from those of the level before
+//   pyramid_spread  the transpose: to each pixel, the sum of the cells that it lies in
 //
-// Work-items stride through pieces of K right-hand sides (dimension 0), columns (1) and rows (2), as many as
-// there are.
+// Work-items stride through pieces of K right-hand sides (dimension 0), columns (1) and rows (2). A launch of
+// pyramid_gather that does one level takes any number of groups; one of several levels, first .. last - 1, takes
+// one group a piece, which waits for itself between levels.
 //
 // Required define: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8.
 // Layout: the cells of all levels one after another, the finest first, each level row-major, right-hand
@@ -15,61 +16,51 @@
 
 #include "common/pieces.h"
 
-// Cells of one level, and the first of them among all.
-typedef struct {
-    int height, width, at;
-} cells;
-
-INLINE cells cells_at(int height, int width, int level)
-{
-    cells a = {height, width, 0};
-    for (; level > 0; --level) {
-        a.at += a.height * a.width;
-        a.height = (a.height + 1) / 2;
-        a.width = (a.width + 1) / 2;
-    }
-    return a;
-}
-
 kernel void pyramid_gather(
-    int height, int width, int level, int levels, int k, real scale, int adds, global const real *x,
-    global real *sums, global const real *add, global real *out)
+    int height, int width, int first, int last, int k, real a, real b, global const real *x, global real *sums,
+    global const real *y, global real *out)
 {
-    const cells a = cells_at(height, width, level), below = cells_at(height, width, max(level - 1, 0));
-    const int reach = level == 0 ? 1 : 2;
-    global const real *of = level < 2 ? x : sums + (below.at + level - 1) * k;
-    for (int row = get_global_id(2); row < a.height; row += get_global_size(2))
-        for (int column = get_global_id(1); column < a.width; column += get_global_size(1))
-            for (int p = get_global_id(0); p < pieces_of(k); p += get_global_size(0)) {
-                const piece q = piece_of(p, k);
+    const piece p = piece_of(get_global_id(0), k);
+    int below_height = height, below_width = width, at = 0;  // of the level before, and where this one begins
+    global const real *below = x + p.at;
+    for (int level = 0; level < last; ++level) {
+        const int h = level ? (below_height + 1) / 2 : height, w = level ? (below_width + 1) / 2 : width;
+        const int reach = level ? 2 : 1;
+        global real *here = sums + (at + level) * k + p.at;
+        for (int row = get_global_id(2); level >= first && row < h; row += get_global_size(2))
+            for (int column = get_global_id(1); column < w; column += get_global_size(1)) {
                 lanes sum = 0;
-                for (int i = reach * row; i < min(reach * (row + 1), below.height); ++i)
-                    for (int j = reach * column; j < min(reach * (column + 1), below.width); ++j)
-                        sum += LOAD(of + (i * below.width + j) * k + q.at);
-                const int cell = (a.at + row * a.width + column) * k + q.at;
-                if (level > 0 && level + 1 < levels)
-                    put(sums, level * k + cell, sum, q.skip, 1, 0, x);
-                put(out, cell, sum, q.skip, scale, adds, add);
+                for (int i = reach * row; i < min(reach * (row + 1), below_height); ++i)
+                    for (int j = reach * column; j < min(reach * (column + 1), below_width); ++j)
+                        sum += LOAD(below + (i * below_width + j) * k);
+                const int cell = row * w + column;
+                if (level > 0)
+                    put(here, cell * k, sum, p.skip, 1, 0, x);
+                put(out, (at + cell) * k + p.at, sum, p.skip, a, b, y);
             }
+        if (level > 0)
+            below = here;
+        below_height = h;
+        below_width = w;
+        at += h * w;
+        barrier(CLK_GLOBAL_MEM_FENCE);
+    }
 }
 
-// Level 0 goes to out. The last of `levels` is alone in the sum.
 kernel void pyramid_spread(
-    int height, int width, int level, int levels, int k, real scale, int adds, global const real *x,
-    global real *sums, global const real *add, global real *out)
+    int height, int width, int levels, int k, real a, real b, global const real *x, global const real *y,
+    global real *out)
 {
-    const cells a = cells_at(height, width, level), above = cells_at(height, width, level + 1);
-    for (int row = get_global_id(2); row < a.height; row += get_global_size(2))
-        for (int column = get_global_id(1); column < a.width; column += get_global_size(1))
-            for (int p = get_global_id(0); p < pieces_of(k); p += get_global_size(0)) {
-                const piece q = piece_of(p, k);
-                const int cell = (a.at + row * a.width + column) * k + q.at;
-                lanes sum = LOAD(x + cell);
-                if (level + 1 < levels)
-                    sum += LOAD(sums + (above.at + level + 1 + row / 2 * above.width + column / 2) * k + q.at);
-                if (level > 0)
-                    put(sums, level * k + cell, sum, q.skip, 1, 0, x);
-                else
-                    put(out, cell, sum, q.skip, scale, adds, add);
+    const piece p = piece_of(get_global_id(0), k);
+    for (int row = get_global_id(2); row < height; row += get_global_size(2))
+        for (int column = get_global_id(1); column < width; column += get_global_size(1)) {
+            lanes sum = 0;
+            for (int level = 0, h = height, w = width, at = 0; level < levels; ++level) {
+                sum += LOAD(x + (at + (row >> level) * w + (column >> level)) * k + p.at);
+                at += h * w;
+                h = (h + 1) / 2;
+                w = (w + 1) / 2;
             }
+            put(out, (row * width + column) * k + p.at, sum, p.skip, a, b, y);
+        }
 }

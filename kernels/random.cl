@@ -1,20 +1,4 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Blocks of random words, one work-item a counter: shows that a device computes the published ones.
-//
-// No defines. counters and out hold four words a block; all blocks have the key of `seed`, low word first.
-
-#include "common/random.h"
-
-kernel void random_philox(int count, ulong seed, global const uint4 *counters, global uint4 *out)
-{
-    const int i = get_global_id(0);
-    if (i >= count)
-        return;
-    uint x = counters[i].x, y = counters[i].y, z = counters[i].z, w = counters[i].w;
-    philox(&x, &y, &z, &w, (uint)seed, (uint)(seed >> 32));
-    out[i] = (uint4)(x, y, z, w);
-}
-
 // Chains of random loads, the yardstick of bench/walk.py: an item follows CHAINS of them side by side, `steps`
 // loads each, every place a function of what was loaded before it. `size` words, at most 2^32.
 #ifndef CHAINS

@@ -1,284 +1,185 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// One block of a sweep x -> y by rows of S = shift I + scale M: Gauss-Seidel, SOR and block Gauss-Seidel.
+// Sweeps over the rows of S = shift I + scale M, in place: Gauss-Seidel, SOR and block Gauss-Seidel.
 //
-// A sweep solves P_BB delta_B = b_B - (S x with y before the block)_B, y_B = x_B + delta_B, block after block;
-// P_BB is what the method makes of S_BB: its lower triangle with D / omega, or all of it. A launch does, side by
-// side, either or both of
-//   product  s_B = b_B - (S x with y before row `start`)_B, for the rows of a block B
-//   finish   P_AA delta_A = s_A - S_AO delta_O, y_A = x_A + delta_A, for a block A that begins in row `start`
-// In one launch, A is the block before B, and O before that had its turn while the product for A ran: nothing is
-// written that another work-item reads. In two, O is empty, A is B, and x and y may be one array.
+//     P_BB delta_B = s_B,   s_B = b_B - (S x)_B with the x of the moment,   x_B += delta_B,   block B after block
 //
-//   relax_csr, relax_dense  one work-item a row, and as in csr.cl and dense.cl
-//   _stream                 the same in wide loads; for CPUs, where a row is a stream
-//   _group                  one work-group a row, its items side by side along the row; for GPUs
-// The first `lead` work-groups finish A by inverse, as rows of a dense product with [-P_AA^-1 S_AO, P_AA^-1], which
-// `weights` is.
+// P_BB is what the method makes of S_BB: its lower triangle with D / omega, or all of it.
 //
-//   relax_substitute        finishes A in a launch of its own, in place: a single work-item goes through the rows
-//                           that have entries left of the diagonal within A, while others correct the rest.
+//   relax_strips   CPUs: a panel of many blocks; a work-item takes a block of rows, which is a strip of the panel
+//   relax_rows     GPUs: s_B; a work-group a row. A launch for each block, and one of
+//   relax_correct  GPUs: delta_B = P_BB^-1 s_B; a work-group a row
+//   relax_windows  where relax_strips and relax_rows split the sparse rows; one work-item a row
 //
-// The sums of a row are kept apart where y ends and x begins, so that a sweep also tells the residual of x: what
-// this sweep takes from x, the one before took from y, and left the rest in carry = b - (S y)_lower.
+// A strip first sums what is outside its panel before it and from itself on, which no other strip changes before its
+// turn. The rest, a narrow window of columns, is added strip by strip in their order: by the work-item that ends the
+// sums of a strip, or by the one that ends the strip before it, whichever is later. So no work-item ever waits.
+// Assumed beyond OpenCL 1.2, true of CPU drivers: mem_fence and atomics order what work-groups of one launch hand on.
 //
-// Required define: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8. Optional: PACKED, see common/lanes.h.
-// Layout: B is `rows` rows from row `begin` of a slab, whose row 0 is row `first` of the matrix; A is `count` rows
-// of the matrix from row `start`, O ends there and starts at row `before`. x, y, b, s, delta, r and carry are
-// row-major with `stride` reals a row; a launch works on columns offset .. offset + K - 1.
-// CSR: middle[i] is the first entry of row i of the slab in a column from `start` on.
-// With K = 3 the fourth lane of a load may be a value that another work-item writes; nothing is made of it.
+// A row is split at column i where its correction is omega s_i / S_ii at once (`inverses` 0), else at the first
+// column of its block. Sums below and above the split are kept apart, so that a sweep also tells the residual r of
+// the x it began with: what this sweep takes from x above, the one before took below, and left in carry = b - that.
+//
+// Required define: K, see common/lanes.h. Optional: PACKED, and DENSE where M is dense.
+// Layout: a slab has rows of M from row `first` on. Of a dense one, values has `width` numbers a row, and
+// pointers, columns and windows are not read; of a sparse one windows[2 row] is the first entry of the window,
+// windows[2 row + 1] the first from the split on. weights are rows of P_BB^-1, `block` numbers each, or 1 / S_ii.
+// x, before (the x it began with), b, s, r and carry are row-major with `stride` reals a row; a launch works on
+// their columns offset .. offset + K - 1, and on rows begin .. end of the panel or block that begins in row `start`.
+// scratch holds K reals a work-item, 2 K in relax_rows.
+// arrivals[0] counts the strips begun, arrivals[i] what strip i waited for; all are 0 between launches.
 
-#include "common/lanes.h"
-#include "common/reduce.h"
+#include "common/product.h"
 #include "common/row_sums.h"
+#include "common/search.h"
 
-// One row of B: its right-hand side, and the residual of the iterate the sweep started from.
-#define RELAX_STORE(i, lower, upper) \
-    do { \
-        const real from_x = shift * x[i] + scale * (upper); \
-        r[i] = carry[i] - from_x; \
-        carry[i] = b[i] - scale * (lower); \
-        s[i] = carry[i] - from_x; \
-    } while (0)
+#define PLACE int begin, int end, int first, int start, int stride, int offset, real shift, real scale, int width
+#define MATRIX \
+    global const int *pointers, global const int *columns, global const real *values, global const int *windows
+#define VECTORS global real *x, global const real *b, global real *s, global real *r, global real *carry
+#define OFFSET (stride = STRIDE(stride), x += offset, b += offset, s += offset, r += offset, carry += offset)
 
-#define RELAX_CORRECT(i, value) \
-    do { \
-        const real correction = value; \
-        delta[i] = correction; \
-        y[i] = x[i] + correction; \
-    } while (0)
+// The entries from .. to of a row, by one work-item in wide loads, and by a work-group side by side (ADD); and by one
+// work-item those on both sides of a window.
+#ifdef DENSE
+#define ROW_SUM(row, from, to) dense_sum(values + (size_t)(row) * width, x, stride, from, to)
+#define ROW_ADD(sum, row, from, to) \
+    dense_add(sum, values + (size_t)(row) * width, x, stride, (from) + (int)get_local_id(0), to, get_local_size(0))
+#define AROUND(lower, upper, row, from, to) (lower = ROW_SUM(row, 0, from), upper = ROW_SUM(row, to, width))
+#define ROW_BEGIN(row) 0
+#define ROW_END(row) width
+#define WINDOW_BEGIN(row, column) (column)
+#define WINDOW_END(row, column) (column)
+#else
+#define ROW_SUM(row, from, to) csr_sum(columns, values, x, stride, from, to)
+#define ROW_ADD(sum, row, from, to) \
+    csr_add(sum, columns, values, x, stride, (from) + (int)get_local_id(0), to, get_local_size(0))
+#if K == 1
+#define AROUND(lower, upper, row, from, to) \
+    const float2 both = csr_around(columns, values, x, stride, pointers[row], from, to, pointers[(row) + 1]); \
+    (lower.vector = both.x, upper.vector = both.y)
+#else
+#define AROUND(lower, upper, row, from, to) \
+    (lower = ROW_SUM(row, pointers[row], from), upper = ROW_SUM(row, to, pointers[(row) + 1]))
+#endif
+#define ROW_BEGIN(row) pointers[row]
+#define ROW_END(row) pointers[(row) + 1]
+#define WINDOW_BEGIN(row, column) windows[2 * (row)]
+#define WINDOW_END(row, column) windows[2 * (row) + 1]
+#endif
 
-// Work-items that each have a row of their own.
-inline void relax_finish(
-    int item, int start, int count, int before, int stride,
-    global const real *weights, global const real *x,
-    global real *y, global const real *s, global real *delta)
+// The sums of a sparse row j .. end before entry `from` and from entry `to` on. Of one right-hand side, where splits
+// would leave odd ends everywhere, the stretches around them are taken in wide loads, too, and masked.
+#if K == 1
+static inline float2 csr_around(
+    global const int *columns, global const real *values, global const real *x, int stride, int j, int from, int to,
+    int end)
 {
-    if (item >= count)
-        return;
-    const int known = start - before;
-    global const real *a = weights + (size_t)item * (known + count);
-    const sums old = dense_sum(a, delta + before * stride, stride, 0, known);
-    const sums own = dense_sum(a + known, s + start * stride, stride, 0, count);
-    const int i = (start + item) * stride;
-    for (int c = 0; c < K; ++c)
-        RELAX_CORRECT(i + c, old.item[c] + own.item[c]);
+    const int whole = j + (from - j) / 16 * 16;
+    const int8 lane = (int8)(0, 1, 2, 3, 4, 5, 6, 7);
+    real8 low = 0, high = 0;
+    real lower = csr_sum(columns, values, x, stride, j, whole).vector;
+    j = whole < from ? whole : whole + (to - whole) / 16 * 16;
+    for (; j < to && j + 16 <= end; j += max(16, (to - j) / 16 * 16))
+        for (int i = j; i < j + 16; i += 8) {
+            const real8 products = LOAD8(values + i) * gather8(x, stride, columns + i);
+            low += select((real8)(0), products, lane < from - i);
+            high += select((real8)(0), products, lane >= to - i);
+        }
+    for (; j < from; ++j)
+        lower += values[j] * x[columns[j] * stride];
+    const real upper = csr_sum(columns, values, x, stride, max(j, to), end).vector;
+    return (float2)(lower + sum8(low), upper + sum8(high));
 }
+#endif
 
-// A work-group with a row of its own.
-inline void relax_finish_group(
-    int item, int start, int count, int before, int stride,
-    global const real *weights, global const real *x,
-    global real *y, global const real *s, global real *delta, local real *scratch)
+kernel void relax_strips(
+    PLACE, MATRIX, VECTORS, int strips, int all, int block, int inverses, real omega, global const real *weights,
+    volatile global int *arrivals, global real *before)
 {
-    const int me = get_local_id(0), step = get_local_size(0), known = start - before;
-    global const real *a = weights + (size_t)item * (known + count);
-    real sum[K];
-    for (int c = 0; c < K; ++c)
-        sum[c] = 0;
-    dense_add(sum, a, delta + before * stride, stride, me, known, step);
-    dense_add(sum, a + known, s + start * stride, stride, me, count, step);
-    const int i = (start + item) * stride;
-    for (int c = 0; c < K; ++c) {
-        const real total = group_sum(sum[c], scratch);
-        if (me == 0)
-            RELAX_CORRECT(i + c, total);
-    }
-}
-
-kernel void relax_csr(
-    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
-    int offset, real shift, real scale, global const int *pointers, global const int *columns,
-    global const real *values, global const int *middle,
-    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
-    global real *carry)
-{
-    stride = STRIDE(stride);
-    x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
-    if (get_group_id(0) < lead) {
-        relax_finish(
-            get_global_id(0), start, count, before, stride, weights, x, y, s,
-            delta);
-        return;
-    }
-    const int row = begin + get_global_id(0) - lead * get_local_size(0);
-    if (row >= begin + rows)
-        return;
-    real lower[K], upper[K];
-    for (int c = 0; c < K; ++c)
-        lower[c] = upper[c] = 0;
-    csr_add(lower, columns, values, y, stride, pointers[row], middle[row], 1);
-    csr_add(upper, columns, values, x, stride, middle[row], pointers[row + 1], 1);
-    const int i = (first + row) * stride;
-    for (int c = 0; c < K; ++c)
-        RELAX_STORE(i + c, lower[c], upper[c]);
-}
-
-kernel void relax_dense(
-    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
-    int offset, real shift, real scale, int width, global const real *matrix,
-    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
-    global real *carry)
-{
-    stride = STRIDE(stride);
-    x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
-    if (get_group_id(0) < lead) {
-        relax_finish(
-            get_global_id(0), start, count, before, stride, weights, x, y, s,
-            delta);
-        return;
-    }
-    const int row = begin + get_global_id(0) - lead * get_local_size(0);
-    if (row >= begin + rows)
-        return;
-    global const real *a = matrix + (size_t)row * width;
-    real lower[K], upper[K];
-    for (int c = 0; c < K; ++c)
-        lower[c] = upper[c] = 0;
-    dense_add(lower, a, y, stride, 0, start, 1);
-    dense_add(upper, a, x, stride, start, width, 1);
-    const int i = (first + row) * stride;
-    for (int c = 0; c < K; ++c)
-        RELAX_STORE(i + c, lower[c], upper[c]);
-}
-
-kernel void relax_csr_stream(
-    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
-    int offset, real shift, real scale, global const int *pointers, global const int *columns,
-    global const real *values, global const int *middle,
-    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
-    global real *carry)
-{
-    stride = STRIDE(stride);
-    x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
-    if (get_group_id(0) < lead) {
-        relax_finish(
-            get_global_id(0), start, count, before, stride, weights, x, y, s,
-            delta);
-        return;
-    }
-    const int row = begin + get_global_id(0) - lead * get_local_size(0);
-    if (row >= begin + rows)
-        return;
-    const row_sums sum = csr_sums(
-        columns, values, y, x, start, stride, pointers[row], middle[row], pointers[row + 1]);
-    const int i = (first + row) * stride;
-    for (int c = 0; c < K; ++c)
-        RELAX_STORE(i + c, sum.lower.item[c], sum.upper.item[c]);
-}
-
-kernel void relax_dense_stream(
-    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
-    int offset, real shift, real scale, int width, global const real *matrix,
-    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
-    global real *carry)
-{
-    stride = STRIDE(stride);
-    x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
-    if (get_group_id(0) < lead) {
-        relax_finish(
-            get_global_id(0), start, count, before, stride, weights, x, y, s,
-            delta);
-        return;
-    }
-    const int row = begin + get_global_id(0) - lead * get_local_size(0);
-    if (row >= begin + rows)
-        return;
-    global const real *a = matrix + (size_t)row * width;
-    row_sums sum;
-    sum.lower = dense_sum(a, y, stride, 0, start);
-    sum.upper = dense_sum(a, x, stride, start, width);
-    const int i = (first + row) * stride;
-    for (int c = 0; c < K; ++c)
-        RELAX_STORE(i + c, sum.lower.item[c], sum.upper.item[c]);
-}
-
-kernel void relax_csr_group(
-    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
-    int offset, real shift, real scale, global const int *pointers, global const int *columns,
-    global const real *values, global const int *middle,
-    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
-    global real *carry, local real *scratch)
-{
-    stride = STRIDE(stride);
-    x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
-    if (get_group_id(0) < lead) {
-        relax_finish_group(
-            get_group_id(0), start, count, before, stride, weights, x, y, s,
-            delta, scratch);
-        return;
-    }
-    const int row = begin + get_group_id(0) - lead;  // one group a row exactly: no row is beyond the last
-    real lower[K], upper[K];
-    for (int c = 0; c < K; ++c)
-        lower[c] = upper[c] = 0;
-    const int me = get_local_id(0), step = get_local_size(0), split = middle[row];
-    csr_add(lower, columns, values, y, stride, pointers[row] + me, split, step);
-    csr_add(upper, columns, values, x, stride, split + me, pointers[row + 1], step);
-    const int i = (first + row) * stride;
-    for (int c = 0; c < K; ++c) {
-        const real below = group_sum(lower[c], scratch), beyond = group_sum(upper[c], scratch);
-        if (me == 0)
-            RELAX_STORE(i + c, below, beyond);
-    }
-}
-
-kernel void relax_dense_group(
-    int rows, int begin, int first, int lead, int start, int count, int before, int stride,
-    int offset, real shift, real scale, int width, global const real *matrix,
-    global const real *weights, global const real *x, global real *y, global const real *b, global real *s, global real *delta, global real *r,
-    global real *carry, local real *scratch)
-{
-    stride = STRIDE(stride);
-    x += offset, y += offset, b += offset, s += offset, delta += offset, r += offset, carry += offset;
-    if (get_group_id(0) < lead) {
-        relax_finish_group(
-            get_group_id(0), start, count, before, stride, weights, x, y, s,
-            delta, scratch);
-        return;
-    }
-    const int row = begin + get_group_id(0) - lead;  // one group a row exactly: no row is beyond the last
-    global const real *a = matrix + (size_t)row * width;
-    real lower[K], upper[K];
-    for (int c = 0; c < K; ++c)
-        lower[c] = upper[c] = 0;
-    const int me = get_local_id(0), step = get_local_size(0);
-    dense_add(lower, a, y, stride, me, start, step);
-    dense_add(upper, a, x, stride, start + me, width, step);
-    const int i = (first + row) * stride;
-    for (int c = 0; c < K; ++c) {
-        const real below = group_sum(lower[c], scratch), beyond = group_sum(upper[c], scratch);
-        if (me == 0)
-            RELAX_STORE(i + c, below, beyond);
-    }
-}
-
-// `places` are first the rows of A, those `chained` ones with entries before the others, and `weights` 1 / D_ii there.
-// From starts[p] on follow the columns of row p of these, and its entries over the D of their columns. In s, rows
-// become D / omega times their correction, which those without entries are from the start.
-kernel void relax_substitute(
-    int count, int chained, int stride, int offset, real omega, global const int *starts,
-    global const int *places, global const real *weights, global real *x, global real *s)
-{
-    stride = STRIDE(stride);
-    x += offset, s += offset;
-    const int other = chained + (int)get_global_id(0) - (int)get_local_size(0);  // not for the first group
-    if (get_group_id(0) > 0 && other < count)
-        for (int c = 0, i = places[other] * stride; c < K; ++c)
-            x[i + c] += omega * weights[other] * s[i + c];
-    if (get_global_id(0) > 0)
-        return;
-    for (int row = 0; row < chained; ++row) {
-        const int i = places[row] * stride, end = starts[row + 1];
-        real sum[K];
-        for (int c = 0; c < K; ++c)
-            sum[c] = 0;
-        for (int j = starts[row]; j < end; ++j)
-            for (int c = 0; c < K; ++c)
-                sum[c] = weights[j] * s[places[j] * stride + c] + sum[c];
-        for (int c = 0; c < K; ++c) {
-            s[i + c] -= omega * sum[c];
-            x[i + c] += omega * weights[row] * s[i + c];
+    OFFSET;
+    before += offset;
+    int strip = atomic_inc(arrivals);
+    int top = (begin / block + strip) * block;  // first row of the block
+    for (int i = max(begin, top); i < min(end, top + block); ++i) {
+        const int row = i - first;
+        sums lower, upper;
+        AROUND(lower, upper, row, WINDOW_BEGIN(row, start), WINDOW_END(row, inverses ? top : i));
+        for (int c = 0, j = i * stride; c < K; ++c, ++j) {
+            s[j] = shift * x[j] + scale * upper.item[c];
+            before[j] = x[j];
+            r[j] = carry[j] - s[j];
+            carry[j] = b[j] - scale * lower.item[c];
         }
     }
+    for (; strip < strips; ++strip, top += block) {
+        mem_fence(CLK_GLOBAL_MEM_FENCE);
+        if (strip > 0 && atomic_inc(arrivals + strip) == 0)
+            return;  // its sums or the strip before it are at work: who ends later goes on here
+        mem_fence(CLK_GLOBAL_MEM_FENCE);
+        if (strip > 0)
+            arrivals[strip] = 0;
+        for (int i = max(begin, top); i < min(end, top + block); ++i) {
+            const int row = i - first;
+            const sums lower = ROW_SUM(row, WINDOW_BEGIN(row, start), WINDOW_END(row, inverses ? top : i));
+            for (int c = 0, j = i * stride; c < K; ++c, ++j) {
+                carry[j] -= scale * lower.item[c];
+                s[j] = carry[j] - s[j];
+                if (!inverses)
+                    x[j] += omega * weights[i] * s[j];
+            }
+        }
+        const int bottom = min(top + block, all);
+        for (int i = top; inverses && bottom <= end && i < bottom; ++i) {  // a block may end in the next slab
+            const sums delta = dense_sum(weights + (size_t)i * block, s + top * stride, stride, 0, bottom - top);
+            for (int c = 0; c < K; ++c)
+                x[i * stride + c] += delta.item[c];
+        }
+    }
+    arrivals[0] = 0;
+}
+
+kernel void relax_rows(PLACE, MATRIX, VECTORS, local real *scratch)
+{
+    OFFSET;
+    const int row = begin - first + get_group_id(0);  // one group a row exactly: no row is beyond the last
+    real sum[2 * K] = {0};
+    ROW_ADD(sum, row, ROW_BEGIN(row), WINDOW_END(row, start));
+    ROW_ADD(sum + K, row, WINDOW_END(row, start), ROW_END(row));
+    group_sums(sum, scratch);
+    group_sums(sum + K, scratch + K * get_local_size(0));  // the tree of the other sums may be at work
+    for (int c = 0, j = (first + row) * stride; get_local_id(0) == 0 && c < K; ++c, ++j) {
+        const real from_x = shift * x[j] + scale * sum[K + c];
+        r[j] = carry[j] - from_x;
+        carry[j] = b[j] - scale * sum[c];
+        s[j] = carry[j] - from_x;
+    }
+}
+
+kernel void relax_correct(
+    int start, int count, int block, int stride, int offset, global const real *weights, global real *x,
+    global real *before, global const real *s, local real *scratch)
+{
+    stride = STRIDE(stride);
+    const int i = start + get_group_id(0);
+    real sum[K] = {0};
+    dense_add(
+        sum, weights + (size_t)i * block, s + start * stride + offset, stride, get_local_id(0), count,
+        get_local_size(0));
+    group_sums(sum, scratch);
+    for (int c = 0, j = i * stride + offset; get_local_id(0) == 0 && c < K; ++c, ++j) {
+        before[j] = x[j];
+        x[j] += sum[c];
+    }
+}
+
+kernel void relax_windows(
+    int rows, int first, int block, int panel, int inverses, global const int *pointers,
+    global const int *columns, global int *windows)
+{
+    const int row = get_global_id(0), i = first + row;
+    if (row >= rows)
+        return;
+    const int begin = pointers[row], end = pointers[row + 1];
+    windows[2 * row] = entry_from(columns, begin, end, i - i % panel);
+    windows[2 * row + 1] = entry_from(columns, begin, end, inverses ? i - i % block : i);
 }

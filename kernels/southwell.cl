@@ -1,73 +1,79 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// One step of Southwell's relaxation on S = shift I + scale M: the largest residual of each part of the picture
-// is made zero, and all residuals learn of it through the columns of S.
+// One step of Southwell's relaxation on S = shift I + scale M: in each part of the picture the largest residual is
+// made zero, and the next step tells all residuals of it through the columns of S.
 //
-//   southwell_pick   one work-item a part and right-hand side: i = argmax |r_i|, delta = r_i / S_ii, x_i += delta
-//   southwell_csr    r -= scale M[:, i] delta, M^T in sparse rows; one work-item a stretch of r, which looks up
-//                    where the stretch begins in each column: no two items write one value, so no atomics
-//   southwell_dense  the same of a dense slab; one work-item a row
+//     r -= scale M[:, i] delta for the rows i picked before;   i = argmax |r_i|, delta_i = r_i / S_ii, x_i += delta_i
 //
-// No defines. x, r, picked and delta are row-major with k columns; parts are equal to one row.
+// southwell_step  a work-group has a range of rows, in which it brings r up to date and then picks a row in each of
+//                 its parts, the rows of `pending` picks before; with `picks` 0 that is all it does.
+//
+// Optional define: DENSE; else the slab is one of M^T in sparse rows, the columns of M, and items look up where their
+// stretch of r begins in each: no two write one value, so no atomics.
+// Layout: x, r, picked and delta are row-major with k columns; parts are equal to one row, and those of a group follow
+// each other. largest and places hold a number for each item of a group.
 
 #include "common/real.h"
+#include "common/search.h"
 
-kernel void southwell_pick(
-    int rows, int parts, int k, real shift, global const real *inverse, global real *x, global real *r,
-    global int *picked, global real *delta)
-{
-    const int part = get_global_id(0), c = get_global_id(1);
-    if (part >= parts)
-        return;
-    const int start = (int)((long)part * rows / parts), stop = (int)((long)(part + 1) * rows / parts);
-    int largest = start;
-    for (int i = start + 1; i < stop; ++i)
-        if (fabs(r[i * k + c]) > fabs(r[largest * k + c]))
-            largest = i;
-    const real step = inverse[largest] * r[largest * k + c];
-    x[largest * k + c] += step;
-    r[largest * k + c] -= shift * step;
-    picked[part * k + c] = largest;
-    delta[part * k + c] = step;
-}
+#define ROW_OF(part, parts, n) ((int)((long)(part) * (n) / (parts)))
 
-// Rows first .. first + rows of M^T are the columns of M in this slab.
-kernel void southwell_csr(
-    int stretches, int size, int rows, int first, int parts, int k, real scale, global const int *pointers,
-    global const int *columns, global const real *values, global const int *picked, global const real *delta,
-    global real *r)
+kernel void southwell_step(
+    int n, int parts, int pending, int picks, int k, real shift, real scale, int rows, int first, int width,
+    global const int *pointers, global const int *columns, global const real *values, global const real *inverse,
+    global real *x, global real *r, global const int *picked, global const real *delta, global int *next_picked,
+    global real *next_delta, local real *largest, local int *places)
 {
-    const int stretch = get_global_id(0), c = get_global_id(1);
-    if (stretch >= stretches)
-        return;
-    for (int part = 0; part < parts; ++part) {
+    const int me = get_local_id(0), items = get_local_size(0), c = get_global_id(1), group = get_group_id(0);
+    const int part_begin = ROW_OF(group, get_num_groups(0), parts);
+    const int part_end = ROW_OF(group + 1, get_num_groups(0), parts);
+    const int begin = ROW_OF(part_begin, parts, n), end = ROW_OF(part_end, parts, n);
+#ifdef DENSE
+    const int stop = min(end, first + rows);
+    for (int i = max(begin, first) + me; i < stop; i += items) {
+        global const real *a = values + (size_t)(i - first) * width;
+        real sum = 0;
+        for (int part = 0; part < pending; ++part)
+            sum = a[picked[part * k + c]] * delta[part * k + c] + sum;
+        r[i * k + c] -= scale * sum;
+    }
+#else
+    const int from = begin + ROW_OF(me, items, end - begin), to = begin + ROW_OF(me + 1, items, end - begin);
+    for (int part = 0; part < pending; ++part) {
         const int row = picked[part * k + c] - first;
         if (row < 0 || row >= rows)
             continue;
         const real step = scale * delta[part * k + c];
-        const int end = pointers[row + 1];
-        int low = pointers[row], high = end;  // the first entry at or after the start of the stretch
-        while (low < high) {
-            const int half_way = low + (high - low) / 2;
-            if (columns[half_way] < stretch * size)
-                low = half_way + 1;
-            else
-                high = half_way;
-        }
-        for (; low < end && columns[low] < (stretch + 1) * size; ++low)
-            r[columns[low] * k + c] -= values[low] * step;
+        int j = entry_from(columns, pointers[row], pointers[row + 1], from);
+        for (; j < pointers[row + 1] && columns[j] < to; ++j)
+            r[columns[j] * k + c] -= values[j] * step;
     }
-}
-
-kernel void southwell_dense(
-    int rows, int first, int parts, int k, real scale, int width, global const real *matrix,
-    global const int *picked, global const real *delta, global real *r)
-{
-    const int row = get_global_id(0), c = get_global_id(1);
-    if (row >= rows)
-        return;
-    global const real *a = matrix + (size_t)row * width;
-    real sum = 0;
-    for (int part = 0; part < parts; ++part)
-        sum = a[picked[part * k + c]] * delta[part * k + c] + sum;
-    r[(first + row) * k + c] -= scale * sum;
+#endif
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    for (int part = picks ? part_begin : part_end; part < part_end; ++part) {
+        const int part_stop = ROW_OF(part + 1, parts, n);
+        int place = ROW_OF(part, parts, n);
+        for (int i = place + me; i < part_stop; i += items)
+            if (fabs(r[i * k + c]) > fabs(r[place * k + c]))
+                place = i;
+        largest[me] = fabs(r[place * k + c]);
+        places[me] = place;
+        for (int left = items; left > 1; left = (left + 1) / 2) {  // a tree; of equal ones the first row
+            const int other = me + (left + 1) / 2;
+            barrier(CLK_LOCAL_MEM_FENCE);
+            if (other < left
+                && (largest[other] > largest[me] || (largest[other] == largest[me] && places[other] < places[me]))) {
+                largest[me] = largest[other];
+                places[me] = places[other];
+            }
+        }
+        if (me == 0) {
+            const int i = places[0] * k + c;
+            const real step = inverse[places[0]] * r[i];
+            x[i] += step;
+            r[i] -= shift * step;
+            next_picked[part * k + c] = places[0];
+            next_delta[part * k + c] = step;
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
 }

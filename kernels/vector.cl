@@ -3,9 +3,13 @@
 //
 // Layout: `count` reals; k right-hand sides of n pixels are stored row-major, so that count = n * k and
 // column c is every k-th value from c on. Elementwise kernels do not care: one work-item an element.
+//
+// ADJACENT: 1 on CPUs, where it may be left out, and 0 on GPUs.
 
-#include "common/real.h"
-#include "common/reduce.h"
+#ifndef ADJACENT
+#define ADJACENT 1
+#endif
+#include "common/columns.h"
 
 kernel void vector_fill(int count, real value, global real *out)
 {
@@ -22,15 +26,14 @@ kernel void vector_axpby(int count, real a, global const real *x, real b, global
         out[i] = a * x[i] + b * y[i];
 }
 
-// out = a_c x + b_c y with coefficients for each column c: a in ab[0 .. k - 1], b in ab[k .. 2 k - 1]. An
-// operand whose coefficient is 0 does not count, whatever it holds. `out` may be x or y.
+// out = a_c x + b_c y in each column c, with coefficients (a, b) (2, k). An operand whose coefficient is 0 does not
+// count, whatever it holds. `out` may be x or y.
 kernel void vector_axpby_columns(
-    int count, int k, global const real *ab, global const real *x, global const real *y, global real *out)
+    int count, int k, global const real *coefficients, global const real *x, global const real *y, global real *out)
 {
     const int i = get_global_id(0);
     if (i < count) {
-        const real a = ab[i % k];
-        const real b = ab[k + i % k];
+        const real a = coefficients[i % k], b = coefficients[k + i % k];
         out[i] = (a == 0 ? 0 : a * x[i]) + (b == 0 ? 0 : b * y[i]);
     }
 }
@@ -43,55 +46,52 @@ kernel void vector_scale_rows(int count, int k, global const real *d, global con
         out[i] = d[i / k] * x[i];
 }
 
-// The sum of x y for each column. Group (g, c) sums the rows of column c that belong to slice g of
-// get_num_groups(0); a second launch with one slice, `rows` partial sums and ones == 1 (y is not read)
-// adds up the slices, where there are several. Launches of a fixed shape: the result is the same at every call.
+// Sums of x y over the rows of each column, to sums (groups, k) from `first` on; items as common/columns.h has them.
 kernel void vector_dot(
-    int rows, int k, int ones, global const real *x, global const real *y, global real *out, int first,
-    local real *scratch)
+    int rows, int k, global const real *x, global const real *y, global real *sums, int first, local real *scratch)
 {
-    const int column = get_group_id(1);
-    const int slice = rows / (int)get_num_groups(0) + 1; // of rows side by side, which caches like
-    const int begin = get_group_id(0) * slice;
-    const int end = begin < rows - slice ? begin + slice : rows;
+    const share s = columns_share(rows, k);
+    columns_sum(dot_share(x, y, 0, s), sums + first + get_group_id(0) * k, 0, s, scratch);
+}
+
+#define LOAD1(a) (*(a))
+#define STORE1(v, a) (*(a) = (v))
+#define STEP(number, LOAD, STORE, i)                                                                \
+    {                                                                                               \
+        const number direction = LOAD(d + i), residual = LOAD(r + i) - LOAD(p + i);                 \
+        STORE(LOAD(x + i) + direction, x + i);                                                      \
+        STORE(residual, r + i);                                                                     \
+        STORE(keep * direction + gain * residual, d + i);                                           \
+    }
+
+// One step of an iteration with p = S d: x += d, r -= p, d = keep d + gain r. The squares of r, added up for each
+// column, go to squares (groups, k) from `first` on. Items with the same neighbouring rows share their values, which
+// are neighbours, eight at a time.
+kernel void vector_step(
+    int rows, int k, real keep, real gain, int first, global const real *p, global real *x, global real *r,
+    global real *d, global real *squares, local real *scratch)
+{
+    const share s = columns_share(rows, k);
+    const int width = ADJACENT && s.width == k ? 8 : 1;
+    for (int i = width == 8 ? s.row * k + 8 * s.column : s.first; max(i, s.first) < s.end; i += width * s.step)
+        if (width == 8 && i + 8 <= s.end)
+            STEP(real8, LOAD8, STORE8, i)
+        else
+            for (int j = i; j < min(i + width, s.end); ++j)
+                STEP(real, LOAD1, STORE1, j)
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    columns_sum(dot_share(r, r, 0, s), squares + first + get_group_id(0) * k, 0, s, scratch);
+}
+
+// out (slots, k) from `first` on = sums (slots, groups, k) added up over the groups. Slot get_group_id(1).
+kernel void vector_sums(
+    int groups, int k, global const real *sums, global real *out, int first, local real *scratch)
+{
+    const share s = columns_share(groups, k);
+    const int slot = get_group_id(1);
     real sum = 0;
-    for (int row = begin + get_local_id(0); row < end; row += get_local_size(0)) {
-        const int i = row * k + column;
-        sum += ones ? x[i] : x[i] * y[i];
-    }
-    sum = group_sum(sum, scratch);
-    if (get_local_id(0) == 0)
-        out[first + get_group_id(0) * k + column] = sum;
-}
-
-// The largest weights[c] squares[c] of k columns, NaN where one of them is.
-inline real largest(int k, global const real *weights, global const real *squares)
-{
-    real worst = 0;
-    for (int c = 0; c < k; c++) {
-        const real value = weights[c] * squares[c];
-        worst = value > worst || isnan(value) ? value : worst;
-    }
-    return worst;
-}
-
-// best = x where row `slot` of squares (slot + 1, k), weighted as above, is at most `lowest` and no row before
-// it is lower: the best iterate stays, and the host need not know which it was. Nothing counts after a row
-// that is not finite. Each item copies every get_global_size(0)-th value.
-kernel void vector_keep(
-    int count, int k, int slot, real lowest, global const real *weights, global const real *squares,
-    global const real *x, global real *best)
-{
-    for (int s = 0; s < slot; s++) {
-        const real before = largest(k, weights, squares + s * k);
-        if (!isfinite(before))
-            return;
-        lowest = before < lowest ? before : lowest;
-    }
-    if (!(largest(k, weights, squares + slot * k) <= lowest))
-        return;
-    for (int i = get_global_id(0); i < count; i += get_global_size(0))
-        best[i] = x[i];
+    EACH_VALUE(i, row) sum += sums[slot * groups * k + i];
+    columns_sum(sum, out + first + slot * k, 0, s, scratch);
 }
 
 // out = a b + c: the STREAM triad, the yardstick of bench/.

@@ -8,16 +8,12 @@
 // Ray k runs from point k of one patch to point partner(k) of the other, and partner(partner(k)) = k: both
 // directions have the same rays, and the same result to the bit.
 //
-// Required defines: LANES: 1 or 8; BLOCKS, see common/blocks.h.
+// Required defines: LANES and BLOCKS, see common/spots.h.
 // Layout: starts and ends hold the points of the patches, ends in the order of their partners: for each ray
 // three rows (x, y, z) of `pitch` reals, a multiple of LANES, one column a patch; normals is three such rows.
 // Lengths are parts of the scene's size.
 
-#include "common/blocks.h"
 #include "common/spots.h"
-
-// Heights above a plane below this are rounding errors.
-#define GRAZING 1e-6f
 
 // The share of the rays of patch i to patches j .. j + LANES - 1.
 INLINE stretch seen(
@@ -29,13 +25,13 @@ INLINE stretch seen(
     stretch open = 0, faced = 0;
     for (int k = 0; k < rays; ++k) {
         const spots p = spread_spots(starts, pitch, k, i), q = load_spots(ends, pitch, k, j);
-        const spots d = {q.x - p.x, q.y - p.y, q.z - p.z};
+        const spots d = between(p, q);
         const flags facing = (dot3(d, p_normal) > GRAZING) & (-dot3(d, q_normal) > GRAZING);
         if (!ANY(facing))
             continue;
         const stretch counted = facing ? one : none;
         faced += counted;
-        open += ltcl_blocked(p, q, blocks) ? none : counted;
+        open += blocked(p, q, blocks) ? none : counted;
     }
     return faced > 0 ? open / faced : one;
 }

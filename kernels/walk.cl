@@ -7,130 +7,100 @@
 //
 // A step goes from i to j with probability |R_ij| / |R_i| and multiplies the weight by sign(R_ij) |R_i|, so that
 // the products of eq. 26 cancel. After step k the walk goes on with probability steps[k].y / 2^22; what it then
-// is worth is weight * b_j * steps[k].x, where steps[k].x holds c_k over the probability to be scored there:
-//   ENDPOINT     scored where it ends, the paper's eq. 26
-//   COLLISION    scored at every step
-// Rows without entries end a walk.
+// is worth is weight * b_j * steps[k].x, where steps[k].x holds c_k over the probability to be scored there: at
+// every step (COLLISION) or where the walk ends, the paper's eq. 26. Rows without entries end a walk.
 //
-// The R of several colour channels share a walk: it steps by a table of entries that any of them has, and the
-// entry t of its row leads to links[t], a column and what the weight of each channel is multiplied by there.
+// LINKED walks step by a table of other probabilities: entry t of its row leads to links[t], a column and what
+// the weight of each channel is multiplied by there. So colour channels share a walk.
 //
 // A work-item takes WALKS chunks of CHUNK samples of one pixel, one walk of each at a time: their loads do not
 // wait for each other. Samples of a chunk are summed in order, with the rounding errors of the sums kept
-// (Knuth's two-sum). So the result does not depend on WALKS, nor on how chunks are spread over work-items.
-// Arithmetic is + and * in this order, without contraction: the same bits on every device, as long as nothing
-// falls below 2^-126, where devices round differently.
+// (Knuth's two-sum). So no bit depends on WALKS, nor on how chunks are spread over work-items. Arithmetic is + and *
+// in this order, without contraction: the same bits on every device, as long as nothing falls below 2^-126.
 //
-// Required defines: TABLE, see common/table.h; CHUNK; WALKS; K, the right-hand sides of one launch;
-// ESTIMATOR: 0 ENDPOINT, 1 COLLISION (walk_columns: ENDPOINT); CHANNELS: 1, or 3 with links (walk_rows only).
-// Counters of random numbers: pixel, sample, step / 2, stream; a step takes half a block.
-// Layout: chunk c of a pixel holds samples first + c CHUNK up to `end`; `chunks` chunks a pixel. b is row-major
-// with `stride` columns, of which offset .. offset + K - 1 are taken, the first of channel 0, the next of channel
-// 1 and so on. Out of walk_rows: (units, K) of (sum, its rounding, sum of squares, its rounding). Without links
-// `links` is not read.
-
-#include "common/random.h"
-#include "common/real.h"
-#include "common/table.h"
+// Random numbers have no state: a block of Philox is a function of its counter, here pixel, sample, step / 2 and
+// stream, and of the seed; a step takes half a block.
+// Layout: tables as in common/table.h. Chunk c of a pixel holds samples first + c CHUNK up to `end`; `chunks`
+// chunks a pixel. b is row-major with `stride` columns, of which offset .. offset + K - 1 are taken, the first
+// of channel 0, the next of channel 1 and so on. Out of walk_rows: (units, K) of (sum, its rounding, sum of
+// squares, its rounding).
 
 #pragma OPENCL FP_CONTRACT OFF
 
-#ifndef CHUNK
-#error "walk.cl needs -DCHUNK=<samples that are summed on the device>"
+#if !defined(CHUNK) || !defined(WALKS) || !defined(COLLISION) || !defined(LINKED) || !defined(PREFETCH) \
+    || !defined(CHANNELS) || K % CHANNELS
+#error "walk.cl needs -DCHUNK, -DWALKS, -DK=<columns of b>, -DCHANNELS=<1 or 3>; 0 or 1: -DCOLLISION -DLINKED -DPREFETCH"
 #endif
-#ifndef WALKS
-#error "walk.cl needs -DWALKS=<walks of an item at a time>"
-#endif
-#ifndef K
-#error "walk.cl needs -DK=<right-hand sides of one launch>"
-#endif
-#ifndef ESTIMATOR
-#error "walk.cl needs -DESTIMATOR=<0 end-point, 1 collision>"
-#endif
-#ifndef CHANNELS
-#error "walk.cl needs -DCHANNELS=<1, or 3 that share walks>"
-#endif
-#if K % CHANNELS
-#error "walk.cl needs a K that CHANNELS divides"
-#endif
-#define ENDPOINT 0
-#define COLLISION 1
 
 #define GO_ON_BITS 22
 #define SLOT_BITS 42  // the rest of 64
 
-// Walks that set off together: what they load comes while those of the next group are at work.
-#define GROUP (WALKS % 8 ? WALKS : 8)
-#define LANES (WALKS % 4 ? 1 : 4)  // whose random numbers are made side by side
+#if WALKS % 4 == 0  // random numbers of four walks are made side by side
+typedef ulong4 words;
+#define LANES 4
+#define LOAD_WORDS(p) convert_ulong4(vload4(0, p))
+#define STORE_WORDS(v, p) vstore4(v, 0, p)
+#else
+typedef ulong words;
+#define LANES 1
+#define LOAD_WORDS(p) ((ulong) * (p))
+#define STORE_WORDS(v, p) (*(p) = (v))
+#endif
+
+#include "common/real.h"
+#include "common/table.h"
 
 // Where an item has several walks, what one will load is asked for while the others are at work: a third
-// less time a step. The language's own prefetch() does nothing in PoCL.
-#if defined(__clang__) && WALKS > 1
+// less time a step. The language's own prefetch() does nothing in PoCL; Oclgrind does not know this one.
+#if PREFETCH && defined(__clang__)
 #define FETCH(p) __builtin_prefetch((const void *)(size_t)(p))
 #else
 #define FETCH(p)
 #endif
 
-#if TABLE == TABLE_CDF
-// The first entry whose cumulative sum is above a uniform part of the total.
-inline ulong draw_entry(global const ulong *entries, uint n, ulong word)
+// Philox4x32-10 of Salmon, Moraes, Dror and Shaw, Parallel Random Numbers: As Easy as 1, 2, 3 (SC 2011): the block
+// of counter (x, y, z, w) in its place, each word in the lower half of a lane.
+static inline void philox(words *x, words *y, words *z, words *w, uint key, uint other_key)
 {
-    const ulong part = mul_hi(word & ~(((ulong)1 << GO_ON_BITS) - 1), entries[n - 1] >> TARGET_BITS);
-    uint low = 0, high = n - 1;
-    while (low < high) {
-        const uint half_way = low + (high - low) / 2;
-        if (entries[half_way] >> TARGET_BITS <= part)
-            low = half_way + 1;
-        else
-            high = half_way;
+    for (uint round = 0; round < 10; ++round) {
+        const words a = 0xD2511F53ul * *x, b = 0xCD9E8D57ul * *z;
+        *x = (b >> 32) ^ *y ^ (ulong)(key + round * 0x9E3779B9u);
+        *z = (a >> 32) ^ *w ^ (ulong)(other_key + round * 0xBB67AE85u);
+        *y = b & 0xfffffffful;
+        *w = a & 0xfffffffful;
     }
-    return entries[low];
 }
-#endif
 
-inline ulong first_entry(uint4 record)
+static inline ulong first_entry(uint4 record)
 {
     return (ulong)record.y << 32 | record.x;
 }
 
 // A uniform choice of the entries of a row, by the upper bits of a word.
-inline ulong slot(uint4 record, ulong word)
+static inline ulong slot(uint4 record, ulong word)
 {
-    return (word >> GO_ON_BITS) * record.z >> SLOT_BITS;
+    return first_entry(record) + ((word >> GO_ON_BITS) * record.z >> SLOT_BITS);
 }
 
-// One entry of the row with this record: its column and sign, and what the weight is multiplied by.
-inline uint draw(uint4 record, global const ulong *entries, ulong word, real *factor)
+// The column and sign of one entry of the row with this record.
+static inline uint draw(uint4 record, global const ulong *entries, ulong word)
 {
-    entries += first_entry(record);
-#if TABLE == TABLE_ALIAS
     const ulong entry = entries[slot(record, word)], place = (word >> GO_ON_BITS) * record.z;
     const uint fraction = (uint)(place >> (SLOT_BITS - THRESHOLD_BITS)) & ((1u << THRESHOLD_BITS) - 1);
-    const uint threshold = (uint)(entry >> (2 * TARGET_BITS));
-    *factor = as_float(record.w);
-    return (uint)(fraction < threshold ? entry >> TARGET_BITS : entry) & TARGET_MASK;
-#elif TABLE == TABLE_CDF
-    *factor = as_float(record.w);
-    return record.z ? (uint)draw_entry(entries, record.z, word) & TARGET_MASK : 0;
-#else
-    const ulong entry = entries[slot(record, word)];
-    *factor = (real)record.z * fabs(as_float((uint)(entry >> 32)));
-    return ((uint)entry << 1) | (uint)(entry >> 63);
-#endif
+    return (uint)(fraction < (uint)(entry >> (2 * TARGET_BITS)) ? entry >> TARGET_BITS : entry) & TARGET_MASK;
 }
 
-// sum + low += value
-inline void two_sum(real value, real *sum, real *low)
+// sum + its rounding += value, both kept side by side
+static inline void two_sum(real value, real *sum)
 {
-    const real total = *sum + value;
-    const real added = total - *sum;
-    *low += (*sum - (total - added)) + (value - added);
-    *sum = total;
+    const real total = sum[0] + value, added = total - sum[0];
+    sum[1] += (sum[0] - (total - added)) + (value - added);
+    sum[0] = total;
 }
 
 // The walks of a work-item, side by side.
 typedef struct {
-    uint pixel[WALKS], start[WALKS], next[WALKS], stop[WALKS];  // samples start .. stop, `next` comes next
+    uint pixel[WALKS], next[WALKS], stop[WALKS];  // sample `next` comes next, up to `stop`
     uint row[WALKS], step[WALKS];
     int alive[WALKS];
     real weight[CHANNELS][WALKS];
@@ -140,46 +110,28 @@ typedef struct {
     real factor[CHANNELS][WALKS];
 } walks;
 
-inline void set_out(walks *walk, int units, int chunks, uint first, uint end, global const uint *pixels)
+static inline void set_out(walks *walk, int units, int chunks, uint first, uint end, global const uint *pixels)
 {
     for (int w = 0; w < WALKS; ++w) {
         const int unit = get_global_id(0) * WALKS + w;
         const int known = unit < units;
-        walk->pixel[w] = known ? pixels[unit / chunks] : 0;
-        walk->start[w] = walk->next[w] = first + (uint)(known ? unit % chunks : 0) * CHUNK;
-        walk->stop[w] = known ? walk->start[w] + min(end - walk->start[w], (uint)CHUNK) : walk->start[w];
-        walk->row[w] = walk->pixel[w];
-        walk->step[w] = 0;
-        walk->alive[w] = 0;
+        walk->row[w] = walk->pixel[w] = known ? pixels[unit / chunks] : 0;
+        walk->next[w] = first + (uint)(known ? unit % chunks : 0) * CHUNK;
+        walk->stop[w] = known ? walk->next[w] + min(end - walk->next[w], (uint)CHUNK) : walk->next[w];
+        walk->step[w] = walk->alive[w] = 0;
         for (int c = 0; c < CHANNELS; ++c)
             walk->weight[c][w] = 0;
     }
 }
 
-// The words of the next step of walks w .. w + LANES.
-inline void draw_words(walks *walk, int w, ulong seed, uint stream)
-{
-#if LANES == 4
-    const ulong4 step = convert_ulong4(vload4(0, walk->step + w));
-    ulong4 x = convert_ulong4(vload4(0, walk->pixel + w)), y = convert_ulong4(vload4(0, walk->next + w) - 1);
-    ulong4 z = step / 2, other = stream;
-    philox4(&x, &y, &z, &other, (uint)seed, (uint)(seed >> 32));
-    vstore4(select(y << 32 | x, other << 32 | z, step << 63), 0, walk->word + w);
-#else
-    uint x = walk->pixel[w], y = walk->next[w] - 1, z = walk->step[w] / 2, other = stream;
-    philox(&x, &y, &z, &other, (uint)seed, (uint)(seed >> 32));
-    walk->word[w] = walk->step[w] & 1 ? (ulong)other << 32 | z : (ulong)y << 32 | x;
-#endif
-}
-
-// Prepare one step of the walks begin .. begin + GROUP: start the next samples where walks have ended, draw the words of
-// the step and ask for the table entries that it will take. Returns whether any walk is under way. Walks that
-// have ended take the step too, from their start, and nobody looks.
-inline int set_off(
-    walks *walk, int begin, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries)
+// Prepare one step of all walks: start the next samples where walks have ended, draw the words of the step and
+// ask for the table entries that it will take. Returns whether any walk is under way. Walks that have ended
+// take the step too, from their start, and nobody looks.
+static inline int set_off(
+    walks *walk, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries)
 {
     int busy = 0;
-    for (int w = begin; w < begin + GROUP; ++w) {
+    for (int w = 0; w < WALKS; ++w) {
         const int starts = !walk->alive[w] && walk->next[w] < walk->stop[w];
         walk->next[w] += starts;
         walk->alive[w] |= starts;
@@ -188,53 +140,40 @@ inline int set_off(
             walk->weight[c][w] = starts ? 1 : walk->weight[c][w];
         busy |= walk->alive[w];
     }
-    for (int w = begin; w < begin + GROUP; w += LANES)
-        draw_words(walk, w, seed, stream);
-    for (int w = begin; w < begin + GROUP; ++w) {
+    for (int w = 0; w < WALKS; w += LANES) {
+        const words step = LOAD_WORDS(walk->step + w);
+        words x = LOAD_WORDS(walk->pixel + w), y = LOAD_WORDS(walk->next + w) - 1, z = step / 2, other = stream;
+        philox(&x, &y, &z, &other, (uint)seed, (uint)(seed >> 32));
+        STORE_WORDS(select(y << 32 | x, other << 32 | z, step << 63), walk->word + w);
+    }
+    for (int w = 0; w < WALKS; ++w) {
         walk->record[w] = rows[walk->row[w]];
-        FETCH(entries + first_entry(walk->record[w]) + slot(walk->record[w], walk->word[w]));
+        FETCH(entries + slot(walk->record[w], walk->word[w]));
     }
     return busy;
 }
 
-inline int set_off_all(
-    walks *walk, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries)
+// The columns and signs that the walks step to, and what weights are multiplied by, 0 where the row is empty.
+// `links` are read where LINKED only; `b` may be 0.
+static inline void draw_targets(
+    walks *walk, global const uint4 *rows, global const ulong *entries, global const uint4 *links,
+    global const real *b, int stride)
 {
-    int busy = 0;
-    for (int begin = 0; begin < WALKS; begin += GROUP)
-        busy |= set_off(walk, begin, seed, stream, rows, entries);
-    return busy;
-}
-
-#if CHANNELS > 1
-// Replace the entries that walks have drawn by what they are linked to.
-inline void follow(walks *walk, global const uint4 *links)
-{
+    for (int w = 0; w < WALKS; ++w) {
+        walk->target[w] = draw(walk->record[w], entries, walk->word[w]);
+        walk->factor[0][w] = walk->record[w].z ? as_float(walk->record[w].w) : 0;
+    }
+#if LINKED
     for (int w = 0; w < WALKS; ++w)
         FETCH(links + first_entry(walk->record[w]) + (walk->target[w] >> 1));
     for (int w = 0; w < WALKS; ++w) {
         const uint4 record = walk->record[w];
         const uint4 link = record.z ? links[first_entry(record) + (walk->target[w] >> 1)] : (uint4)(0);
+        const real factors[3] = {as_float(link.y), as_float(link.z), as_float(link.w)};
         walk->target[w] = link.x << 1;
-        walk->factor[0][w] = as_float(link.y);
-        walk->factor[1][w] = as_float(link.z);
-        walk->factor[2][w] = as_float(link.w);
+        for (int c = 0; c < CHANNELS; ++c)
+            walk->factor[c][w] = factors[c];
     }
-}
-#endif
-
-// The columns and signs that the walks step to, and what weights are multiplied by, 0 where the row is empty.
-// `b` may be 0.
-inline void draw_targets(
-    walks *walk, global const uint4 *rows, global const ulong *entries, global const uint4 *links,
-    global const real *b, int stride)
-{
-    for (int w = 0; w < WALKS; ++w) {
-        walk->target[w] = draw(walk->record[w], entries, walk->word[w], walk->factor[0] + w);
-        walk->factor[0][w] = walk->record[w].z ? walk->factor[0][w] : 0;
-    }
-#if CHANNELS > 1
-    follow(walk, links);
 #endif
     for (int w = 0; w < WALKS; ++w) {
         FETCH(rows + (walk->target[w] >> 1));
@@ -243,15 +182,9 @@ inline void draw_targets(
     }
 }
 
-inline void end_walk(walks *walk, int w)
-{
-    walk->alive[w] = 0;
-    walk->row[w] = walk->pixel[w];
-}
-
 // Move walk w; returns whether it goes on after its score, and in `worth` what a score of each channel is
 // multiplied by: left as it is, 0, where the row is empty.
-inline int move(walks *walk, int w, global const uint2 *steps, real *worth)
+static inline int move(walks *walk, int w, global const uint2 *steps, real *worth)
 {
     int seen = 0;
     for (int c = 0; c < CHANNELS; ++c)
@@ -273,41 +206,33 @@ kernel void walk_rows(
     global const uint2 *steps, global const real *b, global real4 *out)
 {
     walks walk;
-    real score[WALKS][K], sum[WALKS][K], low[WALKS][K], square[WALKS][K], square_low[WALKS][K];
+    real score[WALKS][K] = {{0}}, sums[WALKS][K][4] = {{{0}}};
     set_out(&walk, units, chunks, first, end, pixels);
-    for (int w = 0; w < WALKS; ++w)
-        for (int c = 0; c < K; ++c)
-            score[w][c] = sum[w][c] = low[w][c] = square[w][c] = square_low[w][c] = 0;
-    int busy = set_off_all(&walk, seed, stream, rows, entries);
-    while (busy) {
+    while (set_off(&walk, seed, stream, rows, entries)) {
         draw_targets(&walk, rows, entries, links, b, stride);
-        busy = 0;
-        for (int begin = 0; begin < WALKS; begin += GROUP) {
-            for (int w = begin; w < begin + GROUP; ++w) {
-                if (!walk.alive[w])
-                    continue;
-                real worth[CHANNELS] = {0};
-                const int goes_on = move(&walk, w, steps, worth);
-                if (ESTIMATOR == COLLISION || !goes_on)
-                    for (int c = 0; c < K; ++c)
-                        score[w][c] += worth[c % CHANNELS] * b[(int)walk.row[w] * stride + offset + c];
-                if (goes_on)
-                    continue;
-                end_walk(&walk, w);
-                for (int c = 0; c < K; ++c) {
-                    two_sum(score[w][c], &sum[w][c], &low[w][c]);
-                    two_sum(score[w][c] * score[w][c], &square[w][c], &square_low[w][c]);
-                    score[w][c] = 0;
-                }
+        for (int w = 0; w < WALKS; ++w) {
+            if (!walk.alive[w])
+                continue;
+            real worth[CHANNELS] = {0};
+            walk.alive[w] = move(&walk, w, steps, worth);
+            if (COLLISION || !walk.alive[w])
+                for (int c = 0; c < K; ++c)
+                    score[w][c] += worth[c % CHANNELS] * b[(int)walk.row[w] * stride + offset + c];
+            if (walk.alive[w])
+                continue;
+            walk.row[w] = walk.pixel[w];
+            for (int c = 0; c < K; ++c) {
+                two_sum(score[w][c], sums[w][c]);
+                two_sum(score[w][c] * score[w][c], sums[w][c] + 2);
+                score[w][c] = 0;
             }
-            busy |= set_off(&walk, begin, seed, stream, rows, entries);
         }
     }
     for (int w = 0; w < WALKS; ++w) {
         const int unit = get_global_id(0) * WALKS + w;
         if (unit < units)
             for (int c = 0; c < K; ++c)
-                out[unit * K + c] = (real4)(sum[w][c], low[w][c], square[w][c], square_low[w][c]);
+                out[unit * K + c] = vload4(0, sums[w][c]);
     }
 }
 
@@ -318,17 +243,17 @@ kernel void walk_columns(
 {
     walks walk;
     set_out(&walk, units, units, first, end, pixel);
-    while (set_off_all(&walk, seed, stream, rows, entries)) {
+    while (set_off(&walk, seed, stream, rows, entries)) {
         draw_targets(&walk, rows, entries, 0, 0, 0);
         for (int w = 0; w < WALKS; ++w) {
-            if (!walk.alive[w])
-                continue;
             real worth[CHANNELS] = {0};
-            if (move(&walk, w, steps, worth))
+            if (!walk.alive[w] || move(&walk, w, steps, worth))
                 continue;
-            ends[walk.next[w] - 1 - first] = walk.row[w];
-            scores[walk.next[w] - 1 - first] = worth[0];
-            end_walk(&walk, w);
+            const uint sample = walk.next[w] - 1 - first;
+            ends[sample] = walk.row[w];
+            scores[sample] = worth[0];
+            walk.alive[w] = 0;
+            walk.row[w] = walk.pixel[w];
         }
     }
 }

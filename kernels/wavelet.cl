@@ -1,20 +1,19 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Orthonormal wavelet transforms of pictures, periodized: from pixels to coefficients (split) and back (join).
+// Orthonormal wavelet transforms of pictures, periodized: from pixels to coefficients (wavelet_split) and back
+// (wavelet_join), out = a (W x) + b y.
 //
-// A level halves both sides: first along the rows (wavelet_split_rows), then along the columns
-// (wavelet_split_columns); wavelet_join_columns and wavelet_join_rows undo it. wavelet_split_all and
-// wavelet_join_all do the levels first .. last - 1 of small pictures at once: one work-group for each K
-// right-hand sides, which waits for itself between passes.
+// A level halves both sides at once: from the values that the filters reach, two by two are made, or two by
+// 2 PAIRS. Items stride through pieces of K right-hand sides (dimension 0), pairs of columns (1) and of rows (2).
+// A launch of one level takes any number of groups; one of several, first .. last - 1, takes one group a piece,
+// which waits for itself between levels: for small pictures.
 //
-// Work-items stride through pieces of K values (dimension 0), pairs of samples (1) and rows (2), as many as
-// there are: a CPU takes one item a row or a pair, a GPU one a piece.
-//
-// Required defines: K, the neighbouring values that an item handles together: 1, 2, 3, 4 or 8;
-// TAPS, the length of the filters, even.
+// Required defines: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8;
+// TAPS, the length of the filters, even; PAIRS, of columns together: 1, or 8 where K is 1 and one item takes all of
+// a row.
 // Layout: a picture is row-major, its k right-hand sides side by side. Coefficients stand as PyWavelets'
 // coeffs_to_array puts them: of each side the approximation first, ceil(n / 2) of n. taps[2 * TAPS] is the
-// low-pass filter, then the high-pass one, in the order of the samples. lines and near are scratch of as many
-// pixels as the picture at the level, and as its approximation.
+// low-pass filter, then the high-pass one, in the order of the samples. near holds the approximations of the levels
+// 1 .. levels - 1 as pictures of their own, that of level i + 1 from pixel starts[i] on.
 //
 // A side of any length: `level` times halved it has n = ceil(pixels / 2^level) samples, the last of which may
 // stand for fewer pixels than the others. It stays out of the filters; where an odd number of whole ones is
@@ -23,11 +22,32 @@
 
 #include "common/pieces.h"
 
-#ifndef TAPS
-#error "wavelet.cl needs -DTAPS=<length of the filters: 2, 4, 6, ...>"
+#if !defined(TAPS) || !defined(PAIRS)
+#error "wavelet.cl needs -DTAPS=<length of the filters: 2, 4, 6, ...> and -DPAIRS=<of columns together: 1 or 8>"
 #endif
 
 #define HALF (TAPS / 2)
+#define FIRST ((HALF + 1) % 2)  // where the samples of pair 0 begin that need the same coefficients
+
+// Quantities of PAIRS neighbours, of which every second one is among SAMPLES. At the edges all lanes hold the same,
+// and the first one counts. SHUFFLE takes the first samples of pairs and the second ones to the order of pixels.
+#if PAIRS == 8
+typedef real8 wide;
+#define SAMPLES(p) ((real8)(LOAD8(p).even, LOAD8((p) + 8).even))
+#define NEIGHBOURS(p) LOAD8(p)
+#define ONE(v) ((v).s0)
+#define SHUFFLE(u, v) \
+    do { \
+        const wide first = u, second = v; \
+        u.even = first.lo, u.odd = second.lo, v.even = first.hi, v.odd = second.hi; \
+    } while (0)
+#else
+typedef lanes wide;
+#define SAMPLES(p) LOAD(p)
+#define NEIGHBOURS(p) LOAD(p)
+#define ONE(v) (v)
+#define SHUFFLE(u, v)
+#endif
 
 // n samples make `pairs` of the approximation, `regular` of them by the filters. c and s turn
 // the last two samples, where they are not a regular pair.
@@ -36,7 +56,7 @@ typedef struct {
     real c, s;
 } side;
 
-INLINE side side_at(int pixels, int level)
+static inline side side_at(int pixels, int level)
 {
     const int size = 1 << level, whole = pixels >> level, rest = pixels & (size - 1);
     const int n = whole + (rest > 0);
@@ -45,235 +65,196 @@ INLINE side side_at(int pixels, int level)
     return a;
 }
 
-// Of analysis: one sample of the approximation and one detail. Of synthesis: two neighbouring samples.
+static inline int wrapped(int i, int n)
+{
+    return (i % n + n) % n;
+}
+
+// Term t of pair m. Of analysis: sample `low`, and its weights in approximation and detail. Of synthesis:
+// approximation `low`, detail `high`, and the weights of both in the first sample and in the second.
 typedef struct {
-    lanes first, second;
-} pair;
+    int low, high;
+    real w[4];
+} term;
 
-// Approximation and detail number m of the samples x[0], x[step], ...; of an odd last one there is no detail.
-INLINE pair split(side a, int m, global const real *x, int step, constant real *taps)
+INLINE term split_term(side a, int m, int t, bool inside, constant real *taps)
 {
-    pair p;
-    p.first = p.second = 0;
-    if (m >= a.regular) {
-        const lanes last = LOAD(x + (a.n - 1) * step);
-        p.first = last;
-        if (a.n % 2 == 0) {
-            const lanes before = LOAD(x + (a.n - 2) * step);
-            p.first = a.c * before + a.s * last;
-            p.second = a.s * before - a.c * last;
-        }
-        return p;
+    term v = {2 * m + 1 - HALF + t, 0, {taps[t], taps[TAPS + t], 0, 0}};
+    if (inside)
+        return v;
+    if (m < a.regular) {
+        v.low = wrapped(v.low, 2 * a.regular);
+        return v;
     }
-    const int n = 2 * a.regular;
-    int i = 2 * m + 1 - HALF;
-    if (i >= 0 && i + TAPS <= n) {
+    const bool two = a.n % 2 == 0;
+    v.low = a.n - 1 - (two && t == 0);
+    v.w[0] = t > two ? 0 : !two ? 1 : t ? a.s : a.c;
+    v.w[1] = t > two || !two ? 0 : t ? -a.c : a.s;
+    return v;
+}
+
+INLINE term join_term(side a, int m, int t, bool inside, constant real *taps)
+{
+    const int i = m + HALF / 2 + 1 - HALF + t, tap = TAPS - 2 - 2 * t;
+    term v = {i, a.pairs + i, {taps[tap], taps[TAPS + tap], taps[tap + 1], taps[TAPS + tap + 1]}};
+    if (inside)
+        return v;
+    if (m < a.regular) {
+        v.low = wrapped(i, a.regular);
+        v.high = a.pairs + v.low;
+        return v;
+    }
+    const bool two = a.n % 2 == 0;
+    v.low = m;
+    v.high = two ? a.pairs + m : m;
+    v.w[0] = t ? 0 : two ? a.c : 1;
+    v.w[1] = v.w[2] = t || !two ? 0 : a.s;
+    v.w[3] = t || !two ? 0 : -a.c;
+    return v;
+}
+
+// Where sample 0 or 1 of pair m stands; a.n: there is none.
+static inline int place(side a, int m, int which)
+{
+    const int i = 2 * m + which;
+    return m < a.regular ? (i + FIRST) % (2 * a.regular) : i;
+}
+
+// Of a pair of rows and one of columns, or PAIRS of these; v01 is of the rows' first and the columns' second.
+typedef struct {
+    wide v00, v01, v10, v11;
+} quad;
+
+INLINE quad split(side a, int i, side b, int j, bool inside, global const real *x, int k, constant real *taps)
+{
+    quad q = {0, 0, 0, 0};
+    for (int s = 0; s < TAPS; ++s) {
+        const term r = split_term(a, i, s, inside, taps);
+        wide near = 0, detail = 0;
         for (int t = 0; t < TAPS; ++t) {
-            const lanes v = LOAD(x + (i + t) * step);
-            p.first = taps[t] * v + p.first;
-            p.second = taps[TAPS + t] * v + p.second;
+            const term c = split_term(b, j, t, inside, taps);
+            global const real *p = x + (r.low * b.n + c.low) * k;
+            const wide v = inside ? SAMPLES(p) : (wide)(LOAD(p));
+            near = c.w[0] * v + near;
+            detail = c.w[1] * v + detail;
         }
-        return p;
+        q.v00 = r.w[0] * near + q.v00;
+        q.v01 = r.w[0] * detail + q.v01;
+        q.v10 = r.w[1] * near + q.v10;
+        q.v11 = r.w[1] * detail + q.v11;
     }
-    while (i < 0)
-        i += n;
-    for (int t = 0; t < TAPS; ++t) {
-        const lanes v = LOAD(x + i * step);
-        p.first = taps[t] * v + p.first;
-        p.second = taps[TAPS + t] * v + p.second;
-        i = i + 1 == n ? 0 : i + 1;
-    }
-    return p;
+    return q;
 }
 
-// Where the two samples of join() stand. Pairs are cut so that both need the same coefficients.
-INLINE int first_place(side a, int m)
+// Approximations come from `near`, whose rows have near_pitch pixels, details from x.
+INLINE quad join(
+    side a, int i, side b, int j, bool inside, global const real *near, int near_pitch, global const real *x,
+    int pitch, int k, constant real *taps)
 {
-    return m < a.regular ? 2 * m + (HALF + 1) % 2 : 2 * m;
-}
-
-INLINE int second_place(side a, int m)
-{
-    const int place = first_place(a, m) + 1;
-    return m < a.regular && place == 2 * a.regular ? 0 : place;  // or a.n: there is none
-}
-
-// Two samples from approximations low[0], low[low_step], ... and details high[0], high[high_step], ...
-INLINE pair join(
-    side a, int m, global const real *low, int low_step, global const real *high, int high_step,
-    constant real *taps)
-{
-    pair p;
-    p.first = p.second = 0;
-    if (m >= a.regular) {
-        const lanes near = LOAD(low + m * low_step);
-        p.first = near;
-        if (a.n % 2 == 0) {
-            const lanes detail = LOAD(high + m * high_step);
-            p.first = a.c * near + a.s * detail;
-            p.second = a.s * near - a.c * detail;
+#define COEFFICIENT(from, pixel) (inside ? NEIGHBOURS(from + (pixel) * k) : (wide)(LOAD(from + (pixel) * k)))
+    quad q = {0, 0, 0, 0};
+    for (int s = 0; s < HALF; ++s) {
+        const term r = join_term(a, i, s, inside, taps);
+        wide low0 = 0, low1 = 0, high0 = 0, high1 = 0;
+        for (int t = 0; t < HALF; ++t) {
+            const term c = join_term(b, j, t, inside, taps);
+            const wide ll = COEFFICIENT(near, r.low * near_pitch + c.low), lh = COEFFICIENT(x, r.low * pitch + c.high);
+            const wide hl = COEFFICIENT(x, r.high * pitch + c.low), hh = COEFFICIENT(x, r.high * pitch + c.high);
+            low0 = c.w[0] * ll + (c.w[1] * lh + low0);
+            low1 = c.w[2] * ll + (c.w[3] * lh + low1);
+            high0 = c.w[0] * hl + (c.w[1] * hh + high0);
+            high1 = c.w[2] * hl + (c.w[3] * hh + high1);
         }
-        return p;
+        q.v00 = r.w[0] * low0 + (r.w[1] * high0 + q.v00);
+        q.v01 = r.w[0] * low1 + (r.w[1] * high1 + q.v01);
+        q.v10 = r.w[2] * low0 + (r.w[3] * high0 + q.v10);
+        q.v11 = r.w[2] * low1 + (r.w[3] * high1 + q.v11);
     }
-    int i = m + HALF / 2 + 1 - HALF;
-    while (i < 0)
-        i += a.regular;
-    while (i >= a.regular)
-        i -= a.regular;
-    for (int t = TAPS - 2; t >= 0; t -= 2) {
-        const lanes near = LOAD(low + i * low_step), detail = LOAD(high + i * high_step);
-        p.first = taps[t] * near + (taps[TAPS + t] * detail + p.first);
-        p.second = taps[t + 1] * near + (taps[TAPS + t + 1] * detail + p.second);
-        i = i + 1 == a.regular ? 0 : i + 1;
+    if (inside) {
+        SHUFFLE(q.v00, q.v01);
+        SHUFFLE(q.v10, q.v11);
     }
-    return p;
+    return q;
 }
 
-// Each row of x (rows, n, k) becomes a row of lines: approximation, then details.
-kernel void wavelet_split_rows(
-    int rows, int width, int level, int k, constant real *taps, global const real *x, global real *lines)
+INLINE void store(global real *out, int i, wide v, bool inside, int skip, real a, real b, global const real *y)
 {
-    const side a = side_at(width, level);
-    for (int row = get_global_id(2); row < rows; row += get_global_size(2))
-        for (int m = get_global_id(1); m < a.pairs; m += get_global_size(1))
-            for (int p = get_global_id(0); p < pieces_of(k); p += get_global_size(0)) {
-                const piece q = piece_of(p, k);
-                const int i = row * a.n * k + q.at;
-                const pair v = split(a, m, x + i, k, taps);
-                put(lines, i + m * k, v.first, q.skip, 1, 0, x);
-                if (a.pairs + m < a.n)
-                    put(lines, i + (a.pairs + m) * k, v.second, q.skip, 1, 0, x);
-            }
+#if PAIRS == 8
+    if (inside)
+        STORE8(b != 0 ? a * v + b * LOAD8(y + i) : a * v, out + i);
+    else
+#endif
+        put(out, i, ONE(v), skip, a, b, y);
 }
 
-// Each column of lines (n, run): the approximation of the first `split_at` goes to near, whose rows are as long,
-// where another level follows; all else to its place in out, whose rows are `pitch` long.
-kernel void wavelet_split_columns(
-    int height, int level, int run, int split_at, int pitch, real scale, int adds, constant real *taps,
-    global const real *lines, global real *near, global const real *add, global real *out)
+kernel void wavelet_split(
+    int height, int width, int first, int last, int levels, int k, real scale, real add_scale,
+    constant int *starts, constant real *taps, global const real *x, global real *near, global const real *add,
+    global real *out)
 {
-    const side a = side_at(height, level);
-    const int pieces = pieces_of(split_at);
-    const int all = pieces + pieces_of(run - split_at);
-    for (int m = get_global_id(1); m < a.pairs; m += get_global_size(1))
-        for (int p = get_global_id(0); p < all; p += get_global_size(0)) {
-            const bool nearby = p < pieces;
-            piece q = nearby ? piece_of(p, split_at) : piece_of(p - pieces, run - split_at);
-            q.at += nearby ? 0 : split_at;
-            const pair v = split(a, m, lines + q.at, run, taps);
-            if (nearby)
-                put(near, m * split_at + q.at, v.first, q.skip, 1, 0, lines);
-            else
-                put(out, m * pitch + q.at, v.first, q.skip, scale, adds, add);
-            if (a.pairs + m < a.n)
-                put(out, (a.pairs + m) * pitch + q.at, v.second, q.skip, scale, adds, add);
-        }
-}
-
-// The columns of coefficients x, whose rows are `pitch` long, become those of lines (n, run); the approximation
-// of the first `split_at` comes from near.
-kernel void wavelet_join_columns(
-    int height, int level, int run, int split_at, int pitch, constant real *taps, global const real *x,
-    global const real *near, global real *lines)
-{
-    const side a = side_at(height, level);
-    const int pieces = pieces_of(split_at);
-    const int all = pieces + pieces_of(run - split_at);
-    for (int m = get_global_id(1); m < a.pairs; m += get_global_size(1))
-        for (int p = get_global_id(0); p < all; p += get_global_size(0)) {
-            const bool nearby = p < pieces;
-            piece q = nearby ? piece_of(p, split_at) : piece_of(p - pieces, run - split_at);
-            q.at += nearby ? 0 : split_at;
-            global const real *high = x + a.pairs * pitch + q.at;
-            const pair v = join(
-                a, m, (nearby ? near : x) + q.at, nearby ? split_at : pitch, high, pitch, taps);
-            put(lines, first_place(a, m) * run + q.at, v.first, q.skip, 1, 0, lines);
-            if (second_place(a, m) < a.n)
-                put(lines, second_place(a, m) * run + q.at, v.second, q.skip, 1, 0, lines);
-        }
-}
-
-// Each row of lines (rows, n, k), approximation and details, becomes a row of out.
-kernel void wavelet_join_rows(
-    int rows, int width, int level, int k, real scale, int adds, constant real *taps, global const real *lines,
-    global const real *add, global real *out)
-{
-    const side a = side_at(width, level);
-    for (int row = get_global_id(2); row < rows; row += get_global_size(2))
-        for (int m = get_global_id(1); m < a.pairs; m += get_global_size(1))
-            for (int p = get_global_id(0); p < pieces_of(k); p += get_global_size(0)) {
-                const piece q = piece_of(p, k);
-                const int i = row * a.n * k + q.at;
-                const pair v = join(a, m, lines + i, k, lines + i + a.pairs * k, k, taps);
-                put(out, i + first_place(a, m) * k, v.first, q.skip, scale, adds, add);
-                if (second_place(a, m) < a.n)
-                    put(out, i + second_place(a, m) * k, v.second, q.skip, scale, adds, add);
-            }
-}
-
-// All levels first .. last - 1 of right-hand sides offset .. of x (n of `first`, k), a picture of height x width
-// pixels at level 0. Group g does K of them.
-kernel void wavelet_split_all(
-    int height, int width, int first, int last, int k, int offset, real scale, int adds, constant real *taps,
-    global const real *x, global real *lines, global real *near, global const real *add, global real *out)
-{
-    offset += K * get_group_id(2);
+    const piece p = piece_of(get_global_id(0), k);
     for (int level = first; level < last; ++level) {
         const side a = side_at(height, level), b = side_at(width, level);
-        for (int row = get_local_id(1); row < a.n; row += get_local_size(1))
-            for (int m = get_local_id(0); m < b.pairs; m += get_local_size(0)) {
-                const int i = row * b.n * k + offset;
-                const pair v = split(b, m, x + i, k, taps);
-                put(lines, i + m * k, v.first, 0, 1, 0, x);
-                if (b.pairs + m < b.n)
-                    put(lines, i + (b.pairs + m) * k, v.second, 0, 1, 0, x);
+        const bool deepest = level + 1 == levels;
+        global const real *from = (level ? near + starts[level - 1] * k : x) + p.at;
+        global real *to = deepest ? out + p.at : near + starts[level] * k + p.at;
+        const real u = deepest ? scale : 1, v = deepest ? add_scale : 0;
+        for (int i = get_global_id(2); i < a.pairs; i += get_global_size(2))
+            for (int j = get_global_id(1), done; j < b.pairs; j += done * get_global_size(1)) {
+                const int row = 2 * i + 1 - HALF, column = 2 * j + 1 - HALF;
+                const bool inside = row >= 0 && row + TAPS <= 2 * a.regular && column >= 0
+                    && column + 2 * (PAIRS - 1) + TAPS <= 2 * b.regular;
+                const quad q = inside ? split(a, i, b, j, true, from, k, taps)
+                                      : split(a, i, b, j, false, from, k, taps);
+                const int right = b.pairs * k, below = a.pairs * width * k, here = (i * width + j) * k + p.at;
+                const bool at_right = b.pairs + j < b.n, at_below = a.pairs + i < a.n;
+                store(to, (i * (deepest ? width : b.pairs) + j) * k, q.v00, inside, p.skip, u, v, add + p.at);
+                if (at_right)
+                    store(out, here + right, q.v01, inside, p.skip, scale, add_scale, add);
+                if (at_below)
+                    store(out, here + below, q.v10, inside, p.skip, scale, add_scale, add);
+                if (at_right && at_below)
+                    store(out, here + below + right, q.v11, inside, p.skip, scale, add_scale, add);
+                done = inside ? PAIRS : 1;
             }
         barrier(CLK_GLOBAL_MEM_FENCE);
-        for (int m = get_local_id(1); m < a.pairs; m += get_local_size(1))
-            for (int j = get_local_id(0); j < b.n; j += get_local_size(0)) {
-                const pair v = split(a, m, lines + j * k + offset, b.n * k, taps);
-                if (j < b.pairs && level + 1 < last)
-                    put(near, (m * b.pairs + j) * k + offset, v.first, 0, 1, 0, lines);
-                else
-                    put(out, (m * width + j) * k + offset, v.first, 0, scale, adds, add);
-                if (a.pairs + m < a.n)
-                    put(out, ((a.pairs + m) * width + j) * k + offset, v.second, 0, scale, adds, add);
-            }
-        barrier(CLK_GLOBAL_MEM_FENCE);
-        x = near;
     }
 }
 
-// The inverse: coefficients x become the picture `out` at level `first`; where this is not 0, the scale is 1 and
-// nothing is added.
-kernel void wavelet_join_all(
-    int height, int width, int first, int last, int k, int offset, real scale, int adds, constant real *taps,
-    global const real *x, global real *lines, global real *near, global const real *add, global real *out)
+// Levels last - 1 .. first; `out` gets the picture where the first is level 0.
+kernel void wavelet_join(
+    int height, int width, int first, int last, int levels, int k, real scale, real add_scale,
+    constant int *starts, constant real *taps, global const real *x, global real *near, global const real *add,
+    global real *out)
 {
-    offset += K * get_group_id(2);
+    const piece p = piece_of(get_global_id(0), k);
+    x += p.at;
+    add += p.at;
     for (int level = last - 1; level >= first; --level) {
         const side a = side_at(height, level), b = side_at(width, level);
-        for (int m = get_local_id(1); m < a.pairs; m += get_local_size(1))
-            for (int j = get_local_id(0); j < b.n; j += get_local_size(0)) {
-                const bool nearby = j < b.pairs && level + 1 < last;
-                global const real *high = x + (a.pairs * width + j) * k + offset;
-                const pair v = join(
-                    a, m, (nearby ? near : x) + j * k + offset, (nearby ? b.pairs : width) * k, high, width * k,
-                    taps);
-                put(lines, (first_place(a, m) * b.n + j) * k + offset, v.first, 0, 1, 0, x);
-                if (second_place(a, m) < a.n)
-                    put(lines, (second_place(a, m) * b.n + j) * k + offset, v.second, 0, 1, 0, x);
-            }
-        barrier(CLK_GLOBAL_MEM_FENCE);
-        const bool done = level == first;
-        for (int row = get_local_id(1); row < a.n; row += get_local_size(1))
-            for (int m = get_local_id(0); m < b.pairs; m += get_local_size(0)) {
-                const int i = row * b.n * k + offset;
-                const pair v = join(b, m, lines + i, k, lines + i + b.pairs * k, k, taps);
-                global real *to = done ? out : near;
-                put(to, i + first_place(b, m) * k, v.first, 0, done ? scale : 1, done && adds, add);
-                if (second_place(b, m) < b.n)
-                    put(to, i + second_place(b, m) * k, v.second, 0, done ? scale : 1, done && adds, add);
+        const bool deepest = level + 1 == levels;
+        global const real *low = deepest ? x : near + starts[level] * k + p.at;
+        const int pitch = deepest ? width : b.pairs;
+        global real *to = (level ? near + starts[level - 1] * k : out) + p.at;
+        const real u = level ? 1 : scale, v = level ? 0 : add_scale;
+        for (int i = get_global_id(2); i < a.pairs; i += get_global_size(2))
+            for (int j = get_global_id(1), done; j < b.pairs; j += done * get_global_size(1)) {
+                const int row = i + HALF / 2 + 1 - HALF, column = j + HALF / 2 + 1 - HALF;
+                const int left = place(b, j, 0);
+                const bool inside = row >= 0 && row + HALF <= a.regular && column >= 0
+                    && column + PAIRS - 1 + HALF <= b.regular && left + 2 * PAIRS <= 2 * b.regular;
+                const quad q = inside ? join(a, i, b, j, true, low, pitch, x, width, k, taps)
+                                      : join(a, i, b, j, false, low, pitch, x, width, k, taps);
+                const int right = inside ? left + PAIRS : place(b, j, 1);
+                const int upper = place(a, i, 0) * b.n, lower = place(a, i, 1) * b.n;
+                store(to, (upper + left) * k, q.v00, inside, p.skip, u, v, add);
+                if (right < b.n)
+                    store(to, (upper + right) * k, q.v01, inside, p.skip, u, v, add);
+                if (lower < a.n * b.n)
+                    store(to, (lower + left) * k, q.v10, inside, p.skip, u, v, add);
+                if (right < b.n && lower < a.n * b.n)
+                    store(to, (lower + right) * k, q.v11, inside, p.skip, u, v, add);
+                done = inside ? PAIRS : 1;
             }
         barrier(CLK_GLOBAL_MEM_FENCE);
     }

@@ -13,13 +13,14 @@ ltcl undoes the bounces with matrix-vector products only.
 The house, from the ground up; imports point down only:
 
     errors, checks, files           one-line refusals; outputs that appear whole or not at all
-    device                          OpenCL: devices, kernels, arrays; operators: matrices there, S = I + R
-    transport, theory, solvers      T = S F; what can be forecast; one algorithm per file
-    exact, parts                    a compressed T beside the one it stands for; as the arrays of a file
+    device, operators               OpenCL: devices, kernels, arrays; matrices there, S = I + R
+    layout                          pictures and matrices by colour channel, as arrays of a linear system
+    theory, solvers, diagnostics    forecasts; one algorithm per file; what T tells of its scene
+    first_bounce, transport         F; T = S F
     compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
     acquisition                     from photographs to T: rigs, radiometry, geometry, scanning
     compression                     T in few numbers, with a bound on what solutions lose
-    images, layout, report          pictures, pictures as right-hand sides, JSON
+    images, report                  pictures, JSON
     plots, batch, demo, cli         what people look at; many frames
 
 After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse Light Transport, IEEE PAMI

@@ -3,19 +3,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ltcl import checks, energy, reciprocity, theory
-from ltcl.energy import Energy
+from ltcl import checks, diagnostics, report, theory
+from ltcl.diagnostics import Energy
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
-from ltcl.single_view import negative_bounces
-from ltcl.solvers.survey import survey
+from ltcl.solvers.auto import survey
 from ltcl.transport import Transport, require
 
 
@@ -49,10 +47,9 @@ class ChannelAnalysis:
         on rho(R), in the norm in which a reciprocal T makes A self-adjoint.
     first_bounce : (smallest, median, largest)
     reciprocity_defect : float
-        0 of a Lambertian scene without noise; see `ltcl.reciprocity`.
+        0 of a Lambertian scene without noise; see `ltcl.diagnostics`.
     negative_bounce : float
-        Light that one bounce takes away: 0 of a Lambertian scene, above 0.005 of glossy ones; see
-        `ltcl.single_view`.
+        Light that one bounce takes away: 0 of a Lambertian scene, above 0.005 of glossy ones.
     energy : Energy
     """
 
@@ -87,15 +84,7 @@ class Analysis:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON; what is infinite or unknown is None."""
-        return _plain(dataclasses.asdict(self))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return type(value)(_plain(part) for part in value)
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return report.plain(self)
 
 
 def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
@@ -135,7 +124,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
         masked=int(T.masked.sum()),
         channels=tuple(
             _channel(matrix, f, S, negative, rtol)
-            for matrix, f, S, negative in zip(T.matrices, F, T.systems, negative_bounces(T), strict=True)
+            for matrix, f, S, negative in zip(T.matrices, F, T.systems, T.negative_bounces, strict=True)
         ),
     )
 
@@ -147,9 +136,10 @@ def _channel(T: Any, F: np.ndarray, S: IdentityPlus, negative: float, rtol: floa
         norms = None
     rho = theory.spectral_radius(S.R, norms=norms)
     bounds = theory.free_bounds(S)
-    seen = survey(S)
-    spectrum = seen.spectrum if seen.in_an_interval else None
-    forecasts = theory.forecasts(S, rho, bounds, rtol, spectrum, seen.self_adjoint)
+    found = survey(S)
+    spectrum = found.spectrum if found.in_an_interval else None
+    forecasts = theory.forecasts(S, rho, bounds, rtol, spectrum, found.self_adjoint)
+    upper = rho.upper if math.isfinite(rho.upper) else rho.value
     lit = F[F > 0]
     return ChannelAnalysis(
         norm_one=norms.one if norms else math.nan,
@@ -163,15 +153,9 @@ def _channel(T: Any, F: np.ndarray, S: IdentityPlus, negative: float, rtol: floa
         bounds=bounds,
         products={name: forecast.products for name, forecast in forecasts.items()},
         certificates={name: forecast.certificate for name, forecast in forecasts.items()},
-        series=theory.after_terms(_albedo(rho)),
+        series=theory.after_terms(upper / (1.0 + upper)),  # rho(R) <= m / (1 - m), eq. 14
         first_bounce=(float(lit.min()), float(np.median(lit)), float(lit.max())),
-        reciprocity_defect=reciprocity.defect(T, F),
+        reciprocity_defect=diagnostics.reciprocity_defect(T, F),
         negative_bounce=negative,
-        energy=energy.check(T, F, S),
+        energy=diagnostics.check_energy(T, F, S),
     )
-
-
-def _albedo(rho: theory.SpectralRadius) -> float:
-    """m with rho(R) <= m / (1 - m) (eq. 14), safely so where rho has an upper bound."""
-    most = rho.upper if math.isfinite(rho.upper) else rho.value
-    return most / (1.0 + most)

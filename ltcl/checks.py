@@ -6,7 +6,9 @@ Everything here runs on the host before anything is built, uploaded or overwritt
 
 from __future__ import annotations
 
+import copy
 import math
+import operator
 import os
 from collections.abc import Iterable
 from typing import Any
@@ -36,6 +38,11 @@ def finite(name: str, array: np.ndarray) -> np.ndarray:
 
 def real(name: str, value: Any) -> np.ndarray:
     """Return `value` as an array of real numbers (no copy where it is one); refuse others."""
+    if isinstance(value, np.ma.MaskedArray):  # np.asarray would drop the mask
+        masked = int(np.ma.count_masked(value))
+        raise InputTypeError(
+            f"{name} is a masked array with {masked} masked value(s); give {name}.filled(value)"
+        )
     try:
         array = np.asarray(value)
     except ValueError as error:
@@ -80,16 +87,18 @@ def number(
     below: float | None = None,
 ) -> float:
     """Return `value` as a finite float inside the bounds given."""
-    limits = [
-        (f"above {above:g}" if above is not None else "", above is None or _as_float(value) > above),
-        (f"at least {least:g}" if least is not None else "", least is None or _as_float(value) >= least),
-        (f"at most {most:g}" if most is not None else "", most is None or _as_float(value) <= most),
-        (f"below {below:g}" if below is not None else "", below is None or _as_float(value) < below),
-    ]
-    if not np.isfinite(_as_float(value)) or not all(ok for _, ok in limits):
-        wanted = " and ".join(text for text, _ in limits if text)
-        raise InputError(f"{name} is {value!r}; it must be a finite number {wanted}".rstrip())
-    return float(value)
+    x = _as_float(value)
+    limits = (
+        ("above", above, operator.gt),
+        ("at least", least, operator.ge),
+        ("at most", most, operator.le),
+        ("below", below, operator.lt),
+    )
+    active = [(text, bound, holds) for text, bound, holds in limits if bound is not None]
+    if not math.isfinite(x) or not all(holds(x, bound) for _, bound, holds in active):
+        allowed = " and ".join(f"{text} {bound:g}" for text, bound, _ in active)
+        raise InputError(f"{name} is {value!r}; it must be a finite number {allowed}".rstrip())
+    return x
 
 
 def count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
@@ -141,6 +150,9 @@ def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
     if matrix.ndim != 2:
         raise InputError(f"{name} has shape {matrix.shape}; it must be (M, N)")
     real(name, np.zeros(0, matrix.dtype))
+    if matrix.dtype == np.float16:  # SciPy computes nothing with it
+        matrix = copy.copy(matrix)
+        matrix.data = matrix.data.astype(np.float32)
     if matrix.format in ("csr", "csc"):
         major, minor = matrix.shape if matrix.format == "csr" else matrix.shape[::-1]
         compressed(name, matrix.indptr, matrix.indices, matrix.data, (major, minor))

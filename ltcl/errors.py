@@ -29,6 +29,9 @@ class ToleranceError(InputError):
         super().__init__(message)
         self.least = least
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.least)
+
 
 class FileError(InputError, OSError):
     """A file is missing, truncated, lies about its size, or has an unknown format."""
@@ -57,6 +60,9 @@ class PhotographMissing(AcquisitionError):
         super().__init__(message)
         self.number = number
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.number)
+
 
 class ConvergenceError(LtclError, ArithmeticError):
     """A solve did not reach its tolerance. `solution` holds the best iterate and the history.
@@ -67,3 +73,6 @@ class ConvergenceError(LtclError, ArithmeticError):
     def __init__(self, message: str, solution: Any) -> None:
         super().__init__(message)
         self.solution = solution
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (str(self), self.solution)

@@ -65,6 +65,19 @@ def as_path(path: Any, name: str = "path") -> Path:
         ) from None
 
 
+def refuse_appended(path: Path, comment: bytes) -> None:
+    """Refuse a zip archive with bytes behind its end record, whose last field is the `comment`.
+
+    Readers find that record from behind and skip what follows, such as another file or half of one.
+    """
+    size = 22 + len(comment)
+    with path.open("rb") as file:
+        file.seek(-size, os.SEEK_END)
+        record = file.read(size)
+    if not record.startswith(b"PK\x05\x06") or int.from_bytes(record[20:22], "little") != len(comment):
+        raise FileError("the archive does not end where it says: bytes were appended, or it is damaged")
+
+
 def unknown_extension(path: Path) -> str:
     """What is wrong with the extension of `path`, for a refusal.
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import __version__
 from ltcl.device import Device
 from ltcl.files import replace_file
 from ltcl.solvers import Solution
@@ -52,18 +51,13 @@ def write(path: str | os.PathLike[str], value: Any) -> None:
 
 
 def solution(solved: Solution | tuple[Solution, ...]) -> list[dict[str, Any]]:
-    """What there is to tell of a solve, one entry per colour channel; the solution itself is left out."""
+    """Facts of a solve, one entry per colour channel, without the solution itself."""
+    names = ("method", "iterations", "products", "residual", "seconds", "reason", "error")
     return [
-        {
-            "method": one.method,
+        {name: getattr(one, name) for name in names}
+        | {
             "status": one.status.name.lower(),
-            "iterations": one.iterations,
-            "products": one.products,
-            "residual": one.residual,
             "residuals": list(one.residuals),
-            "seconds": one.seconds,
-            "reason": one.reason,
-            "error": one.error,
             "standard_error": _spread(one.standard_error),
         }
         for one in (solved if isinstance(solved, tuple) else (solved,))
@@ -91,5 +85,7 @@ def device(opened: Device) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Versions that a result can depend on."""
+    from ltcl import __version__  # `ltcl` itself imports this module
+
     found = {"ltcl": __version__, "python": platform.python_version(), "system": platform.platform()}
     return found | {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "pyopencl")}

@@ -17,21 +17,16 @@ light away, or that is far from reciprocal, gives such a scene away: the result 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks, layout
 from ltcl.errors import InputTypeError
-from ltcl.exact import beside, itself
-from ltcl.single_view import negative_bounces
-from ltcl.solvers import Inverse, Solution, sampled, solve_each
-from ltcl.solvers.methods import SAMPLED
-from ltcl.solvers.precomputed import require_inverse
-from ltcl.transport import Transport, require
+from ltcl.solvers import Inverse, Solution, monte_carlo, solve_each
+from ltcl.solvers.solve import SAMPLED
+from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
 
 logger = logging.getLogger(__name__)
 Parts = list[np.ndarray]  # (N, k) of each channel
@@ -39,7 +34,7 @@ Parts = list[np.ndarray]  # (N, k) of each channel
 # Of a scene taken for Lambertian: noise of path tracing alone gives a defect of 0.05 and takes 0.0004.
 LARGEST_DEFECT = 0.1
 LARGEST_NEGATIVE = 0.005
-_RTOL = 1e-3
+RTOL = 1e-3
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -59,9 +54,9 @@ class Separation:
     solutions : tuple
         Solves in the order direct, first bounce, ...; per entry one Solution, or 3 in colour.
     reciprocity_defect : float
-        Of T, see `ltcl.reciprocity`: 0 of a Lambertian scene measured without noise; NaN where unknown.
+        Of T, see `ltcl.diagnostics`: 0 of a Lambertian scene measured without noise; NaN where unknown.
     negative_bounce : float
-        Share of light that a bounce as T has it would take away, see `ltcl.single_view`: 0 of a Lambertian
+        Share of light that a bounce as T has it would take away, see `ltcl.diagnostics`: 0 of a Lambertian
         scene. The first bounce of a glossy scene is off by a few times as much, later ones by more.
     warning : str
         Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 and the
@@ -82,7 +77,7 @@ class Separation:
     transport_error: float = 0.0
 
     def __repr__(self) -> str:
-        shape, off = " x ".join(map(str, self.direct.shape)), itself(self.transport_error)
+        shape, off = " x ".join(map(str, self.direct.shape)), error_note(self.transport_error)
         return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces{off}>"
 
 
@@ -139,108 +134,72 @@ def separate(
     """
     require(T)
     checks.count("bounces", bounces, least=0)
-    sampled.check_whole(options)
+    monte_carlo.check_whole(options)
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     pictures = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
-    true, judges = beside(T, exact)
+    true, judges = resolve_reference(T, exact)
     if inverse is not None:
-        _check_inverse(T, inverse, method, rtol, exact, options)
-    rtol = usual_rtol(T, exact, inverse) if rtol is None else rtol
-    undo = partial(_undo, T, inverse, method, {"rtol": rtol, **options, "exact": judges})
-    chain = _chain(undo, columns, bounces)
+        require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
+        for name in options.keys() - {"callback", "throw"}:
+            raise InputTypeError(
+                f"option {name!r} is given, but with inverse there is no solve that takes it"
+            )
+    options |= {"rtol": default_rtol(RTOL, T, exact, inverse) if rtol is None else rtol, "exact": judges}
 
-    def picture(parts: list[np.ndarray]) -> np.ndarray:
-        return shape.pack(parts, T.grid).astype(np.float32)
+    def undo(parts: Parts, k: int) -> tuple[Solution, ...]:
+        """S^-1 of what is left of each channel before bounce k."""
+        if inverse is not None:
+            return tuple(inverse.solve(l, channel) for channel, l in enumerate(parts))
+        return solve_each(T.systems, parts, method, **_with_seed(method, options, k))
 
-    direct, *indirect = [picture(found) for found in chain.bounces]
-    negative = max(negative_bounces(true))
-    warning = _warning(true.reciprocity_defect, negative, true.error)
+    def picture(parts: Parts) -> np.ndarray:
+        return shape.pack(parts, T.grid).astype(np.float32, copy=False)
+
+    found, solutions, indirect = [], [], np.empty(0)
+    left = [l_out.astype(np.float64) for l_out in columns]
+    for k in range(bounces + 1):
+        solutions.append(undo(left, k))
+        b_k = [solution.x.astype(np.float64) for solution in solutions[-1]]
+        left = [l - b for l, b in zip(left, b_k, strict=True)]
+        found.append(picture(b_k))
+        if k == 0:
+            indirect = picture(left)
+    warning = _warning(true.reciprocity_defect, max(true.negative_bounces), true.error)
     if warning:
         logger.warning(warning)
     return Separation(
-        direct=direct,
-        indirect=picture([l_out - b_0 for l_out, b_0 in zip(columns, chain.bounces[0], strict=True)]),
-        bounces=np.stack(indirect) if indirect else np.empty((0, *direct.shape), np.float32),
-        rest=picture(chain.rest),
-        solutions=tuple(found[0] if T.channels == 1 else found for found in chain.solutions),
+        direct=found[0],
+        indirect=indirect,
+        bounces=np.stack(found[1:]) if bounces else np.empty((0, *found[0].shape), np.float32),
+        rest=picture(left),
+        solutions=tuple(each[0] if T.channels == 1 else each for each in solutions),
         reciprocity_defect=true.reciprocity_defect,
-        negative_bounce=negative,
+        negative_bounce=max(true.negative_bounces),
         warning=warning,
         transport_error=true.error,
     )
 
 
-def usual_rtol(T: Transport, exact: Transport | None = None, inverse: Inverse | None = None) -> float:
-    """Of each bounce where none is given: 1e-3, or what a compressed T or an inverse is off by.
-
-    >>> usual_rtol(Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2)))
-    0.001
-    """
-    error = inverse.error if inverse is not None else T.error if exact is None else 0.0
-    return max(_RTOL, error) if error < 1.0 else _RTOL  # which is refused, with the reason
-
-
-def _check_inverse(
-    T: Transport, inverse: Any, method: str, rtol: float | None, exact: Any, options: dict[str, Any]
-) -> None:
-    require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
-    unknown = [name for name in options if name not in ("callback", "throw")]
-    if unknown:
-        name = unknown[0]
-        raise InputTypeError(f"option {name!r} is given, but with inverse there is no solve that takes it")
-
-
 def _warning(defect: float, negative: float, error: float) -> str:
-    """What is wrong with T for a separation; nothing where both are small, or unknown.
-
-    What a compressed T may be off by is no sign of anything.
-    """
-    found = []
+    """Why bounces are approximate; nothing where both numbers are within that of T's compression, or NaN."""
+    reasons = []
     if defect > (most := LARGEST_DEFECT + error):
-        found.append(f"T is not reciprocal (defect {defect:.2g}, above {most:.2g})")
+        reasons.append(f"T is not reciprocal (defect {defect:.2g}, above {most:.2g})")
     if negative > (most := LARGEST_NEGATIVE + error):
-        found.append(f"a bounce takes away {negative:.2g} of its light (above {most:.2g})")
-    if not found:
+        reasons.append(f"a bounce takes away {negative:.2g} of its light (above {most:.2g})")
+    if not reasons:
         return ""
     return (
-        f"{' and '.join(found)}: surfaces reflect differently to different sides, or T is noisy; with one "
+        f"{' and '.join(reasons)}: surfaces reflect differently to different sides, or T is noisy; with one "
         "camera the bounces of such a scene are approximate (section 8.4, eq. 28 and 29)"
     )
 
 
-@dataclass(frozen=True)
-class _Chain:
-    """Bounces 0, 1, ..., (N, k) of each channel, what is left of each, and the solves of each bounce."""
-
-    bounces: list[list[np.ndarray]]
-    rest: list[np.ndarray]
-    solutions: list[tuple[Solution, ...]]
-
-
-def _undo(
-    T: Transport, inverse: Inverse | None, method: str, options: dict[str, Any], left: Parts, k: int
-) -> tuple[Solution, ...]:
-    """S^-1 of what is `left` of each channel, for bounce k."""
-    if inverse is not None:
-        return tuple(inverse.solve(l, channel) for channel, l in enumerate(left))
-    return solve_each(T.systems, left, method, **_fresh(method, options, k))
-
-
-def _chain(undo: Callable[[Parts, int], tuple[Solution, ...]], columns: Parts, bounces: int) -> _Chain:
-    """`undo` is S^-1 of what is left, for bounce k."""
-    found, solutions, left = [], [], [l_out.astype(np.float64) for l_out in columns]
-    for k in range(bounces + 1):
-        solutions.append(undo(left, k))
-        found.append([solution.x.astype(np.float64) for solution in solutions[-1]])
-        left = [l - b_k for l, b_k in zip(left, found[-1], strict=True)]
-    return _Chain(found, left, solutions)
-
-
-def _fresh(method: str, options: dict[str, Any], k: int) -> dict[str, Any]:
-    """The options of bounce k: with random numbers of its own, or its noise would go with that of others."""
+def _with_seed(method: str, options: dict[str, Any], k: int) -> dict[str, Any]:
+    """The options of bounce k: random numbers of its own, or its noise would go with that of others."""
     if method not in SAMPLED:
         return options
     seed = options.get("seed", 0)
-    sampled.check_seed(seed)
+    monte_carlo.check_seed(seed)
     return {**options, "seed": (seed + k) % 2**64}

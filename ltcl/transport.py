@@ -1,26 +1,32 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Transport`: a measured light transport T, split as T = S F into first bounce and interreflection (eq. 3).
 
-F is diagonal: projector pixel j lights the point that camera pixel j sees. Dividing its columns by F gives
-S = T F^-1 = I + R, one operator per colour channel, on the device from its first use on.
+F is diagonal: projector pixel j lights the point that camera pixel j sees. Dividing the columns of T by F
+gives S = T F^-1 = I + R, one operator per colour channel, on the device from its first use on.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import weakref
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ltcl import channels, checks, first_bounces, inverse_diagonal, layout, reciprocity
+from ltcl import checks, diagnostics, layout
+from ltcl import first_bounce as _first_bounce
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Coupled, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
+from ltcl.operators import stored as stored_operators
 from ltcl.operators.interreflection import device_of, made_with, maskable, nbytes
+from ltcl.solvers import Inverse
 
 logger = logging.getLogger(__name__)
-_SAME = 1e-6  # relative difference of first bounces, which float32 hardly tells from none
+_SAME = 1e-6  # relative difference of first bounces that float32 does not resolve
+_ROUNDING = 1e-5  # of float32, in the products that show whether an inverse belongs to a transport
+_CANCELLATION = 0.5  # of diag(S) = 1 + diag(R): from here on, I + R has all digits of T F^-1
 
 
 class Transport:
@@ -59,6 +65,8 @@ class Transport:
     matrices : tuple of 1 or 3
         T on the host, as given and checked.
         Of 3 x 3 matrices, those on the diagonal; all of them are in `blocks`, else None.
+    is_compressed : bool
+        Whether some channel is an operator S F, as `ltcl.compress` makes it; see `error`.
     masked : (N,) bool
         Projector pixels dropped by ``on_dark="mask"``, in any channel.
     first_bounce_error : array like first_bounce, or None
@@ -93,32 +101,31 @@ class Transport:
         probes: int = 128,
         seed: int = 0,
     ) -> None:
-        self.blocks = channels.blocks(matrix)
-        self.matrices = (
-            channels.own(matrix) if self.blocks is None else tuple(self.blocks[c][c] for c in range(3))
+        self.blocks = layout.blocks(matrix)
+        self.matrices: tuple[Any, ...] = (
+            layout.matrices(matrix) if self.blocks is None else tuple(self.blocks[c][c] for c in range(3))
         )
-        self.mixing = None if mixing is None else channels.mixing(mixing, self.channels, self.blocks)
+        self.mixing = None if mixing is None else layout.mixing(mixing, self.channels, self.blocks)
         self.shape: tuple[int, int] = self.matrices[0].shape
         self.grid = checks.grid("grid", grid, self.shape[1])
         self.camera_grid = _camera_grid(camera_grid, self.shape, self.grid)
-        self._wanted_device = device
-        self._device: Device | None = device_of(self.blocks or [self.matrices], device)
-        self._systems: tuple[IdentityPlus, ...] | None = None
-        self._forward: tuple[Operator, ...] | None = None
         self.compression: Any = None
         self.masked: np.ndarray = np.zeros(self.shape[1], bool)
-        self._first_bounce: np.ndarray | None = None
         self.first_bounce_error: np.ndarray | None = None
-        self._reciprocity_defect: float | None = None
+        self.is_compressed = self.is_square and any(made_with(T) is not None for T in self.matrices)
+        self._requested_device = device
+        self._first_bounce: np.ndarray | None = None
+        self._is_diagonal = isinstance(first_bounce, str) and first_bounce == "diagonal"
+        self._cache: dict[str, Any] = {"device": device_of(self.blocks or [self.matrices], device)}
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
-        if not self.is_square and not (isinstance(first_bounce, str) and first_bounce == "diagonal"):
+        if not self.is_square and not self._is_diagonal:
             kind = self.shape if self.blocks is None else "of 3 x 3 blocks"
             raise InputError(f"first_bounce is given, but T is {kind}; only a square T of channels has one")
         if self.is_square:
             F = self._find_first_bounce(first_bounce, probes, seed)
             dark = F <= 0.0
             if dark.any():
-                first_bounces.refuse_dark(dark, self.grid, on_dark, all(map(maskable, self.matrices)))
+                _first_bounce.refuse_dark(dark, self.grid, on_dark, all(map(maskable, self.matrices)))
                 self.masked = np.asarray(dark.any(axis=0))
                 F = np.where(self.masked, 0.0, F)
             self._first_bounce = F
@@ -130,6 +137,20 @@ class Transport:
         if self.is_compressed:
             size = f", compressed to {checks.size(self.nbytes)} with an error of {self.error:.2g}"
         return f"<ltcl Transport {rows} x {columns}, {kind}, grid {h} x {w}{size}>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For `pickle` and `copy.deepcopy`: without the device, which is opened again when it is needed."""
+        state = {**self.__dict__, "_cache": {"device": None}}
+        if isinstance(device := self._requested_device, Device):
+            state["_requested_device"] = device.description.index
+        if any(isinstance(part, Operator) for row in self.blocks or [self.matrices] for part in row):
+            state["matrices"] = to_arrays(self)
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if isinstance(self.matrices, dict):
+            self.matrices = from_arrays(self.matrices, on_dark="mask", device=self.device).matrices
 
     @property
     def channels(self) -> int:
@@ -154,26 +175,34 @@ class Transport:
 
     @property
     def reciprocity_defect(self) -> float:
-        """Of the worst channel, by a sample of pixels (`ltcl.reciprocity`); computed at the first call."""
-        if self._reciprocity_defect is None:
+        """Of the worst channel, by a sample of pixels (`ltcl.diagnostics`); computed at the first call."""
+        if "defect" not in self._cache:
             pairs = zip(self.matrices, self._require_first_bounce(), strict=True)
-            found = [reciprocity.defect(T, F, entries=reciprocity.QUICK) for T, F in pairs]
-            self._reciprocity_defect = max(found)
-        return self._reciprocity_defect
+            defects = [diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK) for T, F in pairs]
+            self._cache["defect"] = max(defects)
+        return self._cache["defect"]
+
+    @property
+    def negative_bounces(self) -> tuple[float, ...]:
+        """Light that one bounce takes away, of each channel (`ltcl.diagnostics`); computed once."""
+        if "negative" not in self._cache:
+            self._cache["negative"] = tuple(diagnostics.negative_bounce(S, self.grid) for S in self.systems)
+        return self._cache["negative"]
 
     @property
     def device(self) -> Device:
         """The device of the operators; opened here if it was not yet."""
-        if self._device is None:
-            self._device = open_device(self._wanted_device)
-        return self._device
+        if self._cache["device"] is None:
+            self._cache["device"] = open_device(self._requested_device)
+        return self._cache["device"]
 
     @property
     def systems(self) -> tuple[IdentityPlus, ...]:
         """S = I + R of each channel, always as a tuple; uploaded at the first call."""
-        if self._systems is None:
-            self._systems = interreflections(self.matrices, self._require_first_bounce(), self.device)
-        return self._systems
+        if "systems" not in self._cache:
+            F = self._require_first_bounce()
+            self._cache["systems"] = interreflections(self.matrices, F, self.device)
+        return self._cache["systems"]
 
     @property
     def interreflection(self) -> IdentityPlus | tuple[IdentityPlus, ...]:
@@ -187,40 +216,38 @@ class Transport:
 
     @property
     def error(self) -> float:
-        """The largest `solution_error` of the systems: what light may be off by; 0 where all are exact.
+        """The largest `solution_error` of the systems, a bound on the relative error; 0 where all are exact.
 
         It is that of compression: rounding of products in float32, about 1e-7, comes on top.
         """
         return max(S.solution_error for S in self.systems) if self.is_compressed else 0.0
 
     @property
-    def is_compressed(self) -> bool:
-        """Whether some channel was given as S F, as `ltcl.compress` does; `error` is what that may cost."""
-        return self.is_square and any(made_with(T) is not None for T in self.matrices)
-
-    @property
     def operators(self) -> tuple[Operator, ...]:
         """T of each channel on the device, or one `Coupled` of all; see `join`."""
-        if self._forward is None:
+        if "operators" not in self._cache:
             if self.blocks is not None:
-                self._forward = (
-                    Coupled([[as_operator(T, self.device) for T in row] for row in self.blocks]),
-                )
-            elif self.mixing is not None:
-                self._forward = (Coupled.mixed(self._own_channels(), self.mixing),)
+                coupled = [[as_operator(T, self.device) for T in row] for row in self.blocks]
+                self._cache["operators"] = (Coupled(coupled),)
             else:
-                self._forward = self._own_channels()
-        return self._forward
+                own = tuple(self._operator(channel) for channel in range(self.channels))
+                M = self.mixing
+                self._cache["operators"] = own if M is None else (Coupled.mixed(own, M),)
+        return self._cache["operators"]
 
-    def _own_channels(self) -> tuple[Operator, ...]:
-        """S F where that is all of T, so that nothing is stored twice."""
-        if not self.is_square or self.masked.any():
-            return tuple(as_operator(matrix, self.device) for matrix in self.matrices)
-        F = self._require_first_bounce()
-        return tuple(
-            T if isinstance(T, Operator) else ScaledColumns(S, f)
-            for T, S, f in zip(self.matrices, self.systems, F, strict=True)
-        )
+    def _operator(self, channel: int) -> Operator:
+        """T of one channel: S F where that has all of its digits, so that nothing is stored twice."""
+        T = self.matrices[channel]
+        if (
+            self.is_square
+            and not self.masked.any()
+            and hasattr(T, "diagonal")
+            and not isinstance(T, Operator)
+        ):
+            F = self._require_first_bounce()[channel]
+            if self._is_diagonal or np.all(np.asarray(T.diagonal()) >= _CANCELLATION * F):
+                return ScaledColumns(self.systems[channel], F)
+        return as_operator(T, self.device)
 
     def join(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
         """What `operators` take, of one (N, k) a channel: the same, or all below each other, (3 N, k)."""
@@ -233,26 +260,24 @@ class Transport:
     def __matmul__(self, pattern: Any) -> np.ndarray:
         """Relight: the picture (float32) under `pattern`, frames and colours as in `ltcl.relight`."""
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
-        pictures = [_product(T, x) for T, x in zip(self.operators, self.join(columns), strict=True)]
+        pictures = [T.matmat(x) for T, x in zip(self.operators, self.join(columns), strict=True)]
         return shape.pack(self.split(pictures), self.camera_grid)
 
     def to_light(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 at masked pixels."""
-        return first_bounces.undone(columns, self._require_first_bounce(), self.mixing)
+        return layout.to_light(columns, self._require_first_bounce(), self.mixing)
 
-    def _find_first_bounce(self, wanted: Any, probes: int, seed: int) -> np.ndarray:
+    def _find_first_bounce(self, requested: Any, probes: int, seed: int) -> np.ndarray:
         checks.count("probes", probes, least=2)
         checks.count("seed", seed, least=0)
-        wanted_by_name = wanted if isinstance(wanted, str) else ""
-        if wanted_by_name == "exact" and first_bounces.too_large(self.matrices[0]):
-            logger.warning(
-                "T of %d pixels is too large for a dense inverse; its first bounce is estimated",
-                self.shape[1],
-            )
-            wanted_by_name = "estimate"
-        if wanted_by_name != "estimate":
-            return first_bounces.find(self.matrices, wanted)
-        F, error = inverse_diagonal.estimate(self.matrices, self.device, probes, seed)
+        how = requested if isinstance(requested, str) else ""
+        if how == "exact" and _first_bounce.too_large(self.matrices[0]):
+            n = self.shape[1]
+            logger.warning("T of %d pixels is too large for a dense inverse; F is estimated", n)
+            how = "estimate"
+        if how != "estimate":
+            return _first_bounce.find(self.matrices, requested)
+        F, error = _first_bounce.estimate(self.matrices, self.device, probes, seed)
         self.first_bounce_error = error[0] if self.channels == 1 else error
         return F
 
@@ -295,9 +320,150 @@ def refuse_other(name: str, other: Any, T: Transport, advice: str) -> None:
         raise InputError(f"{name} mixes colours in another way than T; {advice}")
 
 
-def _product(T: Operator, x: np.ndarray) -> np.ndarray:
-    """T x on the host for x (N, k)."""
-    return T.apply(T.device.upload(x)).get()
+def require_inverse(T: Transport, inverse: Any, rtol: float | None, **others: Any) -> None:
+    """Refuse an `inverse` that cannot serve for T at `rtol`, or arguments that it takes the place of.
+
+    Whether it belongs to T is tested by one random light, the first time.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        No inverse, one of another transport, an `rtol` below its error, or one of the `others` is not None.
+    """
+    if not isinstance(inverse, Inverse):
+        raise InputTypeError(f"inverse is a {type(inverse).__name__}; it must be what ltcl.invert(T) gives")
+    for name, value in others.items():
+        if value is not None:
+            raise InputError(f"{name} is given, but inverse takes the place of all solves; leave one out")
+    require(T)
+    inverse.refuse_beyond(rtol)
+    tested = T._cache.setdefault("inverses", weakref.WeakSet())
+    if inverse in tested:
+        return
+    refuse_other("inverse", inverse, T, "make it with ltcl.invert(T)")
+    v = np.random.default_rng(0).standard_normal(T.shape[1]).astype(np.float32)
+    misses = [np.linalg.norm(X @ (S @ v) - v) for X, S in zip(inverse.systems, T.systems, strict=True)]
+    deviation = float(max(misses) / np.linalg.norm(v))
+    allowed = inverse.error + T.error * (1.0 + inverse.error) + _ROUNDING
+    if not deviation <= allowed:
+        raise InputError(
+            f"inverse is not that of T: a random light comes back off by {deviation:.2g}, which may be "
+            f"{checks.upwards(allowed)} at most; make it with ltcl.invert(T)"
+        )
+    tested.add(inverse)
+
+
+def default_rtol(least: float, T: Transport, exact: Any = None, inverse: Inverse | None = None) -> float:
+    """Of a task without one: `least`, or the error of a compressed T or of an inverse where that is more.
+
+    >>> default_rtol(1e-3, Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2)))
+    0.001
+    """
+    error = inverse.error if inverse is not None else T.error if exact is None else 0.0
+    return max(least, error) if error < 1.0 else least  # which is refused, with the reason
+
+
+def to_arrays(T: Transport) -> dict[str, np.ndarray]:
+    """The arrays of a compressed T, whose every channel is S diag(d), by name: files and pickles hold these.
+
+    Beside what `ltcl.operators.stored` names there are grid (2,), first_bounce (channels, N), mixing (3, 3)
+    where colours mix, and columns_0, ... (N,) of channels with another d than the first bounce.
+
+    Raises
+    ------
+    InputTypeError
+        T is made of something else.
+    """
+    systems = [made_with(matrix) for matrix in T.matrices]
+    known = [S for S in systems if S is not None]
+    if not T.is_square or len(known) < len(systems):
+        kinds = ", ".join(sorted({type(matrix).__name__ for matrix in T.matrices}))
+        raise InputTypeError(
+            f"T is made of {kinds}; only arrays, sparse matrices and operators S diag(F) can be saved"
+            " or copied"
+        )
+    F = np.atleast_2d(T.first_bounce)
+    arrays = {"grid": np.array(T.grid), "first_bounce": F}
+    if T.mixing is not None:
+        arrays["mixing"] = T.mixing
+    for channel, (matrix, f) in enumerate(zip(T.matrices, F, strict=True)):
+        if not np.array_equal(matrix.d, f):
+            arrays[f"columns_{channel}"] = np.asarray(matrix.d, np.float64)
+    return arrays | stored_operators.to_arrays(known)
+
+
+def from_arrays(
+    arrays: Mapping[str, np.ndarray],
+    *,
+    grid: Any = None,
+    first_bounce: Any = None,
+    on_dark: str = "raise",
+    device: Device | str | None = None,
+) -> Transport:
+    """The transport of such arrays as `to_arrays` names, on a device that is opened at once.
+
+    Parameters
+    ----------
+    grid : (h, w), optional
+        Has to be that of the arrays.
+    first_bounce, on_dark, device
+        As in `Transport`; the first bounce of the arrays when not given.
+
+    Raises
+    ------
+    InputError
+        Arrays that are missing, or do not fit each other.
+
+    Examples
+    --------
+    >>> from ltcl.operators import Dense
+    >>> S = IdentityPlus(Dense(open_device(), [[0.0, 0.5], [0.5, 0.0]]))
+    >>> T = Transport(ScaledColumns(S, np.array([0.5, 0.25])), grid=(1, 2), first_bounce=[0.5, 0.25])
+    >>> print(from_arrays(to_arrays(T)) @ np.array([[1.0, 1.0]]))
+    [[0.625 0.5  ]]
+    """
+    F, own = arrays["first_bounce"], checks.grid("grid", arrays["grid"].tolist())
+    if grid is not None and checks.grid("grid", grid) != own:
+        raise InputError(f"grid is {grid!r}; this transport is compressed on its own, {own}")
+    systems = stored_operators.from_arrays(open_device(device), arrays)
+    if len(systems) != len(F):
+        raise InputError(f"first_bounce has {len(F)} channels, but there are {len(systems)} operators")
+    columns = [arrays.get(f"columns_{channel}", f) for channel, f in enumerate(F)]
+    matrices = [ScaledColumns(S, d) for S, d in zip(systems, columns, strict=True)]
+    return Transport(
+        matrices,
+        own,
+        first_bounce=F if first_bounce is None else first_bounce,
+        on_dark=on_dark,
+        mixing=arrays.get("mixing"),
+    )
+
+
+def resolve_reference(T: Transport, exact: Any) -> tuple[Transport, tuple[IdentityPlus | None, ...]]:
+    """The transport that counts, and the S that judges in each channel: T and none where `exact` is None.
+
+    A compressed T solves, the exact one judges (`ltcl.solvers.refinement`), and all that is shown is of that.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        `exact` is no Transport with an S, or not one of the same pixels, colours and first bounce as T.
+    """
+    if exact is None:
+        return T, (None,) * T.channels
+    require(T)
+    require(exact, name="exact")
+    refuse_other("exact", exact, T, "it must be that of T, or T made from exact")
+    return exact, exact.systems
+
+
+def error_note(error: float) -> str:
+    """Behind a result, by how much the T that it is of deviates; nothing where that is 0.
+
+    >>> error_note(0.0412), error_note(0.0)
+    (' with a T that itself is off by 0.042', '')
+    """
+    return f" with a T that itself is off by {checks.upwards(error)}" if error else ""
 
 
 def _camera_grid(camera_grid: Any, shape: tuple[int, int], grid: tuple[int, int]) -> tuple[int, int]:

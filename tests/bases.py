@@ -8,6 +8,7 @@ import scipy.sparse
 
 from ltcl.device import Array, Device
 from ltcl.operators import CSR, Compressed, Dense
+from ltcl.operators.base import Epilogue
 from ltcl.operators.bases import Basis
 
 
@@ -15,18 +16,14 @@ class Given(Basis):
     """W of any matrix (M, N)."""
 
     def __init__(self, device: Device, matrix: np.ndarray) -> None:
-        super().__init__(device, (1, matrix.shape[1]), "given", len(matrix))
+        self._on_device = Dense(device, matrix)
+        super().__init__(device, (1, matrix.shape[1]), "given", len(matrix), self._on_device)
         self.matrix = matrix.astype(np.float32).astype(np.float64)  # as it lies on the device
         self.orthonormal = bool(np.allclose(matrix.T @ matrix, np.eye(matrix.shape[1]), atol=1e-5))
         self.isometric = bool(np.allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=1e-5))
-        self._on_device = Dense(device, matrix)
 
-    @property
-    def nbytes(self) -> int:
-        return self._on_device.nbytes
-
-    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        self._on_device._product(x, out, scale, add, transpose)
+    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
+        self._on_device._product(x, out, epilogue, transpose)
 
 
 def rotation(n: int, seed: int = 0) -> np.ndarray:

@@ -6,14 +6,12 @@ A twin is named after its kernel; the `_stream` and `_group` variants of a kerne
 
 from __future__ import annotations
 
-import bisect
 import itertools
 import math
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 
 UNIT = 2.0**-24  # largest relative error of rounding to float32
 _LEAVES = 4096  # work-items among which the dot product spreads its rows, where there are that many
@@ -94,53 +92,59 @@ def vector_dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.atleast_1d(np.sum(np.asarray(x, np.float64) * np.asarray(y, np.float64), axis=0))
 
 
-def vector_keep(
-    weights: np.ndarray, squares: np.ndarray, slot: int, lowest: float, x: np.ndarray, best: np.ndarray
-) -> np.ndarray:
-    """x where the weighted residual of row `slot` is at most `lowest` and those before, all finite."""
-    worst = np.max(np.float32(weights) * np.float32(squares[: slot + 1]), axis=1)  # NaN comes through
-    whole = np.isfinite(worst[:-1]).all()
-    return x if whole and worst[-1] <= min([np.float32(lowest), *worst[:-1]]) else best
+def vector_step(
+    p, x, r, d, keep: float, gain: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """x + d, r - p, keep d + gain (r - p), and the squares of r - p added up, (k,)."""
+    p, x, r, d = (np.asarray(v, np.float64) for v in (p, x, r, d))
+    return x + d, r - p, keep * d + gain * (r - p), vector_dot(r - p, r - p)
+
+
+def vector_sums(sums: np.ndarray) -> np.ndarray:
+    """(slots, groups, k) added up over the groups, (slots, k)."""
+    return np.sum(np.asarray(sums, np.float64), axis=1)
 
 
 def vector_triad(a: float, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return vector_axpby(a, b, 1.0, c)
 
 
-def relax_dense(
-    M: np.ndarray,
-    start: int,
-    shift: float,
-    scale: float,
+def relax_rows(
+    S: np.ndarray, split: np.ndarray, x: np.ndarray, y: np.ndarray, b: np.ndarray, carry: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """r and the next carry of a sweep from x to y, with row i split before column split[i]."""
+    lower = np.where(np.arange(len(S)) < split[:, None], S, 0.0)
+    return carry - (S - lower) @ x, b - lower @ y
+
+
+def relax_strips(
+    S: np.ndarray,
+    block: int,
+    omega: float | None,
     x: np.ndarray,
-    y: np.ndarray,
     b: np.ndarray,
     carry: np.ndarray,
+    *,
+    in_place: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """s, r and the next carry of all rows; S = shift I + scale M, times y before column `start`."""
-    M, x, y = (np.asarray(values, np.float64) for values in (M, x, y))
-    lower, upper = scale * (M[:, :start] @ y[:start]), shift * x + scale * (M[:, start:] @ x[start:])
-    return b - lower - upper, carry - upper, b - lower
+    """The next iterate, r and the next carry; of block Gauss-Seidel where omega is None."""
+    y = block_gauss_seidel(S, x, b, block) if omega is None else sor(S, x, b, omega)
+    i = np.arange(len(S))
+    return y, *relax_rows(S, i if in_place else i - i % block, x, y, b, carry)
 
 
-def relax_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
-    """The same of a sparse M."""
-    n = len(pointers) - 1
-    return relax_dense(
-        scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray(), *arguments
-    )
+def relax_correct(inverse: np.ndarray, s: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The block of x with its correction."""
+    return x + inverse @ s
 
 
-def relax_substitute(
-    S: np.ndarray, omega: float | None, before: int, start: int, stop: int, s: np.ndarray, delta: np.ndarray
-) -> np.ndarray:
-    """The delta of P_AA delta_A = s_A - S_AO delta_O: of relax_substitute, where O is empty, and the others.
-
-    P is the triangle with D / omega, or S where omega is None.
-    """
-    own = np.asarray(S, np.float64)[start:stop, start:stop]
-    P = own if omega is None else np.tril(own, -1) + np.diag(own.diagonal() / omega)
-    return np.linalg.solve(P, s[start:stop] - S[start:stop, before:start] @ delta[before:start])
+def relax_windows(M: np.ndarray, block: int, panel: int, *, inverses: bool) -> np.ndarray:
+    """The first entry of each row from its panel on, and from its block or its diagonal on, (N, 2)."""
+    i = np.arange(len(M))
+    edges = np.stack([i - i % panel, i - i % block if inverses else i], axis=1)
+    counts = [[np.count_nonzero(row[:edge]) for edge in pair] for row, pair in zip(M, edges, strict=True)]
+    starts = np.concatenate([[0], np.cumsum(np.count_nonzero(M, axis=1))[:-1]])
+    return starts[:, None] + np.array(counts)
 
 
 def block_gauss_seidel(
@@ -164,34 +168,14 @@ def sor(S: np.ndarray, x: np.ndarray, b: np.ndarray, omega: float = 1.0, sweeps:
     return x
 
 
-def southwell_pick(
-    rows: int, parts: int, shift: float, diagonal: np.ndarray, x: np.ndarray, r: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """x, r, picked and delta after one pick in each part; x and r are (N, k)."""
-    edges = np.arange(parts + 1) * rows // parts
+def southwell_step(S: np.ndarray, parts: int, x: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x and r, (N, k), after the largest residual of each part was made zero."""
+    edges = np.arange(parts + 1) * len(S) // parts
     picked = np.array([a + np.argmax(np.abs(r[a:b]), axis=0) for a, b in itertools.pairwise(edges)])
+    d = np.zeros(r.shape)
     here = (picked, np.arange(r.shape[1]))
-    delta = r[here] / diagonal[picked]
-    x, r = x.copy(), r.copy()
-    x[here] += delta
-    r[here] -= shift * delta
-    return x, r, picked, delta
-
-
-def southwell_dense(
-    M: np.ndarray, scale: float, picked: np.ndarray, delta: np.ndarray, r: np.ndarray
-) -> np.ndarray:
-    """r - scale M[:, picked] delta, each right-hand side with its own."""
-    columns = range(r.shape[1])
-    return r - scale * np.stack([M[:, picked[:, c]] @ delta[:, c] for c in columns], axis=1)
-
-
-def southwell_csr(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, *arguments):
-    """The same with the sparse rows of M^T."""
-    n = len(pointers) - 1
-    return southwell_dense(
-        scipy.sparse.csr_array((values, columns, pointers), shape=(n, n)).toarray().T, *arguments
-    )
+    d[here] = r[here] / S.diagonal()[picked]
+    return x + d, r - S @ d
 
 
 def random_philox(counters: np.ndarray, seed: int) -> np.ndarray:
@@ -212,11 +196,11 @@ def _scaled(values: np.ndarray, shift: int) -> list[int]:
     return [math.floor(value + Fraction(1, 2)) for value in exact]
 
 
-def _integers(values: np.ndarray, cdf: bool) -> tuple[list[int], Fraction]:
+def _integers(values: np.ndarray) -> tuple[list[int], Fraction]:
     """The row scaled by a power of two so that its sum has as many bits as fit, and its sum unscaled."""
     n, largest = len(values), float(np.max(np.abs(values)))
     exponent = max(math.frexp(largest)[1], -125)  # of the smallest normal float32
-    budget = 41 if cdf else min(45, 63 - n.bit_length())
+    budget = min(45, 63 - n.bit_length())
     rough = 31 - exponent
     shift = rough + budget - 1 - (sum(_scaled(values, rough)) + n).bit_length()
     scaled = _scaled(values, shift)
@@ -251,28 +235,16 @@ def _alias(n: int, masses: list[int], capacity: int, targets: list[int]) -> list
     return bins
 
 
-def alias_dense(values: np.ndarray, sampler: str) -> tuple[int, np.float32, list[int]]:
-    """Entries that count, |R_i| and the table of one row, columns 0, 1, ..."""
-    return alias_csr(np.arange(len(values)), values, sampler)
-
-
-def alias_csr(columns: np.ndarray, values: np.ndarray, sampler: str) -> tuple[int, np.float32, list[int]]:
+def alias_rows(columns: np.ndarray, values: np.ndarray) -> tuple[int, np.float32, list[int]]:
     """Entries that count, |R_i| and the table of one row."""
     n = len(values)
     if not np.any(values):
         return 0, np.float32(0), []
-    scaled, exact = _integers(values, sampler == "cdf")
+    scaled, exact = _integers(values)
     total = np.float32(float(exact))
     count = n if total >= np.finfo(np.float32).tiny else 0
     targets = [int(c) << 1 | int(np.signbit(v)) for c, v in zip(columns, values, strict=True)]
-    if sampler == "alias":
-        table = _alias(n, [n * mass for mass in scaled], sum(scaled), targets)
-    elif sampler == "cdf":
-        sums = itertools.accumulate(scaled)
-        table = [part << 23 | target for part, target in zip(sums, targets, strict=True)]
-    else:
-        bits = np.asarray(values, np.float32).view(np.uint32)
-        table = [int(bit) << 32 | int(c) for bit, c in zip(bits, columns, strict=True)]
+    table = _alias(n, [n * mass for mass in scaled], sum(scaled), targets)
     return count, total if count else np.float32(0), table
 
 
@@ -288,12 +260,12 @@ def walk(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Walks from pixels[w], sample samples[w], all at once: scores (w, k) float32, ends and lengths (w,).
 
-    `tables` are records, entries, the sampler and, of walks with three weights, links; then column j of b is
-    of channel j % 3. steps are (L, 2) uint32. Without b a walk scores its weight where it ends, the adjoint.
+    `tables` are records, entries, channels and links or None; column j of b is of channel j % channels. steps
+    are (L, 2) uint32. Without b a walk scores its weight where it ends, the adjoint.
     """
-    records, entries, sampler, *links = tables
+    records, entries, channels, links = tables
     row, step = np.array(pixels), np.zeros(len(pixels), np.int64)
-    weight = np.ones((len(row), 3 if links else 1), np.float32)
+    weight = np.ones((len(row), channels), np.float32)
     scores = np.zeros((len(row), 1 if b is None else b.shape[1]), np.float32)
     alive = np.ones(len(row), bool)
     while alive.any():
@@ -301,10 +273,11 @@ def walk(
         words = random_philox(counters.astype(np.uint32), seed).astype(np.uint64).reshape(-1, 2, 2)
         word = words[np.arange(len(row)), step % 2]
         word = word[:, 0] | word[:, 1] << np.uint64(32)
-        target, factor = _draw(records[row], entries, word, sampler)
+        target, factor = _draw(records[row], entries, word)
         factor = factor[:, None]
-        if links:
-            target, factor = _linked(links[0], records[row], target)
+        if links is not None:
+            target, factor = _linked(links, records[row], target)
+            factor = factor[:, :channels]
         alive &= np.any(factor != 0, axis=1)
         here = np.flatnonzero(alive)
         row[here] = target[here] >> 1
@@ -365,9 +338,7 @@ def random_loads(items: int, chains: int, steps: int, words: np.ndarray) -> np.n
         return state.reshape(items, chains).sum(axis=1)
 
 
-def _draw(
-    records: np.ndarray, entries: np.ndarray, word: np.ndarray, sampler: str
-) -> tuple[np.ndarray, np.ndarray]:
+def _draw(records: np.ndarray, entries: np.ndarray, word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Column and sign in one number, and what weights are multiplied by, of one entry of each row."""
     count = records[:, 2].astype(np.uint64)
     start = records[:, 0].astype(np.uint64) | records[:, 1].astype(np.uint64) << np.uint64(32)
@@ -375,29 +346,18 @@ def _draw(
     place = (word >> np.uint64(22)) * count
     slot = np.where(count > 0, start + (place >> np.uint64(42)), 0)
     entry = entries[slot] if entries.size else np.zeros(len(slot), np.uint64)
-    if sampler == "alias":
-        fraction = place >> np.uint64(24) & np.uint64(2**18 - 1)
-        own = fraction < entry >> np.uint64(46)
-        target = np.where(own, entry >> np.uint64(23), entry) & np.uint64(2**23 - 1)
-        return target.astype(np.int64), factor
-    if sampler == "uniform":
-        value = (entry >> np.uint64(32)).astype(np.uint32).view(np.float32)
-        target = (entry & np.uint64(2**32 - 1)).astype(np.int64) * 2 + np.signbit(value)
-        return target, np.where(count > 0, count.astype(np.float32) * np.abs(value), np.float32(0))
-    target = np.zeros(len(word), np.int64)
-    for w in np.flatnonzero(count):
-        table = [int(e) for e in entries[int(start[w]) : int(start[w] + count[w])]]
-        sums = [e >> 23 for e in table]
-        part = (int(word[w]) >> 22) * sums[-1] >> 42
-        target[w] = table[bisect.bisect_right(sums, part)] & (2**23 - 1)
-    return target, factor
+    fraction = place >> np.uint64(24) & np.uint64(2**18 - 1)
+    own = fraction < entry >> np.uint64(46)
+    target = np.where(own, entry >> np.uint64(23), entry) & np.uint64(2**23 - 1)
+    return target.astype(np.int64), factor
 
 
 def _linked(links: np.ndarray, records: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Column, doubled, and three factors of the entries drawn; 0 of rows without."""
     start = records[:, 0].astype(np.int64) | records[:, 1].astype(np.int64) << 32
     full = records[:, 2] > 0
-    link = np.where(full[:, None], links[np.where(full, start + (target >> 1), 0)], 0).astype(np.uint32)
+    links = np.append(links, np.zeros((1, 4), np.uint32), axis=0)
+    link = links[np.where(full, start + (target >> 1), -1)]
     return link[:, 0].astype(np.int64) << 1, np.ascontiguousarray(link[:, 1:]).view(np.float32)
 
 
@@ -546,15 +506,61 @@ def dot_error(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return gamma(roundings) * vector_dot(np.abs(x), np.abs(y))
 
 
-def bounded_look(
-    lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray, d: np.ndarray, h: np.ndarray
+def krylov_dots(V: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """<v_j, w> of every column for V (J, N, k), and <w, w>: (J + 1, k)."""
+    return np.einsum("jnk,nk->jk", np.concatenate([V, w[None]]), w, dtype=np.float64)
+
+
+def krylov_pairs(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray) -> np.ndarray:
+    """sum_i weights_i x_i y_i of every column for each pair."""
+    return np.stack([np.sum(weights.astype(np.float64) * x * y, axis=0) for x, y in pairs])
+
+
+def krylov_subtract(
+    V: np.ndarray, w: np.ndarray, h: np.ndarray, square: np.ndarray | None = None
 ) -> np.ndarray:
-    """Gap, z.z, z.h and z.d of every column, (4, k); bounds are (N,), the rest (N, k)."""
-    lower, upper, x, g, d, h = (np.asarray(part, np.float64) for part in (lower, upper, x, g, d, h))
+    """w - sum_j h_j v_j with h (J, k); of length 1 where `square`, <w, w> of orthonormal v_j, is given."""
+    left = w - np.einsum("jk,jnk->nk", h, V, dtype=np.float64)
+    return left if square is None else left / np.sqrt(square - np.sum(h.astype(np.float64) ** 2, axis=0))
+
+
+def krylov_cg(
+    sums: np.ndarray, previous: np.ndarray, last: np.ndarray, moves: np.ndarray, *vectors: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """alpha (k,), then p, q, x and r after a step, of z, w, p, q, x and r before; sums <z, z> and <w, z>."""
+    (square, product), (z, w, p, q, x, r) = sums, (v.astype(np.float64) for v in vectors)
+    beta = square / previous
+    alpha = square / (product - beta * square / last)
+    p, q = np.where(moves, z + beta * p, p), np.where(moves, w + beta * q, q)
+    alpha = np.where(moves, alpha, 0.0)
+    return alpha, p, q, x + alpha * p, r - alpha * q
+
+
+def krylov_half(rho: np.ndarray, sigma: np.ndarray, r: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """s = r - alpha v with alpha = rho / <r*, v>."""
+    return r - rho / sigma * v.astype(np.float64)
+
+
+def krylov_bicgstab(
+    sums: np.ndarray, rho: np.ndarray, alpha: np.ndarray, *vectors: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """The next rho (k,), then x, r and p of s, t, v, p and x; sums <t, s>, <t, t>, <r*, s> and <r*, t>."""
+    (ts, tt, shadow_s, shadow_t), (s, t, v, p, x) = sums, (u.astype(np.float64) for u in vectors)
+    omega = ts / tt
+    following = shadow_s - omega * shadow_t
+    r = s - omega * t
+    beta = following / rho * alpha / omega
+    return following, x + alpha * p + omega * s, r, r + beta * (p - omega * v)
+
+
+def bounded_look(
+    lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray, h: np.ndarray
+) -> np.ndarray:
+    """Gap and z.h of every column, (2, k); bounds are (N,), the rest (N, k)."""
+    lower, upper, x, g, h = (np.asarray(part, np.float64) for part in (lower, upper, x, g, h))
     lower, upper = lower[:, None], upper[:, None]
-    z = _free(lower, upper, x, g)
     gap = np.maximum(g * (x - lower), g * (x - upper))
-    return np.stack([part.sum(axis=0) for part in (gap, z * z, z * h, z * d)])
+    return np.stack([gap.sum(axis=0), (_free(lower, upper, x, g) * h).sum(axis=0)])
 
 
 def bounded_direction(
@@ -574,6 +580,12 @@ def bounded_direction(
     way = np.where(step > 0, upper, lower) - x
     share = np.divide(step, way, out=np.zeros_like(step), where=step != 0)
     return step, np.stack([(g * step).sum(axis=0), (step * step).sum(axis=0), share.max(axis=0)])
+
+
+def bounded_weigh(w: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """w v, w w v and the sums of squares of w v, column by column, of (n, k)."""
+    w, v = np.asarray(w, np.float64), np.asarray(v, np.float64)
+    return w * v, w * w * v, np.sum((w * v) ** 2, axis=0)
 
 
 def bounded_move(

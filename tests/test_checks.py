@@ -122,6 +122,10 @@ REFUSED = {
 }
 
 WRONG_TYPES = {
+    "masked array": (
+        lambda: checks.real("desired", np.ma.masked_greater(np.arange(4.0), 2)),
+        "desired is a masked array with 1 masked",
+    ),
     "text": (lambda: checks.real("b", ["a"]), "b holds <U1; it must hold real numbers"),
     "complex": (lambda: checks.real("b", [1j]), "b holds complex128"),
     "object": (lambda: checks.real("b", [None]), "b holds object"),
@@ -218,3 +222,11 @@ def test_memory_is_known_without_proc(monkeypatch):
 )
 def test_sizes_as_people_read_them(nbytes, text):
     assert checks.size(nbytes) == text
+
+
+@pytest.mark.parametrize("form", ["csr", "csc", "coo", "bsr", "dia"])
+def test_half_precision_is_converted(form):
+    matrix = gallery.sparse(5, 7).asformat(form)
+    wanted = matrix.toarray().astype(np.float16)
+    matrix.data = matrix.data.astype(np.float16)
+    np.testing.assert_array_equal(checks.csr("T", matrix).toarray(), wanted)

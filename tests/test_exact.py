@@ -11,10 +11,10 @@ import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl import checks, exact, reciprocity, separation
+from ltcl import checks
 from ltcl.device import Device
-from ltcl.errors import DeviceError, InputError, InputTypeError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, ScaledColumns, Shifted, Wavelet
+from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Shifted, Wavelet
 from tests.bases import Given, rotation, stands_for, two_sided
 from tests.problems import enclosure
 
@@ -65,28 +65,12 @@ def test_operators_are_taken_as_they_stand(device):
     assert repr(T).endswith(f" with an error of {T.error:.2g}>")
 
 
-def test_exact_ones_have_no_error(device):
-    _, T = pair(device)
-    assert T.error == 0.0
-    assert "compressed" not in repr(T)
-    assert ltcl.Transport(np.ones((12, N)), GRID, camera_grid=(3, 4)).error == 0.0
-    matrix, _, _ = given(device)
-    coupled = ltcl.Transport([[matrix] * 3] * 3, GRID)  # of which no S is solved
-    assert coupled.error == 0.0
-    assert repr(coupled) == "<ltcl Transport 42 x 42, colour, grid 6 x 7>"
-
-
 def test_three_share_what_they_share(device):
     W = Given(device, rotation(N))
     cores = [CSR(device, scipy.sparse.csr_array(scene.R)) for scene in SCENES]
     matrices = [ScaledColumns(IdentityPlus(Compressed(C, W, W)), f) for C, f in zip(cores, F, strict=True)]
     T = ltcl.Transport(matrices, GRID, first_bounce=F)
-    patterns = {core.pattern for core in cores}
-    assert len(patterns) == 3
     assert T.nbytes == sum(core.nbytes for core in cores) + W.nbytes
-    dual = [ScaledColumns(IdentityPlus(CSR(device, cores[0]._host, cores[0].pattern)), f) for f in F]
-    T = ltcl.Transport(dual, GRID, first_bounce=F)
-    assert T.nbytes == 3 * 4 * cores[0].nnz + cores[0].pattern.nbytes
 
 
 def test_another_first_bounce_makes_another_S(device):
@@ -104,24 +88,6 @@ def test_another_first_bounce_makes_another_S(device):
     assert np.all(np.linalg.norm(off - x, axis=0) <= T.error * np.linalg.norm(x, axis=0))
 
 
-def test_the_diagonal_is_that_of_the_operator(device):
-    matrix, S, _ = given(device)
-    T = ltcl.Transport(matrix, GRID)
-    np.testing.assert_allclose(T.first_bounce, S.diagonal() * F[1], rtol=1e-5)
-
-
-def test_products_stay_on_the_device(device, monkeypatch):
-    """Operators that are no S F go to the device as they are, too, not through the host."""
-    T = ltcl.Transport(Dense(device, SCENES[0].S * F[0]), GRID, first_bounce=F[0])
-    S = T.systems[0]
-    x = device.upload(rng.uniform(size=N))
-    out = x.like()
-    monkeypatch.setattr(type(x), "get", lambda self: pytest.fail("an array went to the host"))
-    S.apply(x, out)
-    monkeypatch.undo()
-    np.testing.assert_allclose(out.get(), SCENES[0].S @ x.get(), rtol=1e-5)
-
-
 def test_masked_pixels_stay_dark(device):
     f = np.where(np.arange(N) % 5 == 0, 0.0, F[1])
     matrix, _, _ = given(device, f=f)
@@ -134,28 +100,13 @@ def test_masked_pixels_stay_dark(device):
     np.testing.assert_allclose(found.pattern.ravel()[~T.masked], 0.5, atol=0.05)
 
 
-def test_one_device_for_all(device, small_device):
-    matrix, _, _ = given(device)
-    assert ltcl.Transport(matrix, GRID, first_bounce=F[1], device=device).device is device
-    with pytest.raises(InputError, match=r"device is .* but operators lie on"):
-        ltcl.Transport(matrix, GRID, first_bounce=F[1], device=small_device)
-    with pytest.raises(InputError, match="matrix has operators on several devices"):
-        ltcl.Transport([matrix, matrix, given(small_device)[0]], GRID, first_bounce=F)
-    with pytest.raises(DeviceError):
-        ltcl.Transport(matrix, GRID, first_bounce=F[1], device="there is none")
-
-
 def test_tolerances_below_the_error_are_refused_with_the_figure(device):
     C, T = pair(device)
     picture = T @ np.full(GRID, 0.5)
     for task in (ltcl.compensate, ltcl.separate):
         with pytest.raises(InputError) as refused:
             task(C, picture, rtol=1e-6)
-        assert re.fullmatch(
-            r"rtol is 1e-06; S is compressed and its solutions may be off by 0\.\d+: ask for no less, or "
-            r"give exact=T, the uncompressed transport",
-            str(refused.value),
-        )
+        assert re.search(r"rtol is 1e-06.* 0\.\d+.*exact=T", str(refused.value))
 
 
 def test_results_tell_of_which_T_they_are(device):
@@ -177,25 +128,6 @@ def test_results_tell_of_which_T_they_are(device):
     ):
         assert found.transport_error == 0.0
         assert "itself" not in repr(found)
-
-
-def test_a_bounce_is_as_exact_as_T_is(device):
-    C, T = pair(device)
-    assert separation.usual_rtol(T) == separation.usual_rtol(C, T) == 1e-3
-    assert separation.usual_rtol(C) == max(C.error, 1e-3)
-    R = two_sided(device, SCENES[1].R, 0.5)
-    unknown = ScaledColumns(IdentityPlus(R, solution_error=np.inf), F[1])
-    with pytest.raises(InputError, match=r"rtol is 0\.001; .* off by inf: .* or give exact=T,"):
-        ltcl.separate(ltcl.Transport(unknown, GRID, first_bounce=F[1]), np.ones(GRID))
-
-
-def test_compensation_is_as_good_as_it_says(device):
-    C, T = pair(device)
-    p = rng.uniform(0.3, 0.7, GRID)
-    found = ltcl.compensate(C, T @ p, rtol=C.error)
-    l_d, off = F[1] * p.ravel(), F[1] * (found.pattern - p).ravel()
-    slack = np.linalg.cond(np.eye(N) + SCENES[1].R) * C.error  # of the residual that rtol leaves
-    assert np.linalg.norm(off) <= (C.error + slack) * np.linalg.norm(l_d)
 
 
 @pytest.mark.parametrize("kind", [pair, colour])
@@ -263,8 +195,8 @@ def test_what_does_not_lie_beside(device, small_device):
     matrix = T.matrices[0]
     S: Any = T.interreflection
     for other, kind, part in (
-        (matrix, InputTypeError, "exact is a ndarray; it must be a ltcl.Transport: give exact=T, the unc"),
-        (S, InputTypeError, "exact is a IdentityPlus; .* give exact=T, the uncompressed"),
+        (matrix, InputTypeError, "exact is a ndarray"),
+        (S, InputTypeError, "exact is a IdentityPlus"),
         (rgb, InputError, "exact has channels 3; it must be that of T, 1"),
         (
             ltcl.Transport(matrix, (7, 6)),
@@ -280,7 +212,7 @@ def test_what_does_not_lie_beside(device, small_device):
                 task(C, np.ones(GRID), exact=other)
     mixed = ltcl.Transport(rgb.matrices, GRID, first_bounce=F, mixing=np.eye(3) + 0.1)
     with pytest.raises(InputError, match="exact mixes colours in another way"):
-        exact.beside(rgb, mixed)
+        ltcl.compensate(rgb, np.ones((*GRID, 3)), exact=mixed)
     with pytest.raises(InputTypeError, match="'monte_carlo' samples; leave it out"):
         ltcl.separate(C, np.ones(GRID), method="monte_carlo", exact=T)
 
@@ -298,13 +230,6 @@ def test_analysis_by_products(device):
     assert ours.energy.bounce_highest == pytest.approx(theirs.energy.bounce_highest, abs=1e-2)
     assert ours.energy.albedo_from_columns == pytest.approx(theirs.energy.albedo_from_columns, abs=1e-2)
     assert ours.products["jacobi"] == pytest.approx(theirs.products["jacobi"], abs=1)
-
-
-def test_a_defect_by_products_is_that_of_the_entries(device):
-    T = SCENES[0].S * F[0] * rng.uniform(0.8, 1.2, (N, N))
-    assert reciprocity.defect(Dense(device, T), F[0]) == pytest.approx(reciprocity.defect(T, F[0]), rel=1e-4)
-    some = reciprocity.defect(Dense(device, T), F[0], entries=16 * 20**2)  # 20 pixels, a product each
-    assert some == pytest.approx(reciprocity.defect(T, F[0], entries=20**2), rel=1e-4)
 
 
 def test_tasks_accept_a_T_without_any_bound(device):

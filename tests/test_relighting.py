@@ -5,12 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
 
 import ltcl
 from ltcl.errors import InputError, InputTypeError
-from tests.problems import lambertian
 
 GRID = (3, 5)
 N = 15
@@ -41,35 +38,6 @@ def test_it_is_the_product_with_the_matrix(device, shape, camera, channels):
     front = shape[:1] if len(shape) - colour == 3 else ()
     wanted_shape = (*front, *pixels, *((3,) if len(wanted) == 3 else ()))
     np.testing.assert_allclose(picture, np.stack(wanted, axis=-1).reshape(wanted_shape), rtol=1e-6)
-
-
-@settings(max_examples=50, deadline=None)
-@given(
-    st.tuples(st.integers(1, 6), st.integers(1, 6)),
-    st.sampled_from(["flat", "one", "frames"]),
-    st.booleans(),
-    st.integers(1, 4),
-    st.sampled_from([1, 3]),
-)
-def test_an_empty_wall_returns_what_it_is_lit_with(device, grid, kind, colour, frames, channels):
-    """T = I: a pattern of any layout comes back as it was."""
-    assume((frames, *grid) != (3, 3, 3))  # taken for one picture in colour
-    n = grid[0] * grid[1]
-    shape = {"flat": (n,), "one": grid, "frames": (frames, *grid)}[kind] + (
-        (3,) if colour and kind != "flat" else ()
-    )
-    T = ltcl.Transport([np.eye(n)] * channels, grid, device=device)
-    pattern = random.uniform(-1.0, 1.0, shape).astype(np.float32)
-    grey = not (colour and kind != "flat")
-    wanted = np.repeat(pattern[..., None], 3, axis=-1) if grey and channels == 3 else pattern
-    np.testing.assert_array_equal(T @ pattern, wanted)
-
-
-def test_patterns_of_integers_are_light_as_they_stand(device):
-    scene = lambertian(N, 0.5)
-    pattern = random.integers(0, 256, GRID).astype(np.uint8)
-    picture = ltcl.relight(ltcl.Transport(scene.T, GRID, device=device), pattern)
-    np.testing.assert_allclose(picture.ravel(), scene.T @ pattern.ravel().astype(float), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

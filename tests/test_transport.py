@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,9 @@ import scipy.sparse
 from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 import ltcl
-from ltcl import first_bounces
+from ltcl import first_bounce
 from ltcl.errors import DeviceError, InputError, InputTypeError, LtclError
-from ltcl.operators import Dense
+from ltcl.operators import Dense, IdentityPlus, ScaledColumns
 from tests.problems import lambertian
 
 GRID = (5, 7)
@@ -110,11 +112,6 @@ def test_the_device_wanted_is_the_device_used(small_device):
     assert T.interreflection is T.systems[0]
     assert T.systems[0].R.device is small_device
     np.testing.assert_allclose((T @ pattern(*GRID)).ravel(), SCENE.T @ pattern(35), rtol=ROUNDING)
-
-
-def test_operators_of_ltcl_are_taken_too(device):
-    T = transport(Dense(device, SCENE.T), device=device)  # it knows its diagonal
-    np.testing.assert_allclose(T @ pattern(*GRID), (SCENE.T @ pattern(35)).reshape(GRID), rtol=1e-5)
 
 
 @pytest.mark.parametrize("form", ["array", "csr", "operator"])
@@ -229,7 +226,7 @@ BAD: dict[str, tuple[Any, dict[str, Any], type[LtclError], str]] = {
         BARE,
         {},
         InputError,
-        "first_bounce is 'diagonal', but a Bare does not tell its diagonal",
+        "first_bounce is 'diagonal', .* Bare",
     ),
     "no inverse": (BARE, {"first_bounce": "exact"}, InputTypeError, "first_bounce='exact' inverts.*Bare"),
     "singular": (
@@ -253,4 +250,48 @@ def test_bad_input_is_refused_by_name(case, monkeypatch):
 def test_what_would_not_fit_the_host_is_said_before(monkeypatch):
     monkeypatch.setattr("ltcl.checks.host_memory", lambda: 1024)
     with pytest.raises(MemoryError, match="first_bounce='exact' inverts T densely, which for N = 35 needs"):
-        first_bounces.find([SCENE.T], "exact")  # a Transport would turn to an estimate
+        first_bounce.find([SCENE.T], "exact")  # a Transport would turn to an estimate
+
+
+# Copies.
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda T: pickle.loads(pickle.dumps(T))])  # noqa: S301
+@pytest.mark.parametrize(
+    "kind", ["array", "csr", "colour", "mixing", "blocks", "operator S F", "open device"]
+)
+def test_a_used_transport_is_copied_and_pickled(device, kind, again):
+    matrix: Any = SCENE.T
+    arguments: dict[str, Any] = {"device": device if kind == "open device" else None}
+    if kind == "csr":
+        matrix = scipy.sparse.csr_array(matrix)
+    elif kind in ("colour", "mixing"):
+        matrix = [scene.T for scene in SCENES]
+        arguments["mixing"] = np.eye(3) + 0.1 if kind == "mixing" else None
+    elif kind == "blocks":
+        matrix = [[scene.T for scene in SCENES]] * 3
+    elif kind == "operator S F":
+        S = IdentityPlus(Dense(device, SCENE.R), solution_error=1e-3)
+        matrix, arguments["first_bounce"] = ScaledColumns(S, SCENE.F), SCENE.F
+    T = transport(matrix, **arguments)
+    p = pattern(*GRID) if T.channels == 1 else pattern(*GRID, 3)
+    before = T @ p, ltcl.compensate(T, 0.1 * p).pattern
+    other = again(T)
+    assert repr(other) == repr(T)
+    np.testing.assert_array_equal(other @ p, before[0])
+    np.testing.assert_allclose(ltcl.compensate(other, 0.1 * p).pattern, before[1], atol=1e-6)
+
+
+def test_a_bare_operator_cannot_leave_its_device(device):
+    with pytest.raises(InputTypeError, match="operators on a device"):
+        pickle.dumps(transport(Dense(device, SCENE.T)))
+
+
+@pytest.mark.parametrize("form", ["array", "csr", "operator"])
+@pytest.mark.parametrize("share", [1e-4, 1e-30])
+def test_relighting_has_all_digits_whatever_the_first_bounce(device, form, share):
+    """I + R holds no digit of a diagonal of T that is far below F."""
+    F = np.diag(SCENE.T) / share
+    T = transport(FORMS[form](SCENE.T), first_bounce=F, device=device)
+    p = pattern(*GRID)
+    np.testing.assert_allclose((T @ p).ravel(), SCENE.T @ p.ravel(), rtol=ROUNDING)

@@ -48,4 +48,6 @@ typedef union {
     real item[sizeof(lanes) / sizeof(real)];
 } lanes_items;
 
+typedef lanes_items sums;  // of a row, one for each right-hand side
+
 #endif

@@ -1,35 +1,30 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Stretches of any length in pieces of K values, all of them whole: the last one of a stretch begins early, and
-// does not store again what the piece before it does.
+// k right-hand sides in pieces of K, all of them whole: the last one begins early, and does not store again what the
+// piece before it does.
 
 #ifndef LTCL_PIECES_H
 #define LTCL_PIECES_H
 
 #include "common/lanes.h"
 
-// Values `at` .. at + K - 1, of which the first `skip` are those of the piece before.
+// Right-hand sides `at` .. at + K - 1, of which the first `skip` are those of the piece before.
 typedef struct {
     int at, skip;
 } piece;
 
-// Piece p of a stretch of at least K values.
-INLINE piece piece_of(int p, int run)
+// Piece p of at least K right-hand sides.
+static inline piece piece_of(int p, int k)
 {
-    const int at = min(K * p, run - K);
+    const int at = min(K * p, k - K);
     piece q = {at, K * p - at};
     return q;
 }
 
-INLINE int pieces_of(int run)
-{
-    return (run + K - 1) / K;
-}
-
-// out = scale v + add at i .. i + K - 1, but for the first `skip` of them; see LTCL_STORE.
-INLINE void put(global real *out, int i, lanes v, int skip, real scale, int adds, global const real *add)
+// out = a v + b y at i .. i + K - 1, but for the first `skip` of them. Where b is 0, y is not read.
+INLINE void put(global real *out, int i, lanes v, int skip, real a, real b, global const real *y)
 {
     lanes_items items;
-    items.vector = adds ? scale * v + LOAD(add + i) : scale * v;
+    items.vector = b != 0 ? a * v + b * LOAD(y + i) : a * v;
     if (skip == 0) {
         STORE(items.vector, out + i);
         return;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// The number type of every kernel, and how a product leaves one.
+// The number type of every kernel, and wide loads and stores.
 //
 // Products are written a * b + c, never fma(): PoCL compiles fma() on vectors to a library call,
 // which made the CSR product with 8 right-hand sides 1.7 times slower. Compilers contract a * b + c
@@ -35,17 +35,24 @@ typedef real8 real8_packed __attribute__((aligned(4)));
 
 // What works on several values at once must be inlined: a call passes each of them through memory.
 #ifdef __clang__
-#define INLINE inline __attribute__((always_inline))
+#define INLINE static inline __attribute__((always_inline))
 #else
-#define INLINE inline
+#define INLINE static inline
 #endif
 
-// Every product ends in out = scale * sum + add, so that one launch makes a residual or an iteration.
-// `adds` says whether `add` is an operand; where it is 0, `add` is any valid buffer and is not read.
-#define LTCL_STORE(out, i, sum, scale, adds, add) \
-    ((out)[i] = (adds) ? (scale) * (sum) + (add)[i] : (scale) * (sum))
+// The epilogue of a product, value by value: out = a sum + b y + c x; y is not read where b is 0, nor x where c is.
+static inline void finish(
+    int i, real sum, real a, real b, real c, global const real *x, global const real *y, global real *out)
+{
+    real value = a * sum;
+    if (b != 0)
+        value += b * y[i];
+    if (c != 0)
+        value += c * x[i];
+    out[i] = value;
+}
 
-inline real sum8(real8 v)
+static inline real sum8(real8 v)
 {
     real4 h = v.lo + v.hi;
     return (h.s0 + h.s1) + (h.s2 + h.s3);

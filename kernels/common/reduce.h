@@ -1,45 +1,34 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Sum and largest over a work-group as binary trees in local memory: the same order every time, any group size.
+// All items of the group must call them.
 
 #ifndef LTCL_REDUCE_H
 #define LTCL_REDUCE_H
 
 #include "common/real.h"
 
-// All items of the group must call it. The result is valid in every item. `scratch` holds one real an item.
-inline real group_sum(real value, local real *scratch)
+// values[j], j < period, becomes the sum of values[j], values[j + period], ... below count, or the largest of them.
+static inline void fold(local real *values, int count, int period, int largest)
 {
-    const int me = get_local_id(0);
-    scratch[me] = value;
-    for (int width = get_local_size(0); width > 1;) {
-        const int half_width = (width + 1) / 2;  // rounds up, so the size need not be a power of two
+    for (int rows = (count + period - 1) / period; rows > 1;) {
+        const int upper = (rows + 1) / 2 * period;  // rounds up, so the rows need not be a power of two
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (me + half_width < width)
-            scratch[me] += scratch[me + half_width];
-        width = half_width;
+        for (int j = get_local_id(0); j + upper < count; j += get_local_size(0))
+            values[j] = largest ? fmax(values[j], values[j + upper]) : values[j] + values[j + upper];
+        count = upper;
+        rows = upper / period;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+// The sum of one value an item, in every item. `scratch` holds one real an item.
+static inline real group_sum(real value, local real *scratch)
+{
+    scratch[get_local_id(0)] = value;
+    fold(scratch, get_local_size(0), 1, 0);
     const real total = scratch[0];
     barrier(CLK_LOCAL_MEM_FENCE);  // so that the caller may use scratch again
     return total;
-}
-
-// The largest value, in the same way.
-inline real group_max(real value, local real *scratch)
-{
-    const int me = get_local_id(0);
-    scratch[me] = value;
-    for (int width = get_local_size(0); width > 1;) {
-        const int half_width = (width + 1) / 2;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (me + half_width < width)
-            scratch[me] = fmax(scratch[me], scratch[me + half_width]);
-        width = half_width;
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    const real largest = scratch[0];
-    barrier(CLK_LOCAL_MEM_FENCE);
-    return largest;
 }
 
 #endif

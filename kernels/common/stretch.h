@@ -11,20 +11,18 @@
 #error "stretch.h needs -DLANES=<neighbouring values of one work-item: 1 or 8>"
 #endif
 
-// flags: what comparing two stretches gives. FIRST: the value of the first lane. TOTAL: their sum.
+// flags: what comparing two stretches gives. TOTAL: the sum of the lanes.
 #if LANES == 8
 typedef real8 stretch;
 typedef int8 flags;
 #define LOAD_STRETCH(a) LOAD8(a)
 #define ANY(flags) any(flags)
-#define FIRST(v) ((v).s0)
 #define TOTAL(v) sum8(v)
 #else
 typedef real stretch;
 typedef int flags;
 #define LOAD_STRETCH(a) (*(a))
 #define ANY(flags) (flags)
-#define FIRST(v) (v)
 #define TOTAL(v) (v)
 #endif
 

@@ -29,13 +29,12 @@ from ltcl.batch.output import BITS, Output
 from ltcl.batch.reading import Reader
 from ltcl.batch.result import CompensatedFrames
 from ltcl.batch.run import Run, staying
-from ltcl.compensation import compensate, inputs
+from ltcl.compensation import compensate, problem
 from ltcl.errors import InputError
-from ltcl.exact import beside
 from ltcl.files import as_path
 from ltcl.images.codes import Encoding
 from ltcl.images.frames import check_video, open_frames, write_video
-from ltcl.transport import Transport, require
+from ltcl.transport import Transport, require, resolve_reference
 
 _USUAL_FPS = 25.0
 
@@ -162,8 +161,8 @@ def compensate_frames(
 def _checked(T: Transport, gain: Any, loss: Any, options: dict[str, Any]) -> tuple[float, float]:
     """The bounds, (low, high); refuses what `compensate` would, and pictures that are not for all frames."""
     require(T, square=False)
-    beside(T, options.get("exact"))
-    inputs.gain(gain, loss)
+    resolve_reference(T, options.get("exact"))
+    problem.gain(gain, loss)
     for name in ("background", "weights"):
         value = options.get(name)
         if value is None or checks.real(name, value).ndim == 0:
@@ -171,7 +170,7 @@ def _checked(T: Transport, gain: Any, loss: Any, options: dict[str, Any]) -> tup
         count = layout.unpack(name, value, T.camera_grid, T.channels)[1].frames
         if count is not None:
             raise InputError(f"{name} holds {count} frame(s); it must be one picture, for all frames alike")
-    return inputs.bounds(options.get("bounds", (0.0, 1.0)))
+    return problem.bounds(options.get("bounds", (0.0, 1.0)))
 
 
 def _apart(source: Path, targets: dict[str, Any]) -> None:

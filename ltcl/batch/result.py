@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ltcl.batch.manifest import Record
-from ltcl.exact import itself
+from ltcl.transport import error_note
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,5 +56,5 @@ class CompensatedFrames:
 
     def __repr__(self) -> str:
         worst = self.worst
-        off = f"at worst off by {worst.error:.2%}{itself(self.transport_error)}, frame {worst.number}"
+        off = f"at worst off by {worst.error:.2%}{error_note(self.transport_error)}, frame {worst.number}"
         return f"<ltcl CompensatedFrames {len(self.records)} in {self.folder}, {off}>"

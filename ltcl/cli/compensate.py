@@ -132,7 +132,7 @@ def run(
     grid: options.Grid = None,
     camera_grid: options.CameraGrid = None,
     method: options.Method = "auto",
-    rtol: options.Rtol = 1e-2,
+    rtol: options.TaskRtol = None,
     inverse: options.Inverse = None,
     exact: options.Exact = None,
     samples: options.Samples = None,
@@ -171,6 +171,9 @@ def run(
     Of a folder or a video of frames, writes the numbered patterns and frames.json batch by batch, with one
     gain for all; Ctrl-C keeps what is done, for --resume.
     """
+    from ltcl.compensation import RTOL
+    from ltcl.transport import default_rtol
+
     setup = transports.setup_of(transport, calibration)
     sought: Any = ("auto" if setup else 1.0) if gain is None else gain
     _check(sought, loss)
@@ -191,6 +194,7 @@ def run(
     transports.refuse_other(setup, calibration, T)
     known = transports.load_inverse(inverse, T)
     judge = transports.load_exact(exact, T, grid=grid, on_dark=on_dark)
+    rtol = default_rtol(RTOL, T, judge, known) if rtol is None else rtol
     reader = pictures.Reader(T.camera_grid, "the camera", encoding, resize)
     desired = {} if source else reader.read_all(picture)
     dark, counts = (None if file is None else reader.read(file) for file in (background, weights))

@@ -27,6 +27,7 @@ _DEPENDENCIES = """
     platformdirs
 """
 
+_HIDING = "update or remove that driver, or take a working one alone: OCL_ICD_VENDORS=FILE.icd"
 _OPENING = "install a driver, or name one that 'ltcl devices' lists (--device, LTCL_DEVICE)"
 
 
@@ -61,9 +62,10 @@ def examine(device: str | None) -> Iterator[Finding]:
     yield attempt("ltcl and Python", _python, "pip install --upgrade ltcl")
     yield attempt("dependencies", _dependencies, "pip install --upgrade ltcl")
     yield attempt("cache folder", device_checks.cache_folder, _cache_fix)
-    yield attempt(
-        "drivers", device_checks.drivers, "remove or update the driver that crashes; see ltcl devices"
-    )
+    drivers = attempt("drivers", device_checks.drivers, _HIDING)
+    yield drivers
+    if not drivers.passed:  # what crashes a child would crash this process, too
+        return
     opening = attempt("device", lambda: str(open_device(device)), _opening_fix)
     yield opening
     if not opening.passed:

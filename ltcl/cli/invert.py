@@ -38,7 +38,7 @@ def run(
     json: options.Json = False,
 ) -> None:
     """Find A = I - S^-1, one physical bounce, so that each further picture costs one product."""
-    from ltcl.compression import inversion
+    from ltcl.compression import INVERSE_NAMES, invert
     from ltcl.store import inverses
 
     inverses.check_name(out)  # refused before a long computation
@@ -46,7 +46,7 @@ def run(
     T = transports.load(file, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
     with console.Steps(1) as steps:
         steps.item(str(file))
-        inverse = inversion.invert(T, rtol, basis=basis or inversion.BASES, progress=steps.at)
+        inverse = invert(T, rtol, basis=basis or INVERSE_NAMES, progress=steps.at)
     inverses.save_inverse(out, inverse)
     text = {
         **transports.heading("invert", file, T, rtol=rtol, basis=basis),

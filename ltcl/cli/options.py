@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from ltcl.errors import InputError
-from ltcl.solvers.methods import METHODS, SAMPLED
+from ltcl.solvers.solve import METHODS, SAMPLED
 
 
 def grid(text: str) -> tuple[int, int]:
@@ -108,6 +108,15 @@ SolutionRtol = Annotated[
     float, typer.Option(metavar="FRACTION", help="Relative error that a solution may have for it.")
 ]
 Rtol = Annotated[float, typer.Option(metavar="FRACTION", help="Relative residual at which a solve is done.")]
+TaskRtol = Annotated[
+    float | None,
+    typer.Option(
+        metavar="FRACTION",
+        help="Relative residual at which a solve is done. Default: 0.01 of compensate, 0.001 of separate, or "
+        "the error of a compressed TRANSPORT without --exact, or of the inverse, where that is more.",
+        show_default=False,
+    ),
+]
 Inverse = Annotated[
     Path | None,
     typer.Option(

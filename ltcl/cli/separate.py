@@ -13,15 +13,6 @@ from ltcl import checks, report
 from ltcl.cli import console, options, pictures, results, transports
 from ltcl.separation import Separation
 
-_RTOL = Annotated[
-    float | None,
-    typer.Option(
-        metavar="FRACTION",
-        help="Relative residual at which a solve is done. Default: 0.001, or what a compressed TRANSPORT "
-        "without --exact, or the inverse, is off by.",
-        show_default=False,
-    ),
-]
 _BOUNCES = Annotated[int, typer.Option(metavar="N", min=0, help="Indirect bounces to tell apart.")]
 
 
@@ -32,7 +23,7 @@ def run(
     bounces: _BOUNCES = 4,
     grid: options.Grid = None,
     method: options.Method = "auto",
-    rtol: _RTOL = None,
+    rtol: options.TaskRtol = None,
     inverse: options.Inverse = None,
     exact: options.Exact = None,
     samples: options.Samples = None,
@@ -50,13 +41,14 @@ def run(
     little negative) and for the eye as .png, each at its own brightness, which separate.json tells. Several
     pictures get a folder each.
     """
-    from ltcl.separation import separate, usual_rtol
+    from ltcl.separation import RTOL, separate
+    from ltcl.transport import default_rtol
 
     drawn = options.sampling(method, samples, seed)
     T = transports.load(transport, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
     known = transports.load_inverse(inverse, T)
     judge = transports.load_exact(exact, T, grid=grid, on_dark=on_dark)
-    rtol = usual_rtol(T, judge, known) if rtol is None else rtol
+    rtol = default_rtol(RTOL, T, judge, known) if rtol is None else rtol
     seen = pictures.Reader(T.grid, "the camera", encoding, resize).read_all(picture)
     text = transports.heading(
         "separate",

@@ -12,10 +12,9 @@ from ltcl import checks, report, store
 from ltcl.cli import console
 from ltcl.device import open_device
 from ltcl.errors import FileError, InputError
-from ltcl.exact import beside
 from ltcl.solvers import Inverse
 from ltcl.store import formats, mtx
-from ltcl.transport import Transport
+from ltcl.transport import Transport, resolve_reference
 
 _ROUNDING = 1e-5  # of float32, in a picture
 
@@ -117,7 +116,7 @@ def load_exact(path: Path | None, T: Transport, **options: Any) -> Transport | N
     exact = store.load(path, device=T.device, **options)
     if exact.is_square and (exact.grid, exact.channels) == (T.grid, T.channels):
         exact = _with_first_bounce(exact, T)
-    beside(T, exact)  # refuses others
+    resolve_reference(T, exact)  # refuses others
     pattern = np.random.default_rng(0).random((*T.grid, *(3,) * (T.channels == 3)))
     ours, theirs = T @ pattern, exact @ pattern
     missed, allowed = float(np.linalg.norm(ours - theirs) / np.linalg.norm(ours)), T.error + _ROUNDING

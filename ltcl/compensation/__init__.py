@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from ltcl.compensation.result import Compensation
-from ltcl.compensation.task import compensate
+from ltcl.compensation.compensate import RTOL, Compensation, compensate
 
-__all__ = ["Compensation", "compensate"]
+__all__ = ["RTOL", "Compensation", "compensate"]

@@ -13,23 +13,31 @@ is convex in the gain, so that the gains with h <= 0 are an interval. Its upper 
 numbers. Every c comes within the loss at gains of its own, where a quadratic is at most 0: the largest of
 these is in reach. Every solve at a gain has a certificate, and with it a tangent below h: its zero cannot be
 passed, and is where Newton's method goes on. Where such a tangent has no zero, h has none.
+
+A certificate may take thousands of products where T has fewer rows than columns, or small singular values.
+So a system of few numbers is solved on the host, exactly, by active sets (Stark and Parker, Bounded-variable
+least squares, Computational Statistics 10, 1995); a large one in a limited number of steps.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.optimize
 
-from ltcl.compensation.problem import Limits, Problem
+from ltcl.compensation.problem import Columns, Limits, Problem
 from ltcl.errors import InputError
 from ltcl.solvers import Status
 
 TOLERANCE = 0.01  # of the gain; of the least error, where that is sought
 _COARSE = 0.1  # of what the error is above the loss: how exact solves on the way are
 _FINE = 0.2  # of what the tolerance of the gain is worth, to which the last ones are
-_FLOOR = 1e-6  # relative error that float32 hardly tells from none
-_STEPS = 60
+_FLOOR = 1e-6  # relative error that float32 resolves
+_STEPS, _MAXITER = 60, 200  # of the search; of each solve in it
+_ON_HOST = 1 << 12  # entries of a system: an active set changes in less time than a product is launched
+_MORE = 1.1  # times the least error of all gains, that the largest may have where none is in reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,33 +45,28 @@ class Trial:
     """The nearest light that was found at a gain; errors relative to ||gain W d||.
 
     For every gain' min ||W (gain' d - c)|| / ||W d|| is at least gain * least + slope * (gain' - gain).
-    `own` are the parts of ||W c||: its cosine with W d, and its size over ||W d||.
+    `cosine` is that of W c with W d, `sine` the error of this light at the gain that suits it best, `size`
+    that of W c over that of W d.
     """
 
     gain: float
-    light: list[np.ndarray]
+    light: Columns
     error: float
     least: float
     slope: float
-    own: tuple[float, float]
-    settled: bool  # no further step would tell more
-
-    @property
-    def sine(self) -> float:
-        """The error of this light at the gain that suits it best; 1 where none does."""
-        cosine = max(self.own[0], 0.0)
-        return float(np.sqrt(max(1.0 - cosine**2, 0.0)))
+    cosine: float
+    sine: float
+    size: float
+    settled: bool  # no further step would improve it
 
     def largest(self, loss: float) -> float:
         """The largest gain at which this light is within `loss`; 0 where it is at none."""
-        cosine, size = self.own
-        room = loss**2 - (1.0 - cosine**2)
-        if room < 0.0 or cosine <= 0.0:
+        if self.sine > loss or self.cosine <= 0.0:
             return 0.0
-        return size * (cosine + float(np.sqrt(room))) / (1.0 - loss**2)
+        return self.size * (self.cosine + float(np.sqrt(loss**2 - self.sine**2))) / (1.0 - loss**2)
 
 
-def exact(u: list[np.ndarray], v: list[np.ndarray], limits: Limits) -> float | None:
+def exact(u: Columns, v: Columns, limits: Limits) -> float | None:
     """The largest gain with low <= gain u - v <= high at all pixels that are lit; None where there is none.
 
     >>> limits = Limits(0.0, 1.0, np.array([False, False, True]))
@@ -72,80 +75,187 @@ def exact(u: list[np.ndarray], v: list[np.ndarray], limits: Limits) -> float | N
     """
     least, most = 0.0, np.inf
     for slope, shift in zip(u, v, strict=True):
-        still = (slope == 0.0) | limits.masked[:, None]
-        if (limits.exceeded(-shift) & still).any():
+        constant = (slope == 0.0) | limits.masked[:, None]
+        beyond = limits.exceeded(-shift)
+        if beyond is not None and (beyond & constant).any():
             return None
-        ends = np.stack([limits.low + shift, limits.high + shift]) / np.where(still, 1.0, slope)
-        least = max(least, float(np.max(np.min(ends, axis=0), where=~still, initial=0.0)))
-        most = min(most, float(np.min(np.max(ends, axis=0), where=~still, initial=np.inf)))
+        ends = np.stack([limits.low + shift, limits.high + shift]) / np.where(constant, 1.0, slope)
+        least = max(least, float(np.max(np.min(ends, axis=0), where=~constant, initial=0.0)))
+        most = min(most, float(np.min(np.max(ends, axis=0), where=~constant, initial=np.inf)))
     return most if least <= most and 0.0 < most < np.inf else None
 
 
-def largest(problem: Problem, loss: float) -> tuple[float, list[np.ndarray]]:
-    """The largest gain, within `TOLERANCE`, at which some light comes within `loss`; that light.
+def within_loss(problem: Problem, loss: float | None) -> tuple[float, Columns]:
+    """The largest gain within `loss`, or where that is None within the least that can be; its light.
 
     Raises
     ------
     InputError
-        No gain does.
+        No gain is.
     """
-    high, light = _from_above(problem, loss)
-    low, best = 0.0, light
-    gain, accuracy = high, _COARSE * (1.0 - loss)
-    for _ in range(_STEPS):
-        trial = _nearest(problem, gain, light, accuracy)
-        light, own = trial.light, trial.largest(loss)
-        if own > low:
-            low, best = own, light
-        rise = trial.slope - loss
-        if trial.least > loss:  # the tangent decides
-            if rise <= 0.0 or trial.least - loss >= rise:
+    search = Search(problem)
+    if loss is not None:
+        return search.largest(loss)
+    rtol = problem.rules["rtol"]
+    return search.largest(max(rtol, _MORE * search.closest(enough=rtol / _MORE).sine))
+
+
+class Search:
+    """Trials of gains for a problem."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.size = problem.norm(problem.desired)
+        if self.size == 0.0:
+            everywhere = not any(part.any() for part in problem.desired)
+            where = "everywhere" if everywhere else "wherever weights are above 0"
+            raise InputError(f"gain is 'auto', but desired is 0 {where}: no gain is too large for that")
+        self.on_host = all(np.prod(system.A.shape) <= _ON_HOST for system in problem.systems)
+        self.A: list[Any] = [system.A.to_dense() if self.on_host else system.A for system in problem.systems]
+
+    def largest(self, loss: float) -> tuple[float, Columns]:
+        """The largest gain, within `TOLERANCE`, at which some light comes within `loss`; that light."""
+        high, light = self._from_above(loss)
+        low, best = 0.0, light
+        gain, accuracy = high, _COARSE * (1.0 - loss)
+        for _ in range(_STEPS):
+            trial = self._nearest(gain, light, accuracy)
+            light, own = trial.light, trial.largest(loss)
+            if own > low:
+                low, best = own, light
+            rise = trial.slope - loss
+            if trial.least > loss:  # the tangent decides
+                if rise <= 0.0 or trial.least - loss >= rise:
+                    break
+                high = gain * (1.0 - (trial.least - loss) / rise)
+                accuracy = max(_COARSE * (trial.error - loss), _FINE * TOLERANCE * rise)
+            elif trial.settled:
+                high = gain
+            else:
+                accuracy /= 4
+            if high <= (1.0 + TOLERANCE) * low:
                 break
-            high = gain * (1.0 - (trial.least - loss) / rise)
-            accuracy = max(_COARSE * (trial.error - loss), _FINE * TOLERANCE * rise)
-        elif trial.settled:
-            high = gain
-        else:
-            accuracy /= 4
-        if high <= (1.0 + TOLERANCE) * low:
-            break
-        if trial.least > loss or trial.settled:
-            gain = high * (1.0 - TOLERANCE / 2)
-    if low > 0.0:
-        return low, best
-    nearest = closest(problem)
-    if nearest.sine <= loss:
-        return nearest.largest(loss), nearest.light
-    raise InputError(
-        f"gain is 'auto', but no gain brings the picture within a loss of {loss:g}; the least is "
-        f"about {nearest.sine:.3g}; give a larger loss, or brighten the picture's dark parts"
-    )
+            if trial.least > loss or trial.settled:
+                gain = high * (1.0 - TOLERANCE / 2)
+        if low > 0.0:
+            return low, best
+        nearest = self.closest()
+        if nearest.sine <= loss:
+            return nearest.largest(loss), nearest.light
+        raise InputError(
+            f"gain is 'auto', but no gain brings the picture within a loss of {loss:g}; the least is "
+            f"about {nearest.sine:.3g}; give a larger loss, or brighten the picture's dark parts"
+        )
+
+    def closest(self, enough: float = 0.0) -> Trial:
+        """The light with the least `sine`, to `TOLERANCE` of it, or one within `enough`.
+
+        In t = 1 / gain the least error is convex: the tangents of all trials bound it from below, and where
+        that bound is lowest is the next one. Gains below half of the least tried are not looked at.
+        """
+        first, light = self._from_above(0.0)
+        enough = max(enough, _FLOOR)
+        lines: list[tuple[float, float]] = []
+        t, farthest, bound, best = 1.0, 1.0, 0.0, None
+        for _ in range(_STEPS):
+            sine = 1.0 if best is None else best.sine
+            accuracy = max(_COARSE * (sine - bound), TOLERANCE / 4 * max(sine, enough))
+            trial = self._nearest(first / t, light, accuracy)
+            light = trial.light
+            lines.append((trial.slope, (trial.least - trial.slope) / t))
+            if best is None or trial.sine < best.sine:
+                best = trial
+            farthest = max(farthest, t)
+            t, bound = _lowest(lines, 2 * farthest)
+            if best.sine <= max(enough, (1.0 + TOLERANCE) * bound):
+                break
+        assert best is not None  # noqa: S101 - there are steps
+        return best
+
+    def _from_above(self, loss: float) -> tuple[float, Columns]:
+        """A gain that none with h <= 0 exceeds, and the light in whose picture the most of W d is found.
+
+        ``gain ||W d||^2 - max (W c).(W d) <= ||gain W d - W c|| ||W d||``; in p the maximum is of a linear
+        function.
+        """
+        problem, limits, reach, light = self.problem, self.problem.limits, 0.0, []
+        twice = problem.weighted(problem.weighted(problem.desired))
+        for A, system, wwd, dark in zip(self.A, problem.systems, twice, problem.dark, strict=True):
+            use = system.scale[:, None] * (A.T @ wwd)  # T^T W^2 d
+            best = limits.clip(np.where(use > 0.0, limits.high, limits.low))
+            light.append(best)
+            reach += float(np.sum(use * best) + np.sum(dark * wwd))
+        if reach <= 0.0:
+            raise InputError(
+                "gain is 'auto', but no light within the bounds looks more like desired than none does; "
+                "is desired negative, or T?"
+            )
+        return reach / ((1.0 - loss) * self.size**2), light
+
+    def _nearest(self, gain: float, light: Columns, accuracy: float) -> Trial:
+        """The trial at this gain, whose error is above the least by `accuracy` at most, if it has settled."""
+        problem = self.problem
+        solves = [self._solve(which, gain, start, accuracy) for which, start in enumerate(light)]
+        light = [p for p, *_ in solves]
+        wanted = problem.weighted(problem.desired)
+        missing = problem.weighted(self._residual(gain, light))
+        error = float(np.sqrt(_inner(missing, missing)))
+        # Each column has a bound and a slope of its own; these add up with the weights error / norm.
+        above = sum(float(np.sum(errors * (errors - least))) for _, errors, least, _ in solves)
+        seen = [gain * part - rest for part, rest in zip(wanted, missing, strict=True)]
+        norm, along = float(np.sqrt(_inner(seen, seen))), _inner(seen, wanted) / self.size**2
+        across = [part - along * whole for part, whole in zip(seen, wanted, strict=True)]
+        return Trial(
+            gain=gain,
+            light=light,
+            error=error / (gain * self.size),
+            least=(error - above / (error or 1.0)) / (gain * self.size),
+            slope=_inner(missing, wanted) / ((error or 1.0) * self.size),
+            cosine=along * self.size / (norm or 1.0),
+            sine=float(np.sqrt(_inner(across, across))) / (norm or 1.0) if along > 0.0 else 1.0,
+            size=norm / self.size,
+            settled=all(settled for *_, settled in solves),
+        )
+
+    def _solve(
+        self, which: int, gain: float, start: np.ndarray, accuracy: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+        """Light of one system, the error and its lower bound of each column, and whether it has settled."""
+        problem = self.problem
+        if self.on_host:
+            return *_active_sets(problem, which, gain, self.A[which]), True
+        columns = sum(part.shape[1] for part in problem.desired)
+        rules = {"rtol": 0.0, "atol": accuracy * gain * self.size / np.sqrt(columns), "maxiter": _MAXITER}
+        light, found = problem.nearest(which, gain, start, **rules)
+        settled = found.status is not Status.CONVERGED or not np.any(found.errors)
+        return light, found.errors / problem.unit, found.least / problem.unit, settled
+
+    def _residual(self, gain: float, light: Columns) -> Columns:
+        """gain * desired - dark - T p."""
+        x = [system.to_x(p) for system, p in zip(self.problem.systems, light, strict=True)]
+        return [b - A @ part for b, A, part in zip(self.problem.target(gain), self.A, x, strict=True)]
 
 
-def closest(problem: Problem, enough: float = 0.0) -> Trial:
-    """The light with the least `sine`, to `TOLERANCE` of it, or one within `enough`.
-
-    In t = 1 / gain the least error is convex: the tangents of all trials bound it from below, and where
-    that bound is lowest is the next one. Gains below half of the least tried are not looked at.
-    """
-    first, light = _from_above(problem, 0.0)
-    enough = max(enough, _FLOOR)
-    lines: list[tuple[float, float]] = []
-    t, farthest, bound, best = 1.0, 1.0, 0.0, None
-    for _ in range(_STEPS):
-        sine = 1.0 if best is None else best.sine
-        accuracy = max(_COARSE * (sine - bound), TOLERANCE / 4 * max(sine, enough))
-        trial = _nearest(problem, first / t, light, accuracy)
-        light = trial.light
-        lines.append((trial.slope, (trial.least - trial.slope) / t))
-        if best is None or trial.sine < best.sine:
-            best = trial
-        farthest = max(farthest, t)
-        t, bound = _lowest(lines, 2 * farthest)
-        if best.sine <= max(enough, (1.0 + TOLERANCE) * bound):
-            break
-    assert best is not None  # noqa: S101 - there are steps
-    return best
+def _active_sets(
+    problem: Problem, which: int, gain: float, A: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Light, errors and least errors of each column, in float64."""
+    limits, scale, target = problem.limits, problem.systems[which].scale, problem.target(gain)[which]
+    low, high = limits.low, limits.high
+    lit = (scale > 0.0) & ~limits.masked
+    light = limits.clip(np.zeros((len(scale), target.shape[1])))
+    errors, least = np.zeros((2, target.shape[1]))
+    for column, b in enumerate(target.T.astype(np.float64)):
+        w = np.ones(len(b)) if problem.weights is None else problem.weights[which][:, column]
+        T, b = w[:, None] * (A * scale)[:, lit], w * b
+        x = scipy.optimize.lsq_linear(T, b, (low, high), "bvls", 1e-12).x if lit.any() else np.zeros(0)
+        r = T @ x - b
+        g, error = T.T @ r, float(np.linalg.norm(r))
+        gap = float(np.sum(np.maximum(g * (x - low), g * (x - high))))  # as of `solvers.bounded`
+        light[lit, column] = np.clip(x.astype(np.float32), low, high)
+        errors[column] = np.linalg.norm(T @ light[lit, column] - b)
+        least[column] = max(error - gap / error, 0.0) if error > 0.0 else 0.0
+    return light, errors, np.minimum(least, errors)
 
 
 def _lowest(lines: list[tuple[float, float]], most: float) -> tuple[float, float]:
@@ -158,69 +268,5 @@ def _lowest(lines: list[tuple[float, float]], most: float) -> tuple[float, float
     return float(t[np.argmin(heights)]), float(np.min(heights))
 
 
-def _nearest(problem: Problem, gain: float, light: list[np.ndarray], accuracy: float) -> Trial:
-    """The trial at this gain, whose error is above the least by `accuracy` at most."""
-    size = _size(problem)
-    columns = sum(part.shape[1] for part in problem.desired)
-    rules = {"rtol": 0.0, "atol": accuracy * gain * size / np.sqrt(columns)}
-    pairs = [problem.nearest(which, gain, start, **rules) for which, start in enumerate(light)]
-    light, solves = [p for p, _ in pairs], [found for _, found in pairs]
-    wanted = problem.weighted(problem.desired)
-    left = problem.weighted(_residual(problem, gain, light))
-    error = float(np.sqrt(_inner(left, left)))
-    # Each column has a bound and a slope of its own; of the norm, these add up with the weights error / norm.
-    above = sum(float(np.sum(found.errors * (found.errors - found.least))) for found in solves)
-    along = _inner(left, wanted)
-    seen = [gain * part - rest for part, rest in zip(wanted, left, strict=True)]
-    norm = float(np.sqrt(_inner(seen, seen)))
-    return Trial(
-        gain=gain,
-        light=light,
-        error=error / (gain * size),
-        least=(error - above / (error or 1.0)) / (gain * size),
-        slope=along / ((error or 1.0) * size),
-        own=(_inner(seen, wanted) / ((norm or 1.0) * size), norm / size),
-        settled=all(found.status is not Status.CONVERGED or not np.any(found.errors) for found in solves),
-    )
-
-
-def _size(problem: Problem) -> float:
-    size = problem.norm(problem.desired)
-    if size == 0.0:
-        everywhere = not any(part.any() for part in problem.desired)
-        where = "everywhere" if everywhere else "wherever weights are above 0"
-        raise InputError(f"gain is 'auto', but desired is 0 {where}: no gain is too large for that")
-    return size
-
-
-def _from_above(problem: Problem, loss: float) -> tuple[float, list[np.ndarray]]:
-    """A gain that none with h <= 0 exceeds, and the light in whose picture the most of W d is found.
-
-    ``gain ||W d||^2 - max (W c).(W d) <= ||gain W d - W c|| ||W d||``; in p the maximum is of a linear
-    function.
-    """
-    size, reach, light = _size(problem), 0.0, []
-    limits = problem.limits
-    for system, wwd, dark in zip(
-        problem.systems, problem.weighted(problem.weighted(problem.desired)), problem.dark, strict=True
-    ):
-        use = system.scale[:, None] * (system.A.T @ wwd)  # T^T W^2 d
-        best = limits.clip(np.where(use > 0.0, limits.high, limits.low))
-        light.append(best)
-        reach += float(np.sum(use * best) + np.sum(dark * wwd))
-    if reach <= 0.0:
-        raise InputError(
-            "gain is 'auto', but no light within the bounds looks more like desired than none does; "
-            "is desired negative, or T?"
-        )
-    return reach / ((1.0 - loss) * size**2), light
-
-
-def _residual(problem: Problem, gain: float, light: list[np.ndarray]) -> list[np.ndarray]:
-    """gain * desired - dark - T p."""
-    seen = (system.A @ system.to_x(p) for system, p in zip(problem.systems, light, strict=True))
-    return [target - part for target, part in zip(problem.target(gain), seen, strict=True)]
-
-
-def _inner(a: list[np.ndarray], b: list[np.ndarray]) -> float:
+def _inner(a: Columns, b: Columns) -> float:
     return float(sum(np.sum(x * y, dtype=np.float64) for x, y in zip(a, b, strict=True)))

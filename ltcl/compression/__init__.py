@@ -3,19 +3,20 @@
 
 from __future__ import annotations
 
-from ltcl.compression.inverse_norm import inverse_norm
-from ltcl.compression.inversion import invert
-from ltcl.compression.iterated import Iterated
-from ltcl.compression.iteration import invert_coefficients
+from ltcl.compression.bases import INVERSE_NAMES
+from ltcl.compression.compress import compress
+from ltcl.compression.invert import invert
+from ltcl.compression.norms import inverse_norm
 from ltcl.compression.result import ChannelCompression, Compression, Trial
 from ltcl.compression.sources import RowSource
-from ltcl.compression.task import compress
+from ltcl.compression.sparse_inverse import SparseInverse, invert_coefficients
 
 __all__ = [
+    "INVERSE_NAMES",
     "ChannelCompression",
     "Compression",
-    "Iterated",
     "RowSource",
+    "SparseInverse",
     "Trial",
     "compress",
     "inverse_norm",

@@ -14,23 +14,10 @@ from ltcl import checks
 class Trial:
     """One way to write R, tried on a window of pixels or on the whole.
 
-    Attributes
-    ----------
-    basis : str
-        "pixels", "hilbert", a wavelet for both sides, or one with " rows" or " + pixels" behind it.
-    format, width, precision : str, int, str
-        Of the core: "csr" or "tiles"; neighbouring columns of a tile; of its numbers. Of a sum, where they
-        differ, that of the coefficients and that of pixels, "tiles + csr"; the width is of the coefficients.
-    kept : float
-        Numbers in a row.
-    nbytes : int
-        Of the core.
-    error : float or None
-        Upper bound on the 2-norm of R~ - R, before rounding of the core; None where it was left before.
-    seconds : float or None
-        A product in a solve took; None where nothing was timed.
-    left : str
-        Why it was left before a core was made; empty otherwise.
+    `format` ("tiles"; "csr" where none were made), `width` and `precision` are of the core; of a sum, of the
+    coefficients first. `kept` numbers in a row take `nbytes`, and a product of a solve so many `launches`.
+    `error` is an upper bound on the 2-norm of R~ - R, rounding included; None where the basis was `left`
+    before, and why.
     """
 
     basis: str
@@ -39,51 +26,33 @@ class Trial:
     precision: str
     kept: float
     nbytes: int
+    launches: int
     error: float | None
-    seconds: float | None
     left: str = ""
 
 
-@dataclass(frozen=True)
-class ChannelCompression:
-    """One colour channel.
+@dataclass(frozen=True, kw_only=True)
+class ChannelCompression(Trial):
+    """One colour channel: what was taken, of the whole R.
 
     Attributes
     ----------
-    basis, format, width, precision, kept, nbytes, seconds
-        As of a `Trial`, of the whole R.
     threshold : float
         Numbers below it were dropped.
     dropped : float
-        Frobenius norm of all that was dropped; a bound where `dropped_between` is above 0.
-    dropped_between : float
-        The part of it that was dropped between the passes over rows and columns.
+        Frobenius norm of all that was dropped; of a sum, and where memory was short, a bound.
     quantisation : float
         Frobenius norm of what rounding of the core changed; of a sum, a bound on it.
-    error, error_estimate : float
-        Upper bound on the 2-norm of R~ - R, rounding included, and an estimate of it from below.
-    inverse_norm : float
-        Upper bound on the 2-norm of S~^-1.
-    solution_error : float
-        Their product: bound on ``||x~ - x|| / ||x||`` for every picture.
+    inverse_norm, solution_error : float
+        Upper bound on the 2-norm of S~^-1; its product with `error` bounds ``||x~ - x|| / ||x||``.
     confidence : float
-        That the bounds hold, over the random starts of the norms.
+        That the bounds of all channels hold, over the random starts of the norms.
     trials : tuple of Trial
     """
 
-    basis: str
-    format: str
-    width: int
-    precision: str
-    kept: float
-    nbytes: int
-    seconds: float | None
     threshold: float
     dropped: float
-    dropped_between: float
     quantisation: float
-    error: float
-    error_estimate: float
     inverse_norm: float
     solution_error: float
     confidence: float
@@ -94,19 +63,8 @@ class ChannelCompression:
 class Compression:
     """How a compressed transport was made; its ``.compression``.
 
-    Attributes
-    ----------
-    rtol : float
-        The error of the solution that was allowed.
-    budget : int or None
-        Bytes of all cores that were allowed.
-    uncompressed : int
-        Bytes of T as it was; of rows, in float32.
-    window : (h, w)
-        The pixels that bases were tried on.
-    seconds : float
-        It took.
-    channels : tuple of 1 or 3 ChannelCompression
+    `rtol` and `budget` are as allowed, `uncompressed` the bytes of T before (of rows, in float32), `window`
+    (h, w) the pixels that bases were tried on, and `channels` 1 or 3 `ChannelCompression`.
     """
 
     rtol: float

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ltcl.device import failures
 from ltcl.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,31 +41,18 @@ class Array:
 
     def get(self) -> np.ndarray:
         """The values on the host, once everything queued before has run."""
-        import pyopencl as cl
-
         host = np.empty(self.shape, self.dtype)
         if host.size:
-            with failures.translated(f"reading from {self.device.name}"):
-                cl.enqueue_copy(self.device.queue, host, self.buffer)
+            self.device.copy(host, self.buffer)
         return host
 
     def set(self, values: np.ndarray) -> Array:
         """Overwrite with host values of the same shape; returns the array."""
-        import pyopencl as cl
-
         if values.shape != self.shape:
             raise InputError(f"values have shape {values.shape}; the array on the device has {self.shape}")
         host = rounded(values, self.dtype)
         if host.size:
-            with failures.translated(f"writing to {self.device.name}"):
-                cl.enqueue_copy(self.device.queue, self.buffer, host)
-        return self
-
-    def copy_from(self, other: Array) -> Array:
-        """Overwrite with the values of another array of the device; returns this one."""
-        if other.shape != self.shape:
-            raise InputError(f"cannot copy an array of shape {other.shape} into one of {self.shape}")
-        self._copy(self, other, self.nbytes)
+            self.device.copy(self.buffer, host)
         return self
 
     def rows(self, first: int, count: int) -> Array:
@@ -74,26 +60,26 @@ class Array:
         if not 0 <= first <= first + count <= self.shape[0]:
             raise InputError(f"rows {first} to {first + count} are not among {self.shape[0]}")
         part = self.device.empty((count, *self.shape[1:]), self.dtype)
-        self._copy(part, self, part.nbytes, src_offset=first * self._row_bytes)
+        part._copy(self, part.nbytes, src_offset=first * self.columns * self.dtype.itemsize)
         return part
 
     def set_rows(self, first: int, part: Array) -> Array:
         """Overwrite the rows from `first` on with another array of the device; returns this one."""
         if part.shape[1:] != self.shape[1:] or not 0 <= first <= self.shape[0] - part.shape[0]:
             raise InputError(f"rows {first} on of an array of shape {self.shape} cannot hold {part.shape}")
-        self._copy(self, part, part.nbytes, dst_offset=first * self._row_bytes)
+        self._copy(part, part.nbytes, dst_offset=first * self.columns * self.dtype.itemsize)
         return self
 
-    @property
-    def _row_bytes(self) -> int:
-        return self.columns * self.dtype.itemsize
+    def copy_from(self, other: Array) -> Array:
+        """Overwrite with the values of another array of the same shape; returns this one."""
+        if other.shape != self.shape:
+            raise InputError(f"cannot copy an array of shape {other.shape} into one of {self.shape}")
+        self._copy(other, self.nbytes)
+        return self
 
-    def _copy(self, to: Array, of: Array, nbytes: int, **offsets: Any) -> None:
-        import pyopencl as cl
-
+    def _copy(self, of: Array, nbytes: int, **offsets: int) -> None:
         if nbytes:
-            with failures.translated(f"copying on {self.device.name}"):
-                cl.enqueue_copy(self.device.queue, to.buffer, of.buffer, byte_count=nbytes, **offsets)
+            self.device.copy(self.buffer, of.buffer, byte_count=nbytes, **offsets)
 
     def copy(self) -> Array:
         """Another array with the same values."""

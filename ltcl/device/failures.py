@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 
 from ltcl.errors import DeviceError, LtclError, MemoryLimitError
@@ -12,9 +13,16 @@ _MEMORY = {"MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES", "OUT_OF_HOST_MEM
 _ADVICE = {
     "DEVICE_NOT_AVAILABLE": "the device is in use by another process or was unplugged; try LTCL_DEVICE=cpu",
     "COMPILER_NOT_AVAILABLE": "this driver cannot compile kernels; choose another device (ltcl devices)",
-    "INVALID_WORK_GROUP_SIZE": "the driver refused a work-group size it had offered; please report it",
-    "INVALID_KERNEL_ARGS": "an argument of the kernel was not set; please report it",
 }
+
+
+def refuse_forked(process: int) -> None:
+    """Raise where this is not the `process` that opened OpenCL: after a fork, drivers hang."""
+    if os.getpid() != process:
+        raise DeviceError(
+            "this process was forked from one that had used OpenCL, whose drivers do not survive that; start "
+            'workers by multiprocessing.get_context("spawn") or "forkserver", and open the device in each'
+        )
 
 
 @contextlib.contextmanager
@@ -30,20 +38,13 @@ def translated(doing: str) -> Iterator[None]:
 
 def explain(doing: str, error: Exception) -> LtclError:
     """The ltcl error for a pyopencl `error` raised while `doing` something."""
-    status = _status(error)
+    import pyopencl as cl
+
+    code = getattr(error, "code", None)
+    status = str(error).partition("\n")[0] if code is None else cl.status_code.to_string(code, f"{code}")
     if status in _MEMORY:
         return MemoryLimitError(
             f"{doing}: the device ran out of memory ({status}); compress the matrix, free other buffers, "
             "or choose a device with more memory (ltcl devices)"
         )
-    advice = _ADVICE.get(status, "see ltcl doctor")
-    return DeviceError(f"{doing}: OpenCL answered {status}; {advice}")
-
-
-def _status(error: Exception) -> str:
-    import pyopencl as cl
-
-    code = getattr(error, "code", None)
-    if code is None:
-        return str(error).splitlines()[0] if str(error) else type(error).__name__
-    return cl.status_code.to_string(code, f"status {code}")
+    return DeviceError(f"{doing}: OpenCL answered {status}; {_ADVICE.get(status, 'see ltcl doctor')}")

@@ -1,36 +1,31 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a solver does between two products: fill, axpby, axpby column by column, scaling, dot, norm.
 
-Everything is queued and returns at once; only `dot`, `dots` and `norm` give numbers to the host and so wait.
+Everything is queued and returns at once; only `dot` and `norm` give numbers to the host and so wait.
 Sums are trees over a fixed number of slices: the same bits at every call on a given device.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ltcl.device.array import Array
+from ltcl.device.kernels import Kernel
 from ltcl.errors import InputError
 
-_AT_ONCE = {True: 128, False: 16}  # values an item of a CPU or not sums: up to so many, one launch will do
-_SLICES = 64  # partial sums of a dot product: enough groups for a large GPU, few enough for one last group
-_COPIERS = {True: 1 << 12, False: 1 << 16}  # items of `keep` on a CPU or not: each has a rule to work out
+_VALUES = {True: 128, False: 8}  # of an item of a CPU or not, before a reduction takes another group
 
 
 def fill(x: Array, value: float) -> Array:
     """x = value everywhere."""
-    _elementwise(x, "vector_fill", float(value), x)
-    return x
+    return _elementwise(x, "vector_fill", float(value))
 
 
 def axpby(a: float, x: Array, b: float, y: Array, out: Array) -> Array:
     """out = a x + b y; `out` may be `x` or `y`."""
     _same_shape(x, y, out)
-    _elementwise(out, "vector_axpby", float(a), x, float(b), y, out)
-    return out
+    return _elementwise(out, "vector_axpby", float(a), x, float(b), y)
 
 
 def axpy(a: float, x: Array, y: Array) -> Array:
@@ -39,25 +34,14 @@ def axpy(a: float, x: Array, y: Array) -> Array:
 
 
 def axpby_columns(a: ArrayLike, x: Array, b: ArrayLike, y: Array, out: Array) -> Array:
-    """out = a_c x_c + b_c y_c in every column c; `out` may be `x` or `y`.
+    """out = a_c x_c + b_c y_c in every column c; `out` may be `x` or `y`. Waits for the device.
 
     `a` and `b` are numbers or (k,) on the host. An operand whose coefficient is 0 does not count, not even
     its NaN: with (0, 1) a column of y stays as it is, whatever became of x.
     """
     _same_shape(x, y, out)
-    k = out.columns
-    with np.errstate(over="ignore"):  # a step beyond float32 becomes infinite, which the residual tells
-        parts = [np.asarray(c).astype(np.float32) for c in (a, b)]
-    if k == 1 and all(parts):  # numbers travel with the launch, arrays before it
-        return axpby(parts[0].item(), x, parts[1].item(), y, out)
-    ab = np.stack([np.broadcast_to(part, k) for part in parts])
-    _elementwise(out, "vector_axpby_columns", k, out.device.upload(ab), x, y, out)
-    return out
-
-
-def difference(x: Array, y: Array, out: Array) -> Array:
-    """out = x - y."""
-    return axpby(1.0, x, -1.0, y, out)
+    ab = out.device.upload([np.broadcast_to(c, out.columns) for c in (a, b)])
+    return _elementwise(out, "vector_axpby_columns", out.columns, ab, x, y)
 
 
 def scale_rows(d: Array, x: Array, out: Array) -> Array:
@@ -65,62 +49,16 @@ def scale_rows(d: Array, x: Array, out: Array) -> Array:
     _same_shape(x, out)
     if d.shape != x.shape[:1]:
         raise InputError(f"the diagonal has shape {d.shape}; it must be {x.shape[:1]}")
-    _elementwise(out, "vector_scale_rows", x.columns, d, x, out)
-    return out
-
-
-def multiply(x: Array, y: Array, out: Array) -> Array:
-    """out = x y, entry by entry; `out` may be `x` or `y`."""
-    _same_shape(x, y, out)
-    _elementwise(out, "vector_scale_rows", 1, x, y, out)  # of one column as long as all
-    return out
+    return _elementwise(out, "vector_scale_rows", x.columns, d, x)
 
 
 def dot(x: Array, y: Array) -> np.ndarray:
     """<x_c, y_c> of every column c, as (k,) float64; waits for the device."""
-    return dots([x], y)[0]
-
-
-def dots(xs: Sequence[Array], y: Array) -> np.ndarray:
-    """<x_c, y_c> of every column c for each x of `xs`, as (len(xs), k) float64; waits once for all."""
-    out = y.device.empty((len(xs), y.columns))
-    for slot, x in enumerate(xs):
-        queue_dot(x, y, out, slot)
-    return out.get().astype(np.float64)
-
-
-def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
-    """Row `slot` of `out` (slots, k) = <x_c, y_c> of every column c; does not wait."""
     _same_shape(x, y)
-    device, k = x.device, x.columns
-    rows = x.shape[0]
-    kernel = device.kernel("vector", "vector_dot")
-    group = 64 if device.is_cpu else 256
-    group = min(group, kernel.largest_group())
-    scratch = device.local(group)
-    if rows <= _AT_ONCE[device.is_cpu] * group:
-        kernel((group, k), (group, 1), rows, k, 0, x, y, out, slot * k, scratch)
-        return
-    slices = min(_SLICES, -(-rows // group))
-    sums = device.empty((slices, k))
-    kernel((slices * group, k), (group, 1), rows, k, 0, x, y, sums, 0, scratch)
-    kernel((group, k), (group, 1), slices, k, 1, sums, sums, out, slot * k, scratch)
-
-
-def keep(weights: Array, squares: Array, slot: int, lowest: float, x: Array, best: Array) -> Array:
-    """best = x, where ``max(weights * squares[slot])`` is at most `lowest` and that of every row before.
-
-    `weights` are (k,), `squares` (slots, k), for the columns of `x`; nothing is read back. What comes after a
-    row that is not finite is no best.
-    """
-    _same_shape(x, best)
-    items = min(_COPIERS[x.device.is_cpu], x.size)
-    kernel = x.device.kernel("vector", "vector_keep")
-    group = min(64, kernel.largest_group())
-    with np.errstate(over="ignore"):
-        lowest = float(np.float32(lowest))
-    kernel(items, group, x.size, x.columns, slot, lowest, weights, squares, x, best)
-    return best
+    reduction = _reduction("vector_dot", x)
+    sums = x.device.empty((reduction.groups, x.columns))
+    reduction.queue(x, y, sums, 0)
+    return sums.get().sum(axis=0, dtype=np.float64)
 
 
 def norm(x: Array) -> np.ndarray:
@@ -128,9 +66,92 @@ def norm(x: Array) -> np.ndarray:
     return np.sqrt(dot(x, x))
 
 
-def _elementwise(out: Array, name: str, *arguments: float | Array) -> None:
-    kernel = out.device.kernel("vector", name)
-    kernel(out.size, min(256, kernel.largest_group()), out.size, *arguments)
+def norms(*xs: Array) -> np.ndarray:
+    """Euclidean norms of the columns of each x, as (len(xs), k) float64; waits once for all."""
+    out = xs[0].device.empty((len(xs), xs[0].columns))
+    for slot, x in enumerate(xs):
+        queue_dot(x, x, out, slot)
+    return np.sqrt(out.get().astype(np.float64))
+
+
+def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
+    """Row `slot` of `out` (slots, k) = <x_c, y_c> of every column c; does not wait."""
+    _same_shape(x, y)
+    reduction = _reduction("vector_dot", x)
+    if reduction.groups == 1:
+        reduction.queue(x, y, out, slot * x.columns)
+        return
+    sums = x.device.empty((1, reduction.groups, x.columns))
+    reduction.queue(x, y, sums, 0)
+    _queue_sums(sums, 1, out, slot)
+
+
+def queue_step(
+    p: Array, x: Array, r: Array, d: Array, keep: float, gain: float, partials: Array, slot: int
+) -> None:
+    """x += d, r -= p, d = keep d + gain r, in one launch, where p = S d; does not wait.
+
+    The squares of the new r are added up column by column into row `slot` of `partials`, which is
+    (slots, step_groups(x), k).
+    """
+    _same_shape(p, x, r, d)
+    reduction = _reduction("vector_step", x)
+    row = (reduction.groups, x.columns)
+    if partials.shape[1:] != row:
+        raise InputError(f"partials are {partials.shape}; they must be (slots, {row[0]}, {row[1]})")
+    reduction.queue(keep, gain, slot * row[0] * row[1], p, x, r, d, partials)
+
+
+def step_groups(x: Array) -> int:
+    """Into how many partial sums a column `queue_step` adds up the squares of a vector like `x`."""
+    return _reduction("vector_step", x).groups
+
+
+def queue_sum_partials(partials: Array, slots: int, out: Array) -> None:
+    """First `slots` rows of `out` (slots, k) = those of `partials` (slots, groups, k), added up."""
+    if partials.shape[2:] != out.shape[1:] or not slots <= min(partials.shape[0], out.shape[0]):
+        raise InputError(f"{slots} rows of partials {partials.shape} cannot be added up into {out.shape}")
+    _queue_sums(partials, slots, out, 0)
+
+
+def _queue_sums(partials: Array, slots: int, out: Array, slot: int) -> None:
+    kernel = _reduction("vector_sums", out, rows=partials.shape[1])
+    kernel.queue(partials, out, slot * out.columns, across=slots)
+
+
+class _Reduction:
+    """A kernel that sums over the rows of (rows, k) in `groups` work-groups, and how it is launched."""
+
+    def __init__(self, x: Array, name: str, rows: int, k: int) -> None:
+        device, self._sizes = x.device, (rows, k)
+        self._kernel = _kernel(x, name)
+        group = self._kernel.group((16 if k <= 16 else 64) if device.is_cpu else 256)
+        most = max(64, 4 * device.compute_units)  # enough for a large GPU, few enough for one last group
+        wanted = 1 if name == "vector_sums" else -(-rows * k // (group * _VALUES[device.is_cpu]))
+        self.groups = max(1, min(wanted, most))
+        self._group, self._items, self._parts = (group, 1, 1), self.groups * group, -(-k // group)
+        self._local = device.local(group)
+
+    def queue(self, *arguments: float | Array, across: int = 1) -> None:
+        """Launch it with `arguments` between the sizes and the local memory."""
+        self._kernel((self._items, across, self._parts), self._group, *self._sizes, *arguments, self._local)
+
+
+def _reduction(name: str, x: Array, rows: int | None = None) -> _Reduction:
+    """That of vectors like `x`, made once, or of as many columns and `rows` rows."""
+    key = (name, x.shape[0] if rows is None else rows, x.columns)
+    if key not in x.device.reductions:
+        x.device.reductions[key] = _Reduction(x, *key)
+    return x.device.reductions[key]
+
+
+def _kernel(x: Array, name: str) -> Kernel:
+    return x.device.kernel("vector", name, **({} if x.device.is_cpu else {"ADJACENT": 0}))
+
+
+def _elementwise(out: Array, name: str, *arguments: float | Array) -> Array:
+    _kernel(out, name)(out.size, 256, out.size, *arguments, out)
+    return out
 
 
 def _same_shape(*arrays: Array) -> None:

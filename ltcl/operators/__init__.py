@@ -8,20 +8,15 @@ from typing import Any
 import scipy.sparse
 
 from ltcl.device import Device, open_device
-from ltcl.operators.base import Norms, Operator, Transposed
-from ltcl.operators.bases import Basis, Chained, Ordered
-from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted
-from ltcl.operators.compressed import Compressed, Sum
-from ltcl.operators.coupled import Coupled
-from ltcl.operators.csr import CSR, Pattern
+from ltcl.operators.base import Epilogue, Norms, Operator
+from ltcl.operators.bases import Basis, Chained, SubsetBasis, multiresolution_order, restrict_to_support
+from ltcl.operators.composed import Compressed, Coupled, Host, IdentityPlus, ScaledColumns, Shifted, Sum
+from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
-from ltcl.operators.named_bases import basis, basis_of
-from ltcl.operators.orders import hilbert, relatives
-from ltcl.operators.packing import smallest, spread
+from ltcl.operators.packing import smallest
 from ltcl.operators.pyramid import Pyramid
-from ltcl.operators.row_blocks import RowBlocks
-from ltcl.operators.selected import Selected, active, chosen, on_active
+from ltcl.operators.stored import basis
 from ltcl.operators.tiles import Tiles
 from ltcl.operators.wavelets import Wavelet
 
@@ -32,31 +27,25 @@ __all__ = [
     "Compressed",
     "Coupled",
     "Dense",
+    "Epilogue",
     "Host",
     "IdentityPlus",
     "Norms",
     "Operator",
-    "Ordered",
-    "Pattern",
     "Pyramid",
+    "RowBlocks",
     "ScaledColumns",
-    "Selected",
     "Shifted",
+    "SubsetBasis",
     "Sum",
     "Tiles",
-    "Transposed",
     "Wavelet",
-    "active",
     "as_operator",
     "basis",
-    "basis_of",
-    "chosen",
-    "hilbert",
     "interreflections",
-    "on_active",
-    "relatives",
+    "multiresolution_order",
+    "restrict_to_support",
     "smallest",
-    "spread",
 ]
 
 

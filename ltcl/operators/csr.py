@@ -3,12 +3,16 @@
 
 A transposed product uses A^T in the same format, built and uploaded at the first one: twice the memory,
 but the same speed and the same bits at every call, which scattered additions would not give.
+
+A matrix may come a block of rows at a time, as from a file. Then the host keeps row pointers alone: diagonal
+and norms have all blocks read again; a transposed product and the places of nonzeros keep them, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from types import MappingProxyType
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,9 +20,10 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Array, Device
-from ltcl.operators import slabs
-from ltcl.operators.base import Norms
-from ltcl.operators.rows import RowOperator, Slab
+from ltcl.operators.rows import RowOperator, Slab, cut, largest
+
+Blocks = Callable[[], Iterator[tuple[int, Any]]]
+_SLAB = 1 << 26  # bytes: smaller blocks are joined, since each slab is a launch
 
 
 class Pattern:
@@ -35,7 +40,7 @@ class Pattern:
         self.indices = matrix.indices
         row_bytes = np.maximum(4 * np.diff(self.indptr), 4)  # pointers weigh as much as one nonzero
         # There is one pointer more than rows.
-        self.cuts = slabs.cut(row_bytes, slabs.largest(device) - 4, "the sparse matrix")
+        self.cuts = cut(row_bytes, largest(device) - 4, "the sparse matrix")
         self.slabs = [self._upload(start, stop) for start, stop in self.cuts]
 
     def _upload(self, start: int, stop: int) -> tuple[Array, Array]:
@@ -50,11 +55,6 @@ class Pattern:
             values = self.device.upload(data[self.indptr[start] : self.indptr[stop]])
             slabs.append(Slab(start, stop - start, (pointers, columns, values)))
         return slabs
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device."""
-        return sum(pointers.nbytes + columns.nbytes for pointers, columns in self.slabs)
 
     def matches(self, matrix: Any) -> bool:
         """Whether `matrix` has its nonzeros in the same places."""
@@ -92,7 +92,6 @@ class CSR(RowOperator):
     """
 
     file = "csr"
-    defines: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(self, device: Device, matrix: Any, pattern: Pattern | None = None) -> None:
         matrix = checks.csr("matrix", matrix)
@@ -103,41 +102,19 @@ class CSR(RowOperator):
         self.slabs = self.pattern.with_values(matrix.data)
         self.nnz: int = matrix.nnz
         self._host = matrix
-        self._transposed_copy: CSR | None = None
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device, those of the transpose included once it was asked for."""
-        return super().nbytes + (self._transposed_copy.nbytes if self._transposed_copy is not None else 0)
 
     @property
     def data(self) -> np.ndarray:
         """The values on the host, (nnz,), in the order of `pattern`."""
         return self._host.data
 
-    def diagonal(self) -> np.ndarray:
-        """The main diagonal, (min(M, N),) float64."""
-        return self._host.diagonal().astype(np.float64)
-
-    def parts(self, places: Iterable[tuple[slice, slice]]) -> Iterator[np.ndarray]:
-        """Dense float64 copies of the places (rows, columns)."""
-        for rows, columns in places:
-            yield self._host[rows, columns].toarray().astype(np.float64)
-
-    def norms(self) -> Norms:
-        """Norms of the matrix as it was given."""
-        absolute = abs(self._host)
-        return Norms(
-            one=float(np.max(absolute.sum(axis=0), initial=0.0)),
-            inf=float(np.max(absolute.sum(axis=1), initial=0.0)),
-            frobenius=float(np.linalg.norm(self._host.data)),
-            lowest=float(np.min(self._host.data, initial=0.0)),
-        )
+    def blocks(self) -> Iterator[tuple[int, Any]]:
+        """The matrix as it was given, in float64."""
+        yield 0, self._host.astype(np.float64)
 
     def matrix(self) -> scipy.sparse.csr_array:
         """What it stands for: (M, N), float32 values on the host."""
-        values = self._host.data.astype(np.float32)
-        return scipy.sparse.csr_array((values, self._host.indices, self._host.indptr), shape=self.shape)
+        return scipy.sparse.csr_array(self._host.astype(np.float32))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays, of which `from_arrays` makes the same again, to the bit."""
@@ -158,19 +135,83 @@ class CSR(RowOperator):
         checks.compressed("the stored matrix", indptr, indices, checks.real("data", data), (rows, columns))
         return cls(device, scipy.sparse.csr_array((data, indices, indptr), shape=(rows, columns)), pattern)
 
-    def to_dense(self) -> np.ndarray:
-        """The whole matrix, (M, N) float64, on the host."""
-        checks.fits_host(f"a dense matrix {self.shape}", 8 * self.shape[0] * self.shape[1])
-        return self._host.toarray().astype(np.float64)
+    def _transposed_rows(self) -> CSR:
+        return CSR(self.device, scipy.sparse.csr_array(self._host.T))
 
-    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        if not transpose:
-            self._forward(x, out, scale, add)
-            return
-        self.transposed_copy()._forward(x, out, scale, add)
 
-    def transposed_copy(self) -> CSR:
-        """A^T in sparse rows of its own, made at the first call."""
-        if self._transposed_copy is None:
-            self._transposed_copy = CSR(self.device, scipy.sparse.csr_array(self._host.T))
-        return self._transposed_copy
+class RowBlocks(CSR):
+    """A sparse (M, N) matrix on the device, uploaded block by block.
+
+    Parameters
+    ----------
+    device : Device
+    shape : (M, N)
+    blocks : function
+        Gives (first row, csr_array) of all blocks, in order; each is gone from memory before the next comes.
+    nnz : int
+        Nonzeros there are at most.
+
+    Raises
+    ------
+    InputError
+        A block that is malformed or holds NaN.
+    MemoryLimitError
+        More than the device holds; said before anything is allocated.
+
+    Examples
+    --------
+    >>> import ltcl
+    >>> A = scipy.sparse.csr_array([[1.0, 2.0], [0.0, 3.0]])
+    >>> rows = RowBlocks(ltcl.open_device(), (2, 2), lambda: ((i, A[i : i + 1]) for i in range(2)), A.nnz)
+    >>> (rows @ np.array([1.0, 1.0])).tolist()
+    [3.0, 3.0]
+    """
+
+    def __init__(self, device: Device, shape: tuple[int, int], blocks: Blocks, nnz: int) -> None:
+        RowOperator.__init__(self, device, shape)
+        device.require(8 * nnz, f"a sparse matrix of {nnz} nonzeros")
+        self._blocks = blocks
+        self.slabs, pointers = [], [np.zeros(1, np.int64)]
+        for first, block in self.blocks():
+            slabs = Pattern(device, block).with_values(block.data)
+            self.slabs += [dataclasses.replace(slab, first=first + slab.first) for slab in slabs]
+            pointers.append(block.indptr[1:] + pointers[-1][-1])
+        self.pattern = _PatternOfBlocks(self, np.concatenate(pointers))
+        self.nnz = int(self.pattern.indptr[-1])
+
+    def blocks(self) -> Iterator[tuple[int, Any]]:
+        """Read again; neighbouring ones in one, up to `_SLAB` bytes."""
+        some: list[Any] = []
+        start = 0
+        for first, block in self._blocks():
+            if some and 8 * (sum(part.nnz for part in some) + block.nnz) > _SLAB:
+                yield start, _joined(start, some)
+                some, start = [], first
+            some.append(block)
+        yield start, _joined(start, some)
+
+    @cached_property
+    def _host(self) -> scipy.sparse.csr_array:
+        checks.fits_host(f"a sparse matrix of {self.nnz} nonzeros", 24 * self.nnz)
+        return _joined(0, [block for _, block in self._blocks()])
+
+
+class _PatternOfBlocks(Pattern):
+    """The pattern of all blocks; places of nonzeros are read again when they are asked for."""
+
+    def __init__(self, owner: RowBlocks, indptr: np.ndarray) -> None:
+        self.device, self.shape, self.indptr, self._owner = owner.device, owner.shape, indptr, owner
+        self.slabs = [slab.arguments[:2] for slab in owner.slabs]
+
+    @property
+    def indices(self) -> np.ndarray:
+        return self._owner._host.indices
+
+    def matches(self, matrix: Any) -> bool:
+        """Not asked: it would take all blocks in memory."""
+        return False
+
+
+def _joined(first: int, blocks: list[Any]) -> scipy.sparse.csr_array:
+    rows = scipy.sparse.csr_array(scipy.sparse.vstack(blocks, "csr"))
+    return scipy.sparse.csr_array(checks.csr(f"rows from {first}", rows).astype(np.float64))

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import InputError
-from ltcl.operators import slabs
-from ltcl.operators.base import Norms, widths
-from ltcl.operators.rows import RowOperator, Slab
+from ltcl.operators.base import Epilogue, widths
+from ltcl.operators.rows import RowOperator, Slab, cut, largest
+
+_STRIP = 256  # columns of a work-item of a transposed product on a CPU, as in kernels/dense.cl
+_CHUNKS, _CHUNK_ROWS = 64, 32  # of a transposed product: enough groups for a large GPU, none too short
 
 
 class Dense(RowOperator):
@@ -51,23 +54,13 @@ class Dense(RowOperator):
         device.require(4 * host.size, f"a dense matrix {host.shape}")
         self.defines = {"LANES": 8 if device.is_cpu else 1}
         rows, width = host.shape
-        cuts = slabs.cut(np.full(rows, 4 * max(width, 1)), slabs.largest(device), "the dense matrix")
+        cuts = cut(np.full(rows, 4 * max(width, 1)), largest(device), "the dense matrix")
         self.slabs = [Slab(a, b - a, (width, device.upload(host[a:b]))) for a, b in cuts]
 
-    def diagonal(self) -> np.ndarray:
-        """The main diagonal, (min(M, N),) float64."""
-        return np.concatenate([np.diagonal(block, first) for first, block in self._blocks()])
-
-    def norms(self) -> Norms:
-        """Norms of the matrix, in float64, slab by slab."""
-        columns, row, squares, lowest = np.zeros(self.shape[1]), 0.0, 0.0, 0.0
-        for _, block in self._blocks():
-            lowest = min(lowest, float(block.min(initial=0.0)))
-            np.abs(block, out=block)
-            columns += block.sum(axis=0)
-            row = max(row, float(block.sum(axis=1).max(initial=0.0)))
-            squares += float(np.vdot(block, block))
-        return Norms(float(columns.max(initial=0.0)), row, squares**0.5, lowest)
+    def blocks(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Slab by slab, as they lie on the device."""
+        for slab in self.slabs:
+            yield slab.first, slab.arguments[1].get().astype(np.float64)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays, of which `from_arrays` makes the same again, to the bit."""
@@ -79,58 +72,30 @@ class Dense(RowOperator):
         """Of what `to_arrays` gave; what does not fit together is refused."""
         return cls(device, arrays["matrix"])
 
-    def to_dense(self) -> np.ndarray:
-        """The whole matrix, (M, N) float64, on the host."""
-        checks.fits_host(f"a dense matrix {self.shape}", 8 * self.shape[0] * self.shape[1])
-        dense = np.empty(self.shape)
-        for first, block in self._blocks():
-            dense[first : first + len(block)] = block
-        return dense
+    def _bound(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Callable[[], object]:
+        if transpose:
+            return functools.partial(self._transposed_product, x, out, epilogue)
+        return super()._bound(x, out, epilogue, False)
 
-    def parts(self, places: Iterable[tuple[slice, slice]]) -> Iterator[np.ndarray]:
-        """Float64 copies of the places (rows, columns), rows ascending, so that a slab is read once."""
-        slabs = iter(self._blocks())
-        first, block = next(slabs)
-        for rows, columns in places:
-            while rows.start >= first + len(block):
-                first, block = next(slabs)
-            pieces = [block[rows.start - first : rows.stop - first, columns]]
-            while rows.stop > first + len(block):
-                first, block = next(slabs)
-                pieces.append(block[: rows.stop - first, columns])
-            yield np.concatenate(pieces)
-
-    def _blocks(self):
+    def _transposed_product(self, x: Array, out: Array, epilogue: Epilogue) -> None:
         for slab in self.slabs:
-            yield slab.first, slab.arguments[1].get().astype(np.float64)
+            self._transposed_slab(slab, x, out, epilogue)
+            epilogue = Epilogue(epilogue.a, 1.0, out)  # the following slabs add to what the first has written
 
-    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        if not transpose:
-            self._forward(x, out, scale, add)
-            return
-        for offset, width in widths(x.columns):
-            self._transposed_columns(x, out, scale, add, offset, width)
-
-    def _transposed_columns(
-        self, x: Array, out: Array, scale: float, add: Array | None, offset: int, width: int
-    ) -> None:
+    def _transposed_slab(self, slab: Slab, x: Array, out: Array, epilogue: Epilogue) -> None:
+        """The share of one slab, in chunks of rows where there are more work-items to feed than columns."""
         lanes = self.defines["LANES"]
-        kernel = self.kernel("dense_rmatvec", width, x.columns)
-        items = -(-self.shape[1] // lanes)
-        for slab in self.slabs:
-            adds, added = (0, out) if add is None else (1, add)
-            kernel(
-                items,
-                16,
-                slab.rows,
-                slab.first,
-                x.columns,
-                offset,
-                scale,
-                adds,
-                *slab.arguments,
-                x,
-                added,
-                out,
-            )
-            add = out  # the following slabs add to what the first has written
+        items, group = -(-self.shape[1] // _STRIP) if lanes > 1 else self.shape[1], 1 if lanes > 1 else 64
+        chunks = 1 if lanes > 1 else max(1, min(_CHUNKS, -(-slab.rows // _CHUNK_ROWS)))
+        a, b, y, c = epilogue
+        y = out if y is None else y
+        sums, numbers = out, (a, b, c)
+        if chunks > 1:
+            sums, numbers = self.device.empty((chunks, *out.shape)), (a, 0.0, 0.0)
+        for offset, width in widths(x.columns):
+            kernel = self.kernel("dense_rmatvec", width, x.columns)
+            place = (slab.rows, slab.first, x.columns, offset)
+            kernel((items, chunks), (group, 1), *place, *numbers, x, y, sums, *slab.arguments)
+        if chunks > 1:
+            kernel = self.kernel("dense_rmatvec_sum", 1, 1)
+            kernel(out.size, 256, out.size, chunks, b, c, x, y, out, sums)

@@ -10,15 +10,12 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.device import Device, open_device
+from ltcl.device import Array, Device, open_device
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
-from ltcl.operators.bases import Basis
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, Shifted, spread
-from ltcl.operators.compressed import Compressed, Sum
-from ltcl.operators.csr import CSR, Pattern
+from ltcl.operators.csr import CSR, Pattern, RowBlocks
 from ltcl.operators.dense import Dense
-from ltcl.operators.row_blocks import RowBlocks
 
 
 def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> tuple[IdentityPlus, ...]:
@@ -79,16 +76,7 @@ def device_of(rows: Sequence[Sequence[Any]], wanted: Device | str | None) -> Dev
 
 def nbytes(systems: Sequence[IdentityPlus]) -> int:
     """Bytes of all S on the device; a pattern or a basis that they share counts once."""
-    parts = [part for S in systems for part in _shareable(S.R)]
-    return sum(S.nbytes for S in systems) - sum(p.nbytes for p in parts) + sum(p.nbytes for p in set(parts))
-
-
-def _shareable(R: Operator) -> list[Pattern | Basis]:
-    if isinstance(R, CSR):
-        return [R.pattern]
-    if isinstance(R, Compressed):
-        return [*{W for W in (R.out, R.into) if W is not None}, *_shareable(R.core)]
-    return [part for A in R.operators for part in _shareable(A)] if isinstance(R, Sum) else []
+    return sum(array.nbytes for array in set[Array]().union(*(S.arrays() for S in systems)))
 
 
 def _carried(matrix: Any, f: np.ndarray) -> float:
@@ -137,14 +125,14 @@ def _sparse_R(T: Any, divisor: np.ndarray, lit: np.ndarray, first: int = 0) -> s
     on_diagonal = T.indices == row
     data = T.data / divisor[T.indices]
     data[on_diagonal] -= lit[row[on_diagonal]]
-    if np.count_nonzero(on_diagonal) < T.shape[0]:  # some F was given where T stores nothing
-        missing = lit[first : first + T.shape[0]].copy()
-        missing[row[on_diagonal] - first] = False
-        R = scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
-        there = missing.astype(np.float64)
-        return scipy.sparse.csr_array(R - scipy.sparse.diags_array(there, offsets=first, shape=T.shape))
-    if data[on_diagonal].any():
-        return scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
-    keep = ~on_diagonal
-    indptr = T.indptr - np.arange(T.shape[0] + 1)  # exactly one diagonal entry a row is gone
-    return scipy.sparse.csr_array((data[keep], T.indices[keep], indptr), shape=T.shape)
+    full = np.count_nonzero(on_diagonal) == T.shape[0]
+    if full and not data[on_diagonal].any():
+        keep = ~on_diagonal
+        indptr = T.indptr - np.arange(T.shape[0] + 1)  # exactly one diagonal entry a row is gone
+        return scipy.sparse.csr_array((data[keep], T.indices[keep], indptr), shape=T.shape)
+    R = scipy.sparse.csr_array((data, T.indices, T.indptr), shape=T.shape)
+    if full:
+        return R
+    missing = lit[first : first + T.shape[0]].astype(np.float64)  # F was given where T stores nothing
+    missing[row[on_diagonal] - first] = 0.0
+    return scipy.sparse.csr_array(R - scipy.sparse.diags_array(missing, offsets=first, shape=T.shape))

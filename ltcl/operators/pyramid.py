@@ -7,15 +7,15 @@ what was measured (for one pixel of it) as columns of a core C, T = C W: W sums 
 
 from __future__ import annotations
 
-import threading
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, Device
-from ltcl.operators.base import MOST, group_of, lanes_of
-from ltcl.operators.bases import Basis
+from ltcl.operators.bases import Basis, launch_grid, launch_group
+
+_SMALL = 4096  # cells of a level from which on one launch does all the rest
 
 
 class Pyramid(Basis):
@@ -51,49 +51,29 @@ class Pyramid(Basis):
     isometric = False
 
     def __init__(self, device: Device, grid: tuple[int, int]) -> None:
-        self.cells = _cells(checks.grid("grid", grid))
+        h, w = checks.grid("grid", grid)
+        levels = range((max(h, w) - 1).bit_length() + 1)
+        self.cells = tuple((-(-h // 2**level), -(-w // 2**level)) for level in levels)
         super().__init__(device, grid, "pyramid", sum(h * w for h, w in self.cells))
         self.offsets = np.cumsum([0] + [h * w for h, w in self.cells[:-1]])
-        self._sums = device.empty(0)
-        self._lock = threading.Lock()  # a product must have the sums to itself while it is queued
 
     def index(self, level: int, row: Any, column: Any) -> Any:
         """The coefficient of cell (row, column) of a level; of many where these are arrays."""
         return self.offsets[level] + np.asarray(row) * self.cells[level][1] + np.asarray(column)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the scratch."""
-        return self._sums.nbytes
-
     def diagonal(self) -> np.ndarray:
         """1 of every pixel, (N,) float64: the finest level comes first."""
         return np.ones(self.shape[1])
 
-    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        if x.columns == 0:
+    def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
+        k, levels = x.columns, len(self.cells)
+        kernel, pieces = self._kernel("pyramid", "spread" if transpose else "gather", k)
+        if transpose:
+            launch_grid(kernel, pieces, *self.grid, *self.grid, levels, k, a, b, x, y, out)
             return
-        levels = range(len(self.cells))
-        name, levels = ("spread", reversed(levels)) if transpose else ("gather", levels)
-        with self._lock:
-            needed = (self.shape[0] + len(self.cells)) * x.columns  # a spare cell a level
-            if self._sums.size < needed:
-                self._sums = self.device.empty(needed)
-            for level in levels:
-                self._launch(name, level, scale, int(add is not None), x, self._sums, add or out, out)
-
-    def _launch(self, name: str, level: int, *arguments: Any) -> None:
-        (h, w), k = self.cells[level], arguments[-1].columns
-        lanes = lanes_of(k)
-        kernel = self.device.kernel("pyramid", f"pyramid_{name}", K=lanes)
-        pieces = -(-k // lanes)
-        if self.device.is_cpu:
-            size, group = (1, min(w, -(-64 // h)), min(h, MOST)), (1, 1, 1)
-        else:
-            size, group = (pieces, min(w, MOST), min(h, MOST)), (*group_of(pieces), 1)
-        kernel(size, group, *self.grid, level, len(self.cells), k, *arguments)
-
-
-def _cells(grid: tuple[int, int]) -> tuple[tuple[int, int], ...]:
-    levels = (max(grid) - 1).bit_length() + 1
-    return tuple((-(-grid[0] // 2**level), -(-grid[1] // 2**level)) for level in range(levels))
+        sums = self.device.empty((self.shape[0] + levels) * k)  # a spare cell a level
+        large = sum(h * w > _SMALL for h, w in self.cells)
+        for level in range(large):
+            arguments = (*self.grid, level, level + 1, k, a, b, x, sums, y, out)
+            launch_grid(kernel, pieces, *self.cells[level], *arguments)
+        launch_group(kernel, pieces, *self.grid, large, levels, k, a, b, x, sums, y, out)

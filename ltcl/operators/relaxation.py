@@ -1,215 +1,176 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Sweeps over the rows of S = shift I + scale M, block after block, by `kernels/relax.cl`.
+"""Methods that read the rows of S = shift I + scale M: sweeps (`kernels/relax.cl`), steps (`southwell.cl`).
 
-Gauss-Seidel and SOR are a forward substitution, x += (D / omega + L)^-1 (b - S x): of each block a parallel
-product with the x of the moment, then the small triangle inside it. Their blocks are a matter of speed: the
-iterates are those of the textbook, up to rounding. Block Gauss-Seidel solves with all of S_BB in place of the
-triangle, and its iterates change with the blocks.
-
-Sparse triangles are solved in place and in sequence, which takes two launches a block. Where blocks have
-inverses, small ones, one launch corrects a block and runs the product for the next, which leaves out what the
-first changes.
+A sweep is a blocked forward substitution, x_B += P_BB^-1 (b - S x)_B with the x of the moment, block after
+block: a parallel product of the rows of B with all that is outside it, then what is inside. A CPU takes many
+small blocks in one launch and substitutes row after row; a GPU takes two launches a block and keeps P_BB^-1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import functools
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ltcl.device import Array, Device
+from ltcl.device import Array
 from ltcl.errors import InputError
-from ltcl.operators import blocks
 from ltcl.operators.base import Operator, widths
-from ltcl.operators.blocks import Block, Finish, Rows
 from ltcl.operators.composed import IdentityPlus
 from ltcl.operators.csr import CSR
 from ltcl.operators.dense import Dense
+from ltcl.operators.rows import Slab
 
-_ITEMS = 8  # rows of a work-group on a CPU: few, so that cores end a block together
-_CORRECTED = 256  # rows of a work-group that only corrects them
-
-
-class Sweep:
-    """What one solve keeps from sweep to sweep; all of the shape of the iterate.
-
-    `x` is the iterate, `before` the one before it and `r` the residual of that. `s` is the right-hand side of
-    a block, `delta` its correction, `carry` what the next residual is made of.
-    """
-
-    def __init__(self, x: Array, b: Array, r: Array) -> None:
-        self.x, self.b, self.r = x, b, r
-        self.before, self.s, self.delta, self.carry = x.like(), x.like(), x.like(), x.like()
+INVERTED = 128  # rows of a block whose inverse is kept: small beside the matrix
+_STRIP, _PANEL = 1 << 17, 1 << 23  # bytes of M in a strip and a panel: many beside what starting one costs
+_GROUP = 64  # items that share a row on a GPU
 
 
 @dataclass(frozen=True)
-class Step:
-    """One launch: the product for rows begin .. begin + rows of a slab, beside what finishes a block."""
+class Rows:
+    """S = shift I + scale M, where M has rows to read."""
 
-    slab: int
-    begin: int
-    rows: int
-    start: int  # columns of the product below it are those of the new iterate
-    finish: Finish
+    M: CSR | Dense
+    shift: float
+    scale: float
+
+    def kernel(self, file: str, name: str, **defines: int) -> Any:
+        """A kernel for the format of M."""
+        dense = {"DENSE": 1} if isinstance(self.M, Dense) else {}
+        return self.M.device.kernel(file, name, **dense, **defines)
+
+    def inverse_diagonal(self, method: str) -> np.ndarray:
+        """1 / S_ii, (N,) float64; a zero is refused, naming its first row and `method`."""
+        diagonal = self.shift + self.scale * self.M.diagonal()
+        zeros = np.flatnonzero(diagonal.astype(np.float32) == 0.0)
+        if zeros.size:
+            raise InputError(
+                f"method={method!r} divides by the diagonal of S, which is 0 in {zeros.size} row(s), "
+                f"first in row {zeros[0]}; use method='direct'"
+            )
+        return 1.0 / diagonal
+
+    def inverse_blocks(self, size: int, omega: float | None, method: str) -> np.ndarray:
+        """P_BB^-1 below each other, (N, size), of triangles with D / omega; of all of S_BB without omega."""
+        n = self.M.shape[0]
+        self.M.device.require(4 * n * size, f"method={method!r} with inverses of {-(-n // size)} blocks")
+        if omega is not None:
+            self.inverse_diagonal(method)
+        inverses, starts = np.zeros((n, size)), range(0, n, size)
+        for first, rows in self.M.blocks():  # which may begin and end within a block of S
+            for start in starts[first // size : -(-(first + rows.shape[0]) // size)]:
+                top, bottom = max(start - first, 0), min(start + size - first, rows.shape[0])
+                part = rows[top:bottom, start : start + size]
+                part = part if isinstance(part, np.ndarray) else part.toarray()
+                inverses[first + top : first + bottom, : part.shape[1]] = self.scale * part
+        for start in starts:
+            P = inverses[start : start + size, : min(size, n - start)]
+            P += self.shift * np.eye(len(P))
+            if omega is not None:
+                P[:] = np.tril(P, -1) + np.diag(P.diagonal() / omega)
+            P[:] = _inverse(P, f"method={method!r}", start)
+        return inverses
+
+
+def _inverse(P: np.ndarray, method: str, start: int) -> np.ndarray:
+    try:
+        inverse = np.linalg.inv(P)
+        if np.linalg.norm(P, 1) * np.linalg.norm(inverse, 1) < 1.0 / np.finfo(np.float64).eps:  # NaN is not
+            return inverse
+    except np.linalg.LinAlgError:
+        pass
+    raise InputError(
+        f"{method} inverts blocks of S, and the one of rows {start} to {start + len(P) - 1} is singular; "
+        "choose another block= or use method='direct'"
+    )
+
+
+def entries(slab: Slab, unread: Array) -> tuple[Any, ...]:
+    """(width, pointers, columns, values) of a slab of either format; `unread` stands for what it lacks."""
+    if len(slab.arguments) == 3:
+        return 0, *slab.arguments
+    width, values = slab.arguments
+    return width, unread, unread, values
 
 
 class Relaxation:
-    """The sweeps of one operator with one block size; made by `relaxation`, which keeps it.
+    """How S is swept with one block size; made by `relaxation`, which keeps it with the matrix."""
 
-    Parameters
-    ----------
-    rows : Rows
-    finishes : list of Finish
-        One for each block of rows, in order; all in sequence or all by inverse.
-    omega : float
-        Stretches corrections that are made in sequence; those by inverse contain it.
-    """
-
-    def __init__(self, rows: Rows, finishes: list[Finish], omega: float) -> None:
+    def __init__(self, rows: Rows, method: str, block: int | None, omega: float | None) -> None:
+        M, device, n = rows.M, rows.M.device, max(1, rows.M.shape[0])
         self.rows, self.omega = rows, omega
-        self.device: Device = rows.M.device
-        self.block = max((f.block.stop - f.block.start for f in finishes), default=1)
-        self.in_place = any(finish.chained >= 0 for finish in finishes)
-        self._slabs = self._arguments(finishes)
-        self._steps = list(self._plan(finishes))
+        self.inverses = omega is None or not device.is_cpu
+        size = block or (INVERTED if self.inverses else _STRIP * n // max(1, M.nbytes))
+        self.block = max(1, min(size, n))
+        # 1 / (2 panels) of each row waits for the rows before it: little beside the share of a core.
+        panels = max(8, 2 * device.compute_units, M.nbytes // _PANEL) if device.is_cpu else n
+        self.panel = self.block * -(-n // (self.block * panels))
+        with np.errstate(over="ignore"):  # a sweep with Inf ends as divergence, and says so
+            if self.inverses:
+                weights = rows.inverse_blocks(self.block, omega, method)
+            else:
+                weights = rows.inverse_diagonal(method)
+            self.weights = device.upload(weights.astype(np.float32))
+        self.windows = [self._split(slab) for slab in M.slabs]
 
-    def sweep(self, state: Sweep) -> None:
-        """Queue one sweep: `x` becomes the next iterate, `r` the residual of the one before.
+    def _split(self, slab: Slab) -> Array:
+        """Where the kernels split the rows of a sparse slab."""
+        if isinstance(self.rows.M, Dense):
+            return self.weights  # not read
+        windows = self.rows.M.device.empty((slab.rows, 2), np.int32)
+        place = (slab.rows, slab.first, self.block, self.panel, int(self.inverses))
+        self.rows.kernel("relax", "relax_windows", K=1)(slab.rows, None, *place, *slab.arguments[:2], windows)
+        return windows
 
-        The residual holds from the second sweep of a `state` on.
-        """
-        if self.in_place:
-            state.before.copy_from(state.x)
-        else:
-            state.x, state.before = state.before, state.x
-        for offset, width in widths(state.x.columns):
-            launch = self._launch(state, offset, width)
-            for step in self._steps:
-                launch(step)
 
-    def _launch(self, state: Sweep, offset: int, width: int) -> Callable[[Step], None]:
-        """What queues a step for `width` right-hand sides from `offset` on."""
-        rows, columns = self.rows, state.x.columns
-        fastest = rows.M.fastest(state.x, width)  # variants of one name read rows alike
-        variant = fastest.kernel.name.removeprefix(f"{rows.M.file}_matvec")
-        packed = {"PACKED": 1} if width == columns else {}
-        kernel = self.device.kernel("relax", f"relax_{rows.M.file}{variant}", K=width, **packed)
-        group = fastest.group or (_ITEMS if self.device.is_cpu else 64)
-        taken = 1 if fastest.group else group  # rows of a work-group
-        numbers = (columns, offset, rows.shift, rows.scale)
-        old = state.x if self.in_place else state.before
-        vectors = (old, state.x, state.b, state.s, state.delta, state.r, state.carry)
-        local = (self.device.local(group),) if fastest.group else ()
-        alone = self.device.kernel("relax", "relax_substitute", K=width, **packed)
+class Sweeps:
+    """Sweeps of a solve: the iterate `x`, the one `before`, and from the second on its residual `r`."""
 
-        def launch(step: Step) -> None:
-            block, finish = step.finish.block, step.finish
-            count = block.stop - block.start
-            if finish.chained >= 0:
-                size = min(_CORRECTED, self.device.max_group)
-                items = size * (1 - (finish.chained - count) // size)
-                numbered = (count, finish.chained, columns, offset, self.omega)
-                alone(items, size, *numbered, *finish.arguments, state.x, state.s)
-                return
-            lead, work = -(-count // taken), -(-step.rows // taken)
-            place = (
-                step.rows,
-                step.begin,
-                rows.M.slabs[step.slab].first,
-                lead,
-                step.start,
-                count,
-                block.before,
+    def __init__(self, relaxation: Relaxation, x: Array, b: Array, r: Array) -> None:
+        self.relaxation, self.x, self.b, self.r, self.group = relaxation, x, b, r, _GROUP
+        self.before, self.s, self.carry = x.like(), x.like(), x.like()
+        self._arrivals = x.device.upload(np.zeros(relaxation.panel // relaxation.block + 1), np.int32)
+
+    def sweep(self) -> None:
+        """Queue one sweep."""
+        how, (n, k) = self.relaxation, (self.x.shape[0], self.x.columns)
+        rows, in_strips = how.rows, self.x.device.is_cpu
+        for offset, width in widths(k):
+            defines = {"K": width, "PACKED": 1} if width == k else {"K": width}
+            sums, correct = (
+                rows.kernel("relax", f"relax_{name}", **defines)
+                for name in ("strips" if in_strips else "rows", "correct")
             )
-            arguments = (*place, *numbers, *self._slabs[step.slab], *finish.arguments, *vectors)
-            kernel(group * (lead + work), group, *arguments, *local)
-
-        return launch
-
-    def _arguments(self, finishes: list[Finish]) -> list[tuple[Any, ...]]:
-        """What the kernels take for each slab."""
-        M = self.rows.M
-        if isinstance(M, Dense):
-            return [slab.arguments for slab in M.slabs]
-        counts, found = blocks.middle(M, [finish.block for finish in finishes]), []
-        for slab in M.slabs:
-            pointers = M.pattern.indptr[slab.first : slab.first + slab.rows]
-            within = pointers - (pointers[0] if slab.rows else 0)
-            split = within + counts[slab.first : slab.first + slab.rows]
-            found.append((*slab.arguments, self.device.upload(split, np.int32)))
-        return found
-
-    def _plan(self, finishes: list[Finish]) -> Iterator[Step]:
-        """Blocks are those of the matrix: one that crosses slabs has its product in several launches."""
-        waiting = nothing = Finish(Block(0, 0, 0), -1, (self.device.upload([0.0]),))
-        for finish in finishes:
-            for number, slab in enumerate(self.rows.M.slabs):
-                begin = max(finish.block.start, slab.first)
-                stop = min(finish.block.stop, slab.first + slab.rows)
-                if begin < stop:
-                    yield Step(number, begin - slab.first, stop - begin, finish.block.before, waiting)
-                    waiting = nothing
-            waiting = finish
-            if self.in_place:
-                yield Step(0, 0, 0, finish.block.start, finish)
-                waiting = nothing
-        if not self.in_place:
-            yield Step(0, 0, 0, waiting.block.start, waiting)
+            group = min(sums.group(self.group), correct.group(self.group))
+            local = self.x.device.local(2 * width * group)
+            vectors = (self.x, self.b, self.s, self.r, self.carry)
+            for start in range(0, n, how.panel):
+                for slab, windows in zip(rows.M.slabs, how.windows, strict=True):
+                    begin, end = max(start, slab.first), min(start + how.panel, slab.first + slab.rows)
+                    place = (begin, end, slab.first, start, k, offset, rows.shift, rows.scale)
+                    arguments = (*place, *entries(slab, windows), windows, *vectors)
+                    if begin < end and in_strips:
+                        strips = -(-end // how.block) - begin // how.block
+                        more = (strips, n, how.block, int(how.inverses), how.omega or 1.0)
+                        sums(strips, 1, *arguments, *more, how.weights, self._arrivals, self.before)
+                    elif begin < end:
+                        sums((end - begin) * group, group, *arguments, local)
+                if not in_strips:
+                    count = min(how.block, n - start)
+                    place = (start, count, how.block, k, offset, how.weights)
+                    correct(count * group, group, *place, self.x, self.before, self.s, local)
 
 
-def relaxation(S: Operator, method: str, block: int | None = None, omega: float = 1.0) -> Relaxation:
-    """The sweeps of Gauss-Seidel and SOR, made at the first call and kept with the matrix of S.
+def relaxation(S: Operator, method: str, block: int | None = None, omega: float | None = 1.0) -> Relaxation:
+    """Gauss-Seidel and SOR or, where `omega` is None, block Gauss-Seidel.
 
-    Raises
-    ------
-    InputError
-        S does not give its rows, or has a zero on its diagonal; the message names `method`.
-    MemoryLimitError
-        More than the device holds; said before anything is computed.
+    Made at the first call and kept with the matrix of S; another omega takes the place of the one before.
     """
     rows = readable(S, method)
-
-    def finishes() -> list[Finish]:
-        refuse_zeros(rows.diagonal(), method)
-        # In sequence is slow on a GPU, and a dense triangle is no smaller than its inverse.
-        sequential = rows.M.device.is_cpu and isinstance(rows.M, CSR)
-        size = block or blocks.best_size(rows.M, sequential=sequential)
-        cut = blocks.cut(S.shape[0], size, overlap=not sequential)
-        if sequential:
-            return list(blocks.in_sequence(rows, cut))
-        return list(blocks.by_inverse(rows, cut, omega, method))
-
-    return _kept(rows, ("triangle", block), omega, finishes)
-
-
-def block_relaxation(S: Operator, method: str, block: int) -> Relaxation:
-    """The sweeps of block Gauss-Seidel with `block` rows a block, kept likewise.
-
-    Raises
-    ------
-    InputError
-        S does not give its rows, or a block has no inverse; the message names `method`.
-    MemoryLimitError
-        More than the device holds; said before anything is computed.
-    """
-    rows = readable(S, method)
-
-    def finishes() -> list[Finish]:
-        return list(blocks.by_inverse(rows, blocks.cut(S.shape[0], block, overlap=True), None, method))
-
-    return _kept(rows, ("block", block), 1.0, finishes)
-
-
-def _kept(
-    rows: Rows, kind: tuple[str, int | None], omega: float, finishes: Callable[[], list[Finish]]
-) -> Relaxation:
-    """One for each kind: that of another omega takes the place of the one before."""
-    kept, key = rows.M.relaxations, (rows.shift, rows.scale, *kind)
+    kept, key = rows.M.relaxations, (rows.shift, rows.scale, block, omega is None)
     if key not in kept or kept[key].omega != omega:
-        kept.pop(key, None)
-        kept[key] = Relaxation(rows, finishes(), omega)
+        kept[key] = Relaxation(rows, method, block, omega)
     return kept[key]
 
 
@@ -224,11 +185,28 @@ def readable(S: Operator, method: str) -> Rows:
     return Rows(M, shift, scale)
 
 
-def refuse_zeros(diagonal: np.ndarray, method: str) -> None:
-    """Refuse to divide by a zero on the diagonal of S, naming its first row and `method`."""
-    zeros = np.flatnonzero(diagonal.astype(np.float32) == 0.0)
-    if zeros.size:
-        raise InputError(
-            f"method={method!r} divides by the diagonal of S, which is 0 in {zeros.size} row(s), "
-            f"first in row {zeros[0]}; use method='direct'"
-        )
+class Steps:
+    """Steps of Southwell's relaxation on an iterate `x` and its residual `r`, with `parts` rows a step."""
+
+    def __init__(self, S: Operator, method: str, x: Array, r: Array, parts: int) -> None:
+        rows, device = readable(S, method), S.device
+        self.rows, self.x, self.r, self.parts, self._pending = rows, x, r, parts, 0
+        self._inverse = device.upload(rows.inverse_diagonal(method))
+        self._slabs = (rows.M.transposed_copy() if isinstance(rows.M, CSR) else rows.M).slabs
+        shape = (parts, x.columns)
+        self._picked, self._next = ((device.empty(shape, np.int32), device.empty(shape)) for _ in range(2))
+        # Each item looks its rows up in all columns picked: few do on a CPU, where an item is a stream.
+        self.groups, self.group = (2 * device.compute_units, 1) if device.is_cpu else (_GROUP, _GROUP)
+
+    def step(self, *, picks: bool = True) -> None:
+        """Queue one step; `r` learns of its picks at the next, or at one that picks nothing."""
+        n, k, kernel = self.x.shape[0], self.x.columns, self.rows.kernel("southwell", "southwell_step")
+        group, groups = kernel.group(self.group), min(self.groups, self.parts)
+        launch = functools.partial(kernel, (groups * group, k), (group, 1))
+        local = self.x.device.local(group)
+        vectors = (self._inverse, self.x, self.r, *self._picked, *self._next, local, local)
+        for slab in self._slabs:
+            last = picks and slab is self._slabs[-1]
+            place = (n, self.parts, self._pending, int(last), k, self.rows.shift, self.rows.scale)
+            launch(*place, slab.rows, slab.first, *entries(slab, self._inverse), *vectors)
+        self._picked, self._next, self._pending = self._next, self._picked, self.parts if picks else 0

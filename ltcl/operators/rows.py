@@ -1,21 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Operators whose matrix lies on the device as slabs of rows: how their products are launched.
+"""Operators whose matrix lies on the device as slabs of rows: how their products and steps are launched.
 
-Kernels of such a format `f` share their arguments, `(rows, first, stride, offset, scale, adds, <slab>, x,
-add, out)`, and come as `f_matvec`, `f_matvec_stream` and `f_matvec_group`; see `kernels/csr.cl`.
+Kernels of such a format `f` come as `f_matvec`, `f_matvec_stream` and `f_matvec_group`, and take the
+arguments of `kernels/common/product.h`, those of a slab and local memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import permutations
+from types import MappingProxyType
 from typing import Any
 
-from ltcl.device import Array, Device, tuning
-from ltcl.device.kernels import Kernel
-from ltcl.operators.base import Operator, widths
+import numpy as np
+import scipy.sparse
 
-_WORTH_TIMING = 1 << 20  # bytes; below, a product takes as long as its launch and timing tells nothing
+from ltcl import checks
+from ltcl.device import Array, Device, tuning, vectors
+from ltcl.device.device import SPARE_BYTES
+from ltcl.device.kernels import Kernel, Launch
+from ltcl.errors import MemoryLimitError
+from ltcl.operators.base import PLAIN, Epilogue, Norms, Operator, Stepper, widths
+
+_WORTH_TIMING = 1 << 20  # bytes; below, a CPU takes as long to launch a product as to make it
+_KEEP, _GAIN, _GROUP_AT = 6, 7, 8  # arguments of a step that change, see kernels/common/product.h
 
 
 @dataclass(frozen=True)
@@ -33,86 +42,204 @@ class Slab:
 
 
 @dataclass(frozen=True)
-class Launch:
-    """One way to run a kernel over rows: `group` items share a row, or each item has its own (0)."""
+class Variant:
+    """One way to run a kernel over rows: work-groups of `group` items, which share a row or have one each."""
 
-    kernel: Kernel
+    suffix: str
     group: int
+    shared: bool
 
-    def __call__(self, rows: int, *arguments: Any) -> None:
-        """Queue the kernel over `rows` rows."""
-        if self.group:
-            local = self.kernel.device.local(self.group)
-            self.kernel(rows * self.group, self.group, rows, *arguments, local)
-        else:
-            self.kernel(rows, 16 if self.kernel.device.is_cpu else 64, rows, *arguments)
+    def shape(self, kernel: Kernel, rows: int, width: int) -> tuple[int, int, Any]:
+        """Work-items, work-group and local memory of a launch over `rows` with `width` right-hand sides."""
+        group = kernel.group(self.group)
+        return (rows * group if self.shared else rows), group, kernel.device.local(width * group)
 
 
 class RowOperator(Operator):
-    """An operator stored as slabs of rows. Subclasses set `file`, `defines` and `slabs`."""
+    """An operator stored as slabs of rows. Subclasses set `file`, `defines`, `slabs`, and give `blocks`."""
 
     file: str  # stem of the kernel file
-    defines: Mapping[str, Any]
+    defines: Mapping[str, Any] = MappingProxyType({})
+    unit = 1.0  # of the numbers in the slabs
     slabs: list[Slab]
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         super().__init__(device, shape)
-        self._fastest: dict[tuple[int, int], Launch] = {}
+        self._fastest: dict[tuple[int, int], Variant] = {}
+        self._transposed: RowOperator | None = None
         self.relaxations: dict[tuple[Any, ...], Any] = {}  # of relaxation.py: lives as long
-        self.tables: dict[str, Any] = {}  # of alias.py
+        self.tables: dict[str, Any] = {}  # of walks.py
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the matrix on the device."""
-        return sum(slab.nbytes for slab in self.slabs)
+    def arrays(self) -> set[Array]:
+        """Of all slabs, and of the transpose once it was asked for."""
+        arrays = {part for slab in self.slabs for part in slab.arguments if isinstance(part, Array)}
+        return arrays if self._transposed is None else arrays | self._transposed.arrays()
 
-    def kernel(self, name: str, width: int, columns: int) -> Kernel:
-        """The kernel `name` for `width` of `columns` right-hand sides."""
-        packed = {"PACKED": 1} if width == columns else {}
-        return self.device.kernel(self.file, name, K=width, **packed, **self.defines)
+    def blocks(self) -> Iterator[tuple[int, Any]]:
+        """(first row, rows on the host): float64 arrays or csr_arrays (rows, N) of what it stands for."""
+        raise TypeError(f"{type(self).__name__} does not implement blocks")
 
-    def variants(self, width: int, columns: int) -> dict[str, Launch]:
-        """The ways to run a product with `width` of `columns` right-hand sides here, the default first."""
+    def diagonal(self) -> np.ndarray:
+        """The main diagonal, (min(M, N),) float64."""
+        diagonal = np.zeros(min(self.shape))
+        for first, rows in self.blocks():
+            here = rows.diagonal(first)
+            diagonal[first : first + len(here)] = here
+        return diagonal
 
-        def launch(suffix: str, group: int) -> Launch:
-            return Launch(self.kernel(f"{self.file}_matvec{suffix}", width, columns), group)
+    def norms(self) -> Norms:
+        """Norms of what it stands for, in float64."""
+        columns, inf, squares, lowest = np.zeros(self.shape[1]), 0.0, 0.0, 0.0
+        for _, rows in self.blocks():
+            values = rows.data if scipy.sparse.issparse(rows) else rows
+            squares += float(np.vdot(values, values))
+            lowest = min(lowest, float(values.min(initial=0.0)))
+            sizes = abs(rows)
+            columns += sizes.sum(axis=0)
+            inf = max(inf, float(sizes.sum(axis=1).max(initial=0.0)))
+        return Norms(float(columns.max(initial=0.0)), inf, squares**0.5, lowest)
 
+    def to_dense(self) -> np.ndarray:
+        """The whole matrix that it stands for, (M, N) float64, on the host."""
+        checks.fits_host(f"a dense matrix {self.shape}", 8 * self.shape[0] * self.shape[1])
+        dense = np.empty(self.shape)
+        for first, rows in self.blocks():
+            here = rows.toarray() if scipy.sparse.issparse(rows) else rows
+            dense[first : first + len(here)] = here
+        return dense
+
+    def transposed_copy(self) -> RowOperator:
+        """A^T in rows of its own, made at the first call and kept."""
+        if self._transposed is None:
+            self._transposed = self._transposed_rows()
+        return self._transposed
+
+    def _transposed_rows(self) -> RowOperator:
+        raise TypeError(f"{type(self).__name__} does not implement _transposed_rows")
+
+    def variants(self) -> dict[str, Variant]:
+        """The ways to run a product here, the default first."""
+        item = Variant("", 16 if self.device.is_cpu else 64, shared=False)
         if self.device.is_cpu:
-            return {"stream": launch("_stream", 0), "item": launch("", 0)}
+            return {"stream": Variant("_stream", 16, shared=False), "item": item}
         groups = [size for size in (32, 64, 128, 256) if size <= self.device.max_group]
-        return {**{f"group{size}": launch("_group", size) for size in groups}, "item": launch("", 0)}
+        return {**{f"group{size}": Variant("_group", size, shared=True) for size in groups}, "item": item}
 
-    def _forward(self, x: Array, out: Array, scale: float, add: Array | None) -> None:
-        for offset, width in widths(x.columns):
-            launch = self.fastest(x, width)
-            for slab in self.slabs:
-                _run(launch, slab, x, offset, out, scale, add)
-
-    def fastest(self, x: Array, width: int) -> Launch:
+    def fastest(self, x: Array, width: int) -> Variant:
         """The way to run products with `width` of the right-hand sides `x`, timed at the first call."""
         key = (width, x.columns)
         if key not in self._fastest:
             self._fastest[key] = self._measure(x, width)
         return self._fastest[key]
 
-    def _measure(self, x: Array, width: int) -> Launch:
-        variants = self.variants(width, x.columns)
+    def _measure(self, x: Array, width: int) -> Variant:
+        variants = self.variants()
         slab = max(self.slabs, key=lambda slab: slab.nbytes)
-        if slab.nbytes < _WORTH_TIMING:
+        if self.device.is_cpu and slab.nbytes < _WORTH_TIMING:
             return next(iter(variants.values()))
         # Timed on the real matrix, into an array nobody needs: `out` may be an operand.
         spare = self.device.empty((self.shape[0], *x.shape[1:]))
         trials = {
-            name: lambda launch=launch: _run(launch, slab, x, 0, spare, 1.0, None)
-            for name, launch in variants.items()
+            name: self._launch(variant, slab, x, spare, 0, width, PLAIN) for name, variant in variants.items()
         }
-        row = slab.nbytes // slab.rows
-        problem = f"k={width} of {x.columns}, rows of about 2^{row.bit_length()} bytes"
+        row = slab.nbytes // max(slab.rows, 1)
+        kind = " ".join(f"{name}={value}" for name, value in sorted(self.defines.items()))
+        problem = f"{kind} k={width} of {x.columns}, rows of about 2^{row.bit_length()} bytes"
         return variants[tuning.choose(self.device, self.file, problem, trials)]
 
+    def kernel(self, name: str, width: int, columns: int, **defines: int) -> Kernel:
+        """The kernel `name` for `width` of `columns` right-hand sides."""
+        packed = {"PACKED": 1} if width == columns else {}
+        return self.device.kernel(self.file, name, K=width, **packed, **defines, **self.defines)
 
-def _run(
-    launch: Launch, slab: Slab, x: Array, offset: int, out: Array, scale: float, add: Array | None
-) -> None:
-    adds, added = (0, out) if add is None else (1, add)
-    launch(slab.rows, slab.first, x.columns, offset, scale, adds, *slab.arguments, x, added, out)
+    def _launch(
+        self, variant: Variant, slab: Slab, x: Array, out: Array, offset: int, width: int, epilogue: Epilogue
+    ) -> Callable[[], None]:
+        kernel = self.kernel(f"{self.file}_matvec{variant.suffix}", width, x.columns)
+        items, group, local = variant.shape(kernel, slab.rows, width)
+        a, b, y, c = epilogue
+        numbers = (slab.rows, slab.first, x.columns, offset, a * self.unit, b, c)
+        operands = (x, out if y is None else y, out)
+        return kernel.bind(items, group, *numbers, *operands, *slab.arguments, local)
+
+    def _bound(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Callable[[], object]:
+        if transpose:
+            return self.transposed_copy()._bound(x, out, epilogue, False)
+        launches = [
+            self._launch(self.fastest(x, width), slab, x, out, offset, width, epilogue)
+            for offset, width in widths(x.columns)
+            for slab in self.slabs
+        ]
+        return launches[0] if len(launches) == 1 else lambda: [launch() for launch in launches]
+
+    def _stepper(self, x: Array, r: Array, slots: int, a: float, c: float) -> Stepper:
+        return RowStepper(self, x, r, slots, a * self.unit, c)
+
+
+class RowStepper(Stepper):
+    """Steps of which each is one launch, or one a slab and eight right-hand sides."""
+
+    A: RowOperator
+
+    def _prepare(self) -> None:
+        A, columns = self.A, self.x.columns
+        pieces, ends = [], []
+        for offset, width in widths(columns):
+            variant, at = A.fastest(self.x, width), 0
+            for slab in A.slabs:
+                kernel = A.kernel(f"{A.file}_matvec{variant.suffix}", width, columns, STEP=1)
+                shape = variant.shape(kernel, slab.rows, width)
+                pieces.append((kernel, shape, slab, offset, at))
+                at += -(-shape[0] // shape[1])
+            ends.append(at)
+        self._groups = max(ends, default=1)
+        self._partials = A.device.empty((self.slots, self._groups, columns))
+        if len(set(ends)) > 1:
+            vectors.fill(self._partials, 0.0)  # some pieces of right-hand sides have fewer groups than others
+        # The direction is read by many rows while the next one is written: the two take turns.
+        self._turns: list[list[tuple[Launch, int]]] = [[], []]
+        for turn, (d, following) in zip(self._turns, permutations((self.d, self.other)), strict=True):
+            for kernel, (items, group, local), slab, offset, at in pieces:
+                numbers = (slab.rows, slab.first, columns, offset, self._a, self._c, 0.0, 0.0, at)
+                arrays = (d, self.x, self.r, following, self._partials, *slab.arguments)
+                turn.append((kernel.bind(items, group, *numbers, *arrays, local), at))
+
+    def _queue(self, keep: float, gain: float) -> None:
+        for launch, at in self._turns[0]:
+            launch.set(_KEEP, keep)
+            launch.set(_GAIN, gain)
+            launch.set(_GROUP_AT, self.waiting * self._groups + at)
+            launch()
+        self._turns.reverse()
+        self.d, self.other = self.other, self.d
+
+
+def cut(row_bytes: np.ndarray, limit: int, what: str) -> list[tuple[int, int]]:
+    """Row ranges (start, stop) of slabs, as few as possible, each of at most `limit` bytes.
+
+    `row_bytes` (M,) are those of each row in the largest of a slab's buffers; a single row beyond the limit
+    is refused, naming `what`.
+
+    >>> cut(np.array([4, 4, 4, 4, 4]), 8, "A")
+    [(0, 2), (2, 4), (4, 5)]
+    """
+    ends = np.concatenate([[0], np.cumsum(row_bytes, dtype=np.int64)])
+    pieces, start = [], 0
+    while start < len(row_bytes):
+        stop = int(np.searchsorted(ends, ends[start] + limit, side="right")) - 1
+        if stop == start:
+            raise MemoryLimitError(
+                f"row {start} of {what} has {checks.size(int(row_bytes[start]))}, "
+                f"the largest buffer of this device {checks.size(limit)}"
+            )
+        pieces.append((start, stop))
+        start = stop
+    return pieces or [(0, 0)]
+
+
+def largest(device: Device, itemsize: int = 4) -> int:
+    """Bytes of a slab's largest buffer, of so few values that 32 bits count them.
+
+    Kernels count on beyond the end of a row by a work-group or a stretch: room is left for that.
+    """
+    return min(device.max_allocation - SPARE_BYTES, itemsize * ((1 << 31) - 4096))

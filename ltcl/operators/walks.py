@@ -1,109 +1,263 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Random walks over the rows of R, by `kernels/walk.cl`: estimates of sums of powers times a vector.
+"""Alias tables of the rows of R, and random walks over them: sums of powers of R times a vector.
 
     y_i = sum over k = 1 .. of c_k (R^k b)_i      (eq. 22 and 23 without the term of k = 0)
 
-Sample s of pixel i has random numbers of its own, which the seed, i and s determine alone. So results are the
-same to the bit for any work-group size, device or split of the samples into launches, and a pixel costs the
-same and gets the same estimate whether others are asked for or not.
+A step goes from i to j with chance p(j | i) = |R_ij| / |R_i|, |R_i| = sum_j |R_ij| (eq. 25), the sign kept
+with the column: one load of 8 bytes, from tables that `kernels/alias.cl` builds once. `Linked` tables step by
+other chances p and multiply the weight by R_ij / p(j | i), from a second load. So channels share a walk; of
+all p
+
+    p(j | i) = P_ij / |P_i|,  P_ij^2 = mean over channels c of (R_cij / |R_ci|)^2
+
+has the least sum of the second moments of a step, each in units of those that the channel has by itself.
+
+The seed, i and s determine the random numbers of sample s of pixel i: results are the same to the bit for any
+work-group size, device or split into launches, and whether other pixels are asked for or not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.sparse
 
-from ltcl.device import Array, Device
-from ltcl.operators.alias import SAMPLERS, Tables
-from ltcl.operators.base import widths
+from ltcl import checks
+from ltcl.device import Array
+from ltcl.errors import InputError
+from ltcl.operators.base import Operator, widths
+from ltcl.operators.csr import CSR
+from ltcl.operators.dense import Dense
+from ltcl.operators.relaxation import readable
 
-ESTIMATORS = {"endpoint": 0, "collision": 1}  # the ESTIMATOR of kernels/walk.cl
+SAMPLERS = ("alias", "uniform")
+ESTIMATORS = ("endpoint", "collision")
 CHUNK = 64  # samples that are summed on the device
+_COLUMNS = 1 << 22  # that an entry of 64 bits can tell apart
+_HOST_BYTES = 64  # an entry, while linked tables are made
 _CERTAIN = 1 << 22  # chances to go on, of as many
 _NEVER = 64  # walks of a length whose chance is below 2^-64 are cut: nobody will see one
 _UNITS = 1 << 18  # chunks of one launch at most
 _RECORDS = 1 << 22  # samples of one launch of the adjoint at most
 _STEPS = 1 << 23  # steps of one launch for each compute unit, in the mean: half a second
-_ALIKE = 2.0**-20  # spread over sum of squares, which float32 rounds
+
+
+class Tables:
+    """What a walk over the rows of M needs, see `kernels/common/table.h`; made by `tables`, which keeps it.
+
+    Of the transpose of R, `of_columns`, there is room for one more row, of b; see `append`.
+    """
+
+    channels = 1
+    links: Array | None = None
+
+    def __init__(self, M: CSR | Dense, of_columns: bool = False) -> None:
+        self.device, self.shape, self.of_columns = M.device, M.shape, of_columns
+        self.kept: dict[str, Any] = {}  # what `ltcl.theory.walks` finds out about these walks
+        rows, columns = M.shape
+        if columns > _COLUMNS:
+            raise InputError(f"R has {columns} columns; walks take at most {_COLUMNS}")
+        self._used = M.nnz if isinstance(M, CSR) else rows * columns
+        entries = self._used + columns * of_columns
+        self.device.require(8 * entries, f"tables of the {entries} entries of R")
+        self.records = self.device.empty((rows + of_columns, 4), np.uint32)
+        self.entries = self.device.empty((entries,), np.uint64)
+        for slab in M.slabs:
+            if isinstance(M, CSR):
+                place, arrays = (int(M.pattern.indptr[slab.first]), 0), slab.arguments
+            else:
+                place, arrays = (slab.first * columns, columns), (None, None, slab.arguments[1])
+            self._build(slab.rows, slab.first, *place, *arrays)
+        self._refuse_overflow("R", slice(rows))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return self.records.nbytes + self.entries.nbytes + (self.links.nbytes if self.links else 0)
+
+    def sums(self) -> np.ndarray:
+        """|M_i| of each row, (rows,) float32."""
+        return np.ascontiguousarray(self.records.get()[:, 3]).view(np.float32)
+
+    def append(self, values: Array) -> None:
+        """Build the one row behind those of M from `values`, dense, (columns,)."""
+        self._build(1, self.shape[0], self._used, values.shape[0], None, None, values)
+        self._refuse_overflow("b", slice(self.shape[0], None))
+
+    def second_moments(self, R: CSR | Dense) -> list[Operator]:
+        """Of each channel what a step makes of the second moments of weights: R_ij^2 / p(j | i), (N, N)."""
+        host = _host(R).T if self.of_columns else _host(R)
+        sums = scipy.sparse.diags_array(self.sums()[: self.shape[0]].astype(np.float64))
+        return [_like(R, sums @ abs(host))]
+
+    def _build(self, *arguments: Any) -> None:
+        kernel = self.device.kernel("alias", "alias_rows")
+        kernel(arguments[0], 1 if self.device.is_cpu else 64, *arguments, self.records, self.entries)
+
+    def _refuse_overflow(self, name: str, rows: slice) -> None:
+        beyond = np.flatnonzero(~np.isfinite(self.sums()[rows]))
+        if beyond.size:
+            raise InputError(
+                f"the absolute values of {beyond.size} row(s) of {name}, first of row {beyond[0]}, sum to "
+                f"more than float32 holds, {np.finfo(np.float32).max:.3g}; rescale"
+            )
+
+
+class Linked(Tables):
+    """What a walk over one or three matrices needs, by chances of its own; 24 bytes an entry of any channel.
+
+    `links`, (entries, 4) uint32, hold the column of each entry and the bits of the factors R_cij / p(j | i);
+    `others` are all of Rs but the first, which keeps these tables. See `linked`.
+    """
+
+    def __init__(self, Rs: Sequence[CSR | Dense], signs: Sequence[float], sampler: str) -> None:
+        self.others, self.channels, device = tuple(Rs[1:]), len(Rs), Rs[0].device
+        most = max(R.nnz if isinstance(R, CSR) else R.shape[0] * R.shape[1] for R in Rs)
+        checks.fits_host("tables of walks that channels share", _HOST_BYTES * most)
+        parts: list[Any] = [scipy.sparse.csr_array(_host(R)).astype(np.float64) for R in Rs]
+        squares: Any = 0
+        for part in parts:
+            part.eliminate_zeros()
+            rows = abs(part).sum(axis=1)
+            share = scipy.sparse.diags_array(1.0 / np.where(rows > 0.0, rows, 1.0)) @ part
+            squares = squares + share * share
+        P: Any = scipy.sparse.csr_array(squares)
+        device.require(16 * P.nnz, f"links of the {P.nnz} entries of R")
+        self.links = device.empty((P.nnz, 4), np.uint32)
+        row = np.repeat(np.arange(P.shape[0], dtype=np.int32), np.diff(P.indptr))
+        values = np.ones(P.nnz) if sampler == "uniform" else np.sqrt(P.data / len(parts))
+        places = np.arange(P.nnz) - P.indptr[row]
+        super().__init__(CSR(device, scipy.sparse.csr_array((values, places, P.indptr), shape=P.shape)))
+        self._indptr = P.indptr
+        self._chances = values.astype(np.float32) / self.sums()[row].astype(np.float64)
+        host = np.zeros(self.links.shape, np.uint32)
+        host[:, 0] = P.indices
+        numbers = scipy.sparse.csr_array((np.arange(1, P.nnz + 1), P.indices, P.indptr), shape=P.shape)
+        for c, (sign, part) in enumerate(zip(signs, parts, strict=True)):
+            here = (numbers * (part != 0)).data - 1  # the entries of this channel among all
+            chances, factors = self._chances[here], np.zeros(part.nnz)
+            np.divide(sign * part.data, chances, out=factors, where=chances > 0.0)
+            with np.errstate(over="ignore"):  # then second moments overflow, too, and are refused
+                host[here, 1 + c] = factors.astype(np.float32).view(np.uint32)
+        self.links.set(host)
+
+    def second_moments(self, R: CSR | Dense) -> list[Operator]:
+        """Of each channel R_ij^2 / p(j | i), (N, N); R is not looked at."""
+        assert self.links is not None  # noqa: S101 - made with the tables
+        columns, *bits = np.ascontiguousarray(self.links.get().T)
+        Qs = (self._chances * one.view(np.float32).astype(np.float64) ** 2 for one in bits[: self.channels])
+        place = (columns.astype(np.int32), self._indptr)
+        return [CSR(self.device, scipy.sparse.csr_array((Q, *place), shape=self.shape)) for Q in Qs]
+
+
+def tables(M: CSR | Dense) -> Tables:
+    """The alias tables of M, made at the first call and kept with it."""
+    return _kept(M, "alias", lambda: Tables(M))
+
+
+def tables_of_columns(M: CSR | Dense) -> Tables:
+    """Alias tables of M^T, with room for one more row of as many entries as M has rows; kept with M."""
+    return _kept(M, "columns", lambda: Tables(_like(M, _host(M).T), of_columns=True))
+
+
+def linked(Rs: Sequence[CSR | Dense], signs: Sequence[float], sampler: str = "alias") -> Linked:
+    """The tables of walks over sign R of one or three (N, N), made at the first call, kept with the first.
+
+    `sampler` is "alias", for P as above, or "uniform", where all entries of a row are alike.
+    """
+    key = f"linked {sampler} {tuple(signs)} {[id(R) for R in Rs]}"  # ids of what the tables keep alive
+    return _kept(Rs[0], key, lambda: Linked(Rs, signs, sampler))
+
+
+def squares(M: CSR | Dense) -> CSR | Dense:
+    """M_ij^2, which carry variances; made at the first call and kept with M, as much memory again."""
+    return _kept(M, "squares", lambda: _like(M, _host(M) * _host(M)))
+
+
+def rows_of_R(S: Operator, method: str) -> tuple[CSR | Dense, float]:
+    """R with rows to read, and the sign in S = I + sign R; of an S that is stored whole R is kept with it.
+
+    An S that does not give its rows is refused with an InputError that names `method`.
+    """
+    rows = readable(S, method)
+    M = rows.M
+    if rows.shift == 1.0:
+        return M, rows.scale
+    return _kept(M, "R", lambda: _like(M, _host(M) - scipy.sparse.eye_array(M.shape[0]))), 1.0
+
+
+def _kept(M: CSR | Dense, key: str, make: Callable[[], Any]) -> Any:
+    if key not in M.tables:
+        M.tables[key] = make()
+    return M.tables[key]
+
+
+def _host(M: CSR | Dense) -> Any:
+    """M on the host, float32 as on the device: a csr_array or an array."""
+    return M.matrix() if isinstance(M, CSR) else np.concatenate([part.arguments[1].get() for part in M.slabs])
+
+
+def _like(M: CSR | Dense, host: Any) -> CSR | Dense:
+    """A matrix on the device of M, in its format."""
+    return CSR(M.device, host, M.pattern) if isinstance(M, CSR) else Dense(M.device, host)
 
 
 @dataclass(frozen=True)
 class Lengths:
     """How long walks are, and what they estimate.
 
-    Attributes
-    ----------
-    coefficients : (L,) float64
-        c_1 .. c_L.
-    chances : (L,) uint32
-        After step k a walk goes on with chance ``chances[k - 1] / 2^22``; the last is 0.
+    `coefficients`, (L,) float64, are c_1 .. c_L: no walk has more than L steps. `go_on` is the chance q of
+    each other step to be followed by one more. Walks `from_b` have a step before, from the row of b to where
+    they start.
     """
 
     coefficients: np.ndarray
-    chances: np.ndarray
+    go_on: float = 1.0
+    from_b: bool = False
 
-    def steps(self, estimator: str) -> np.ndarray:
-        """The steps of `kernels/walk.cl`, (L, 2) uint32: c_k by the chance to be scored, chance to go on."""
-        _, worth = self.scores(estimator)
-        return np.stack([worth.astype(np.float32).view(np.uint32), self.chances], axis=1)
+    @classmethod
+    def geometric(cls, q: float, sign: float, from_b: bool = False) -> Lengths:
+        """Of the series sum of sign^k R^k: p(k) = (1 - q) q^(k-1), which is eq. 24 with q = m / (1 - m).
+
+        >>> Lengths.geometric(0.5, -1.0).coefficients[:3].tolist()
+        [-1.0, 1.0, -1.0]
+        """
+        q = max(1, round(q * _CERTAIN)) / _CERTAIN  # never 0, which would leave terms out
+        return cls(sign ** np.arange(1, 2 + int(np.ceil(_NEVER / -np.log2(q)))), q, from_b)
 
     def scores(self, estimator: str) -> tuple[np.ndarray, np.ndarray]:
-        """Of each step the chance to be scored, and c_k by it, 0 where that is never; (L,) float64."""
-        going = self.chances / _CERTAIN
-        scored = np.concatenate([[1.0], np.cumprod(going[:-1])])
+        """Of each step (L,) what a score is multiplied by, c_k over its chance, and the chance to go on."""
+        chances = np.full(len(self.coefficients), self.go_on)
+        chances[-1] = 0.0  # the table of steps ends here
+        scored = np.cumprod(np.append(1.0, chances[:-1]))
         if estimator == "endpoint":
-            scored = scored * (1.0 - going)
-        return scored, np.divide(self.coefficients, scored, out=np.zeros_like(scored), where=scored > 0.0)
+            scored = scored * (1.0 - chances)
+        return np.divide(self.coefficients, scored, out=np.zeros_like(scored), where=scored > 0.0), chances
 
-    @property
-    def are_one(self) -> bool:
-        """Whether all walks are of the same length."""
-        return bool(np.all(self.chances[:-1] == _CERTAIN))
+    def steps(self, estimator: str) -> np.ndarray:
+        """The steps of `kernels/walk.cl`, (L, 2) or (L + 1, 2) uint32."""
+        worth, chances = self.scores(estimator)
+        if self.from_b:
+            worth, chances = np.append(0.0, worth), np.append(1.0, chances)
+        bits = worth.astype(np.float32).view(np.uint32)
+        return np.stack([bits, np.round(chances * _CERTAIN).astype(np.uint32)], axis=1)
 
     @property
     def mean(self) -> float:
         """Steps of a walk in the mean, where no row is empty."""
-        return 1.0 + float(np.sum(np.cumprod(self.chances[:-1] / _CERTAIN)))
-
-    def after_start(self) -> Lengths:
-        """The same for walks whose first step goes from the row of b to where they start."""
-        return Lengths(np.append(0.0, self.coefficients), np.append(np.uint32(_CERTAIN), self.chances))
-
-
-def geometric(q: float, sign: float) -> Lengths:
-    """Lengths of the series sum of sign^k R^k: p(k) = (1 - q) q^(k-1), which is eq. 24 with q = m / (1 - m).
-
-    >>> lengths = geometric(0.5, -1.0)
-    >>> lengths.coefficients[:3].tolist(), (lengths.chances[:3] / 2**22).tolist()
-    ([-1.0, 1.0, -1.0], [0.5, 0.5, 0.5])
-    """
-    chance = max(1, round(q * _CERTAIN))  # never 0, which would leave terms out
-    count = 1 + int(np.ceil(_NEVER / -np.log2(chance / _CERTAIN)))
-    chances = np.full(count, chance, np.uint32)
-    chances[-1] = 0
-    return Lengths(sign ** np.arange(1, count + 1), chances)
-
-
-def whole(coefficients: np.ndarray) -> Lengths:
-    """Lengths of a polynomial in R, all walks as long as its degree; c_1 .. c_L."""
-    chances = np.full(len(coefficients), _CERTAIN, np.uint32)
-    chances[-1] = 0
-    return Lengths(np.asarray(coefficients, np.float64), chances)
+        return float(np.sum(self.go_on ** np.arange(len(self.coefficients))))
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Of `samples` samples of each pixel: their sum and that of their squares, (P,) or (P, k) float64.
-
-    `fourths` sums the squares of what each chunk of `CHUNK` samples adds to `squares`.
-    """
+    """Of `samples` samples of each pixel: their sum and that of their squares, (P,) or (P, k) float64."""
 
     samples: int
     total: np.ndarray
     squares: np.ndarray
-    fourths: np.ndarray | None = None
 
     @property
     def mean(self) -> np.ndarray:
@@ -112,145 +266,81 @@ class Sums:
 
     @property
     def standard_error(self) -> np.ndarray:
-        """Of the mean; infinite of a single sample, which tells nothing about it."""
+        """Of the mean, by the spread of samples; infinite of a single one, which tells nothing about it."""
         if self.samples < 2:
             return np.full_like(self.total, np.inf)
-        return np.sqrt(self._spread() / (self.samples * (self.samples - 1.0)))
-
-    @property
-    def alike(self) -> np.ndarray:
-        """Where all samples scored the same up to rounding: they do not tell how others would differ."""
-        return self._spread() <= _ALIKE * self.squares
-
-    @property
-    def doubt(self) -> np.ndarray:
-        """Relative standard error of `squares`, by how chunks differ; infinite where that cannot be told.
-
-        Where few samples carry the squares it is near 1, and the standard error of the mean worth little.
-        """
-        chunks = -(-self.samples // CHUNK)
-        if self.fourths is None or chunks < 2:
-            return np.full_like(self.total, np.inf)
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            share = self.fourths / self.squares**2  # 1 over the chunks that carry them
-            return np.nan_to_num(np.sqrt(np.maximum(chunks * share - 1.0, 0.0) / (chunks - 1.0)), nan=np.inf)
-
-    def _spread(self) -> np.ndarray:
-        with np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):  # of scores whose squares are beyond float32
             spread = np.maximum(self.squares - self.total**2 / self.samples, 0.0)
-        return np.where(np.isnan(spread), np.inf, spread)  # of scores whose squares are beyond float32
-
-
-@dataclass(frozen=True)
-class Launching:
-    """How work is spread over a device: `walks` at a time in a work-item. It changes no result."""
-
-    walks: int
-    group: int
-
-    @classmethod
-    def best(cls, device: Device, units: int) -> Launching:
-        """Many walks an item where few items run, so that their loads do not wait for each other."""
-        if not device.is_cpu:
-            return cls(1, 64)
-        return cls(32 if units >= 128 * device.compute_units else 4, 1)
+        return np.sqrt(np.nan_to_num(spread, nan=np.inf) / (self.samples * (self.samples - 1.0)))
 
 
 @dataclass(frozen=True)
 class Walker:
     """Walks over the rows of a matrix.
 
-    Parameters
-    ----------
-    tables : Tables
-    lengths : Lengths
-    estimator : str
-        "endpoint", the paper's: a walk scores where it ends (eq. 26). "collision": it scores at every step.
-    seed : int
-        Below 2^64.
-    launching : Launching, optional
-    watch : callable, optional
-        Called after each launch.
+    `estimator`: "endpoint", the paper's, scores where a walk ends (eq. 26), "collision" at every step.
+    `watch` is called after each launch. `launching`: walks of a work-item and items of a work-group; changes
+    no result.
     """
 
     tables: Tables
     lengths: Lengths
     estimator: str
     seed: int
-    launching: Launching | None = None
     watch: Callable[[], object] = lambda: None
+    launching: tuple[int, int] | None = None
 
-    def rows(self, b: Array, pixels: np.ndarray, first: int, samples: int, stream: int = 0) -> Sums:
-        """Samples first .. first + samples of each pixel.
+    def rows(self, b: Array, pixels: np.ndarray, samples: int, stream: int = 0) -> Sums:
+        """`samples` samples of each of the `pixels`, (P,); those of another stream are independent of them.
 
-        Parameters
-        ----------
-        b : Array, (N,) or (N, k)
-            All right-hand sides share the walks. Of walks with three weights column j is of channel j % 3,
-            and there are as many of each.
-        pixels : (P,) integers
-        first, samples : int
-            Below 2^32 together.
-        stream : int
-            Samples of another stream are independent of these.
+        All right-hand sides b, (N,) or (N, k), share the walks. Of walks with three weights column j is of
+        channel j % 3, and there are as many of each.
         """
-        steps = self.tables.device.upload(self.lengths.steps(self.estimator), np.uint32)
-        shape = (len(pixels), b.columns)
-        total, squares, fourths = np.zeros((3, *shape))
-        units = max(1, min(_UNITS, self._walks() // CHUNK))
-        for some in _pieces(len(pixels), max(1, units // -(-samples // CHUNK))):
-            place = self.tables.device.upload(pixels[some], np.uint32)
-            for part in _pieces(samples, max(CHUNK, units * CHUNK // place.size)):
-                bounds = (first + part.start, first + part.stop)
-                for offset, width in self._widths(b):
-                    found = self._row_sums(b, place, bounds, stream, steps, offset, width)
-                    here = (some, slice(offset, offset + width))
-                    total[here] = _added(total[here], found[..., 0], found[..., 1])
-                    squares[here] = _added(squares[here], found[..., 2], found[..., 3])
-                    fourths[here] = _added(fourths[here], _squared(found[..., 2:].sum(axis=-1)), 0.0)
+        device, channels = self.tables.device, self.tables.channels
+        steps = device.upload(self.lengths.steps(self.estimator), np.uint32)
+        total, squares = np.zeros((2, len(pixels), b.columns))
+        chunks, units = -(-samples // CHUNK), max(1, min(_UNITS, self._walks() // CHUNK))
+        for some in _pieces(len(pixels), max(1, units // chunks)):
+            place = device.upload(pixels[some], np.uint32)
+            for part in _pieces(chunks, max(1, units // place.size)):
+                count = part.stop - part.start
+                bounds = count, CHUNK * part.start, min(CHUNK * part.stop, samples)
+                for offset, width in widths(b.columns // channels):
+                    here = slice(channels * offset, channels * (offset + width))
+                    out = device.empty((place.size * count, channels * width, 4))
+                    numbers = (*bounds, self.seed, stream, b.columns, here.start)
+                    arrays = (
+                        place,
+                        self.tables.records,
+                        self.tables.entries,
+                        self.tables.links,
+                        steps,
+                        b,
+                        out,
+                    )
+                    self._launch("walk_rows", place.size * count, channels * width, *numbers, *arrays)
+                    sums = out.get().reshape(place.size, count, -1, 4).astype(np.float64)
+                    total[some, here] = _added(total[some, here], sums[..., 0] + sums[..., 1])
+                    squares[some, here] = _added(squares[some, here], sums[..., 2] + sums[..., 3])
                     self.watch()
         shape = (len(pixels), *b.shape[1:])
-        return Sums(samples, *(found.reshape(shape) for found in (total, squares, fourths)))
+        return Sums(samples, total.reshape(shape), squares.reshape(shape))
 
-    def _widths(self, b: Array) -> list[tuple[int, int]]:
-        """Launches of as many right-hand sides of each channel: (offset, width) pairs."""
-        channels = self.tables.channels
-        return [(channels * offset, channels * width) for offset, width in widths(b.columns // channels)]
-
-    def _row_sums(
-        self,
-        b: Array,
-        pixels: Array,
-        bounds: tuple[int, int],
-        stream: int,
-        steps: Array,
-        offset: int,
-        width: int,
-    ) -> np.ndarray:
-        """Sums of each chunk with what rounding took, and of the squares, (pixels, chunks, width, 4)."""
-        first, end = bounds
-        chunks = -(-(end - first) // CHUNK)
-        out = b.device.empty((pixels.size * chunks, width, 4))
-        tables = (self.tables.records, self.tables.entries, self.tables.links, steps)
-        place = (out.shape[0], chunks, first, end, self.seed, stream, b.columns, offset)
-        self._launch("walk_rows", self.estimator, width, *place, pixels, *tables, b, out)
-        return out.get().reshape(pixels.size, chunks, width, 4)
-
-    def columns(self, first: int, samples: int, stream: int = 0) -> Sums:
-        """Samples first .. first + samples of walks from b, by `tables_of_columns`, which b was appended to.
+    def columns(self, samples: int, stream: int = 0) -> Sums:
+        """Of `samples` walks from b, by `tables_of_columns`, which b was appended to, and lengths `from_b`.
 
         The sums are those of every pixel, (N,). A sample adds to one of them; it counts as 0 to the others.
         """
         device, n = self.tables.device, self.tables.shape[0]
-        steps = device.upload(self.lengths.after_start().steps("endpoint"), np.uint32)
-        total, squares = np.zeros(n), np.zeros(n)
+        steps = device.upload(self.lengths.steps("endpoint"), np.uint32)
+        total, squares = np.zeros((2, n))
         source = device.upload(np.array([n]), np.uint32)
         for part in _pieces(samples, max(1, min(_RECORDS, self._walks()))):
             count = part.stop - part.start
             ends, scores = device.empty((count,), np.uint32), device.empty((count,))
-            tables = (source, self.tables.records, self.tables.entries, steps)
-            place = (-(-count // CHUNK), first + part.start, first + part.stop, self.seed, stream)
-            self._launch("walk_columns", "endpoint", 1, *place, *tables, ends, scores)
+            numbers = (part.start, part.stop, self.seed, stream)
+            arrays = (source, self.tables.records, self.tables.entries, steps, ends, scores)
+            self._launch("walk_columns", -(-count // CHUNK), 1, *numbers, *arrays)
             score = scores.get().astype(np.float64)
             where = np.where(score == 0.0, 0, ends.get())  # a walk that died may stand in the row of b
             total += np.bincount(where, score, n)
@@ -262,29 +352,23 @@ class Walker:
         """Of one launch, so that none takes long: whoever waits wants to hear that there is progress."""
         return int(_STEPS * self.tables.device.compute_units / self.lengths.mean)
 
-    def _launch(self, name: str, estimator: str, width: int, units: int, *arguments: object) -> None:
-        how = self.launching or Launching.best(self.tables.device, units)
-        kernel = self.tables.device.kernel(
-            "walk",
-            name,
-            TABLE=SAMPLERS[self.tables.sampler],
-            ESTIMATOR=ESTIMATORS[estimator],
-            CHANNELS=self.tables.channels,
-            CHUNK=CHUNK,
-            WALKS=how.walks,
-            K=width,
-        )
-        kernel(-(-units // how.walks), how.group, units, *arguments)
+    def _launch(self, name: str, units: int, width: int, *arguments: object) -> None:
+        """Many walks an item where few items run, so that their loads do not wait for each other."""
+        device = self.tables.device
+        walks, group = self.launching or (1, 64)
+        if device.is_cpu and self.launching is None:
+            walks, group = (32 if units >= 128 * device.compute_units else 4), 1
+        defines = {
+            "COLLISION": int(self.estimator == "collision"),
+            "LINKED": int(self.tables.links is not None),
+            "PREFETCH": int(walks > 1 and device.kind != "simulator"),
+        }
+        defines |= {"CHANNELS": self.tables.channels, "CHUNK": CHUNK, "WALKS": walks, "K": width}
+        device.kernel("walk", name, **defines)(-(-units // walks), group, units, *arguments)
 
 
-def _squared(sums: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        return sums.astype(np.float64) ** 2
-
-
-def _added(start: np.ndarray, sums: np.ndarray, low: np.ndarray | float) -> np.ndarray:
+def _added(start: np.ndarray, parts: np.ndarray) -> np.ndarray:
     """start + all chunks, (pixels, chunks, width), one after the other, so that no split changes a bit."""
-    parts = sums.astype(np.float64) + low
     return np.add.accumulate(np.concatenate([start[:, None], parts], axis=1), axis=1)[:, -1]
 
 

@@ -11,8 +11,6 @@ of one sample is left alone while the other goes on.
 
 from __future__ import annotations
 
-import threading
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,14 +18,11 @@ import pywt
 
 from ltcl import checks
 from ltcl.device import Array, Device, vectors
-from ltcl.device.kernels import Kernel
 from ltcl.errors import InputError
-from ltcl.operators.base import MOST, group_of, lanes_of, widths
-from ltcl.operators.bases import Basis
+from ltcl.operators.bases import Basis, launch_grid, launch_group
 
 _pywt: Any = pywt  # compiled, so that no type checker knows its names
 _SMALL = 4096  # pixels of a level from which on one launch does all the rest
-_ITEMS = 64  # work-items that keep a CPU busy
 
 
 class Wavelet(Basis):
@@ -53,137 +48,48 @@ class Wavelet(Basis):
     >>> import ltcl, numpy
     >>> from ltcl.operators import Wavelet
     >>> W = Wavelet(ltcl.open_device(), (3, 5), "db2")
-    >>> print(numpy.round(W @ numpy.ones(15), 4)[:3])  # sqrt(15), the norm, and nothing else
+    >>> print(abs(W @ numpy.ones(15)).round(4)[:3])  # sqrt(15), the norm, and nothing else
     [3.873 0.    0.   ]
     """
 
     def __init__(
         self, device: Device, grid: tuple[int, int], name: str = "db2", levels: int | None = None
     ) -> None:
-        taps = filters(name)
-        super().__init__(device, grid, name)
-        self.levels = _levels(self.grid, levels)
+        self._taps = device.upload(filters(name))
+        super().__init__(device, grid, name, None, self._taps)
+        most = (max(self.grid) - 1).bit_length()
+        self.levels = most if levels is None else checks.count("levels", levels, least=0, most=most)
         self._large = sum(h * w > _SMALL for h, w in map(self.sides, range(self.levels)))
-        self._defines = {"TAPS": taps.shape[1]}
-        self._taps = device.upload(taps)
-        self._scratch = device.empty(0), device.empty(0)
-        self._lock = threading.Lock()  # a transform must have the scratch to itself while it is queued
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the filters. Scratch of 1.25 N k numbers, k of the widest picture so far, comes on top."""
-        return self._taps.nbytes
+        # Where the approximations of levels 1, 2, ... begin, a spare pixel between: wide loads reach there.
+        pixels = [h * w + 1 for h, w in map(self.sides, range(1, self.levels + 1))]
+        self._starts = device.upload(np.cumsum([0, *pixels]), np.int32)
+        self._room = sum(pixels)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Name, grid and levels."""
         return {**super().to_arrays(), "levels": np.array(self.levels)}
-
-    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
-        if x.size == 0:
-            return
-        if self.levels == 0:
-            vectors.axpby(scale, x, 0.0 if add is None else 1.0, x if add is None else add, out)
-            return
-        with self._lock:
-            lines, near = self._room(x.columns)
-            task = _Task(self, x.columns, x, lines, near, (scale, int(add is not None)), add or out, out)
-            (task.join if transpose else task.split)()
-
-    def _room(self, k: int) -> tuple[Array, Array]:
-        """Scratch for a picture of k right-hand sides, and for its first approximation."""
-        h, w = self.grid
-        needed = h * w * k, -(-h // 2) * -(-w // 2) * k
-        if self._scratch[0].size < needed[0]:
-            self._scratch = self.device.empty(needed[0]), self.device.empty(needed[1])
-        return self._scratch
 
     def sides(self, level: int) -> tuple[int, int]:
         """Rows and columns of the approximation that is split `level` times already: (h, w) / 2^level, up."""
         h, w = self.grid
         return -(-h // 2**level), -(-w // 2**level)
 
-
-@dataclass(frozen=True)
-class _Task:
-    """One transform of k right-hand sides: large levels in two launches each, all small ones in one."""
-
-    W: Wavelet
-    k: int
-    x: Array
-    lines: Array
-    near: Array
-    scaled: tuple[float, int]  # scale, and whether `add` counts
-    add: Array
-    out: Array
-
-    def split(self) -> None:
-        W, k, taps = self.W, self.k, self.W._taps
-        source = self.x
-        for level in range(W._large):
-            (h, w), run, split_at, pitch = self._geometry(level)
-            self._rows("split", h, w, h, W.grid[1], level, k, taps, source, self.lines)
-            self._columns(
-                "split", h, run, split_at, W.grid[0], level, run, split_at, pitch, *self.scaled, taps,
-                self.lines, self.near, self.add, self.out,
-            )  # fmt: skip
-            source = self.near
-        self._all("split", self.scaled, source, self.add, self.out)
-
-    def join(self) -> None:
-        W, k, taps = self.W, self.k, self.W._taps
-        plain = (1.0, 0)
-        if W._large:
-            self._all("join", plain, self.x, self.near, self.near)
-        else:
-            self._all("join", self.scaled, self.x, self.add, self.out)
-        for level in reversed(range(W._large)):
-            (h, w), run, split_at, pitch = self._geometry(level)
-            self._columns(
-                "join", h, run, split_at, W.grid[0], level, run, split_at, pitch, taps,
-                self.x, self.near, self.lines,
-            )  # fmt: skip
-            scaled, add, out = (
-                (self.scaled, self.add, self.out) if level == 0 else (plain, self.near, self.near)
-            )
-            self._rows("join", h, w, h, W.grid[1], level, k, *scaled, taps, self.lines, add, out)
-
-    def _geometry(self, level: int) -> tuple[tuple[int, int], int, int, int]:
-        """Sides at a level; reals of its rows, of the approximation in them, and of a row of the picture."""
-        h, w = self.W.sides(level)
-        split_at = -(-w // 2) * self.k if level + 1 < self.W.levels else 0
-        return (h, w), w * self.k, split_at, self.W.grid[1] * self.k
-
-    def _kernel(self, name: str, lanes: int) -> Kernel:
-        return self.W.device.kernel("wavelet", f"wavelet_{name}", K=lanes, **self.W._defines)
-
-    def _rows(self, name: str, h: int, w: int, *arguments: Any) -> None:
-        lanes = lanes_of(self.k)
-        kernel = self._kernel(f"{name}_rows", lanes)
-        pieces, pairs = -(-self.k // lanes), -(-w // 2)
-        if self.W.device.is_cpu:
-            kernel((1, min(pairs, -(-_ITEMS // h)), min(h, MOST)), (1, 1, 1), *arguments)
-        else:
-            kernel((pieces, min(pairs, MOST), min(h, MOST)), (*group_of(pieces), 1), *arguments)
-
-    def _columns(self, name: str, h: int, run: int, split_at: int, *arguments: Any) -> None:
-        lanes = lanes_of(min(part for part in (split_at, run - split_at) if part))
-        kernel = self._kernel(f"{name}_columns", lanes)
-        pieces, pairs = -(-split_at // lanes) + -(-(run - split_at) // lanes), -(-h // 2)
-        if self.W.device.is_cpu:
-            kernel((min(pieces, -(-_ITEMS // pairs)), min(pairs, MOST)), (1, 1), *arguments)
-        else:
-            kernel((pieces, min(pairs, MOST)), group_of(pieces), *arguments)
-
-    def _all(self, name: str, scaled: tuple[float, int], source: Array, add: Array, out: Array) -> None:
-        first, last = self.W._large, self.W.levels
-        if first == last:
+    def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
+        if self.levels == 0:
+            vectors.axpby(a, x, b, y, out)
             return
-        group = 1 if self.W.device.is_cpu else 16
-        for offset, width, pieces in _pieces(self.k):
-            self._kernel(f"{name}_all", width)(
-                (group, group, pieces), (group, group, 1), *self.W.grid, first, last, self.k, offset, *scaled,
-                self.W._taps, source, self.lines, self.near, add, out,
-            )  # fmt: skip
+        name, k, levels = "join" if transpose else "split", x.columns, self.levels
+        wide = 8 if k == 1 and self.device.is_cpu else 1
+        kernel, pieces = self._kernel("wavelet", name, k, TAPS=self._taps.shape[1], PAIRS=wide)
+        near = self.device.empty(self._room * k)
+        launches = [(level, level + 1) for level in range(self._large)]
+        launches += [(self._large, levels)] if self._large < levels else []
+        for first, last in reversed(launches) if transpose else launches:
+            arguments = (*self.grid, first, last, levels, k, a, b, self._starts, self._taps, x, near, y, out)
+            if last <= self._large:
+                launch_grid(kernel, pieces, *self.sides(last), *arguments)
+            else:
+                launch_group(kernel, pieces, *arguments)
 
 
 def is_known(name: Any) -> bool:
@@ -209,8 +115,8 @@ def filters(name: str) -> np.ndarray:
 def _orthonormal(taps: np.ndarray) -> bool:
     """Whether shifts by two are orthonormal to float32; "dmey" is to 2e-3 only."""
     length = taps.shape[1]
-    shifts = [taps[:, 2 * s :] @ taps[:, : length - 2 * s].T for s in range(length // 2)]
-    return bool(np.abs(np.array(shifts) - [np.eye(2) * (s == 0) for s in range(length // 2)]).max() < 1e-7)
+    errors = [taps[:, s:] @ taps[:, : length - s].T - np.eye(2) * (s == 0) for s in range(0, length, 2)]
+    return bool(np.max(np.abs(errors)) < 1e-7)
 
 
 def families() -> str:
@@ -220,19 +126,3 @@ def families() -> str:
     for n in names:
         numbers[n.rstrip("0123456789")].append(int("0" + n.lstrip("abcdefghijklmnopqrstuvwxyz")))
     return ", ".join(f"{f}{min(n)} to {f}{max(n)}" if any(n) else f for f, n in numbers.items())
-
-
-def _levels(grid: tuple[int, int], levels: int | None) -> int:
-    most = (max(grid) - 1).bit_length()
-    if levels is None:
-        return most
-    if checks.count("levels", levels, least=0) > most:
-        raise InputError(f"levels is {levels}; it must be at most {most} on a {grid[0]} x {grid[1]} grid")
-    return int(levels)
-
-
-def _pieces(k: int) -> list[tuple[int, int, int]]:
-    """Cut k right-hand sides for launches: offset, width and how many of that width follow each other."""
-    whole, rest = divmod(k, 8)
-    cut = [(0, 8, whole)] if whole else []
-    return cut + [(8 * whole + offset, width, 1) for offset, width in widths(rest)]

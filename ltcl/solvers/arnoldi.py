@@ -1,56 +1,82 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""One Arnoldi step by classical Gram-Schmidt, twice: a new direction, made orthogonal to those there are.
+"""Arnoldi's method: an orthonormal basis v_0, v_1, ... of what products with S reach, S V = V H.
 
-Twice is enough for orthogonality to rounding (Giraud, Langou, Rozloznik, Comput. Math. Appl. 50, 2005), and
-where modified Gram-Schmidt waits for every inner product in turn, each pass here waits once for all of them.
+Each step is a product and classical Gram-Schmidt, twice, which is enough for orthogonality to rounding
+(Giraud, Langou, Rozloznik, Comput. Math. Appl. 50, 2005): five launches and one wait, for a column of H.
 
 Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 6.2 in blocks.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from ltcl.device import Array, vectors
-from ltcl.solvers.columns import ratio
+from ltcl.device import Array
+from ltcl.operators import Operator
+from ltcl.solvers.columns import Columns
 
-_LOST = 2.0**-20  # of its length: what orthogonalization left is rounding, the space holds S v already
+_COUNT = 2  # argument of krylov_subtract
 
 
-def extend(basis: list[Array], w: Array, step: np.ndarray) -> np.ndarray:
-    """Make `w` = S v_j, the newest of `basis`, orthogonal to it and append it with unit length.
+class Arnoldi:
+    """The space of S and a start (N, k), one for each column.
 
-    Parameters
+    Attributes
     ----------
-    basis : j orthonormal arrays (N, k), column by column; gets the next one, which is `w`
-    w : Array, (N, k)
-    step : (k,) bool
-        Columns to extend; the others, and those whose `w` lies in the space already, get a direction of 0.
-
-    Returns
-    -------
-    (k, j + 1) float64
-        The new columns of the Hessenberg matrices, h_1j to h_(j+1)j; the last is 0 where a space is complete.
+    V : Array, (steps + 1, N k)
+        v_0 .. v_count, each a row.
+    count : int
+        Steps made.
+    steps : int
+        That there is room for: those asked for, or less where these are thousands.
     """
-    found = vectors.dots(basis, w)  # 5.
-    _subtract(found, basis, step, w)  # 6.
-    *again, square = vectors.dots([*basis, w], w)
-    _subtract(again, basis, step, w)
-    h = np.zeros((w.columns, len(basis) + 1))
-    h[:, :-1] = np.where(step, found + again, 0.0).T
-    squares = np.sum(h**2, axis=1)
-    left = np.sqrt(square - np.minimum(np.sum(np.square(again), axis=0), square))  # 8.
-    complete = left <= _LOST * np.sqrt(squares + left**2)
-    h[:, -1] = np.where(step & ~complete, left, 0.0)
-    basis.append(
-        vectors.axpby_columns(ratio(np.ones_like(left), left, step & ~complete), w, 0.0, w, w)
-    )  # 10.
-    return h
 
+    def __init__(self, S: Operator, start: Array, steps: int) -> None:
+        device, self.count = start.device, -1
+        self._columns = columns = Columns(start, "krylov", "krylov_dots", "krylov_subtract")
+        self.steps = min(steps, columns.room - 3)  # whose coefficients a work-group holds
+        rows = self.steps + 1
+        device.require(
+            rows * start.nbytes, f"restart={steps}, {rows} directions of {start.size} values each,"
+        )
+        self.V = device.empty((rows, start.size))
+        v, w = start.like(), start.copy()
+        sums, self._h = columns.sums(rows + 1), [device.empty((rows + 1, columns.k)) for _ in range(2)]
+        self._product = S.bind(v, w)
+        self._dots = columns.bind("krylov_dots", self.V, w, sums)
+        self._subtract = [
+            columns.bind(
+                *("krylov_subtract", 0, columns.slices, again, again, sums, self._h[0], h, self.V, w, out),
+                extra=rows + 2,
+            )
+            for again, h, out in ((0, self._h[0], w), (1, self._h[1], v))
+        ]
+        self._orthogonalize()
 
-def _subtract(h: Any, basis: list[Array], step: np.ndarray, w: Array) -> None:
-    """w = w - sum_i h_i v_i in the columns `step`."""
-    for along, v in zip(h, basis, strict=True):
-        vectors.axpby_columns(np.where(step, -along, 0.0), v, step, w, w)
+    def extend(self) -> np.ndarray:
+        """One step: the next direction, and the new columns of H.
+
+        Returns
+        -------
+        (k, count + 1) float64
+            h_1j .. h_(j+1)j. Where S v_j lies in the space but for rounding the last is 0, and so is v_(j+1).
+        """
+        self._product()  # 3.
+        self._orthogonalize()
+        return self._h[1].get()[: self.count + 1].T.astype(np.float64)
+
+    def add_to(self, x: Array, y: np.ndarray) -> None:
+        """x = x + sum_j y_j v_j with y (k, j)."""
+        count = y.shape[1]
+        minus_y = x.device.upload(np.pad(-y.T, ((0, 1), (0, 0))))  # as sums of one slice, <w, w> among them
+        arguments = (count, 1, 0, 0, minus_y, *self._h, self.V, x, x)
+        self._columns.bind("krylov_subtract", *arguments, extra=count + 2)()
+
+    def _orthogonalize(self) -> None:
+        """What a product left becomes the next direction."""
+        self.count += 1
+        self._dots.resize(self._columns.items(self.count + 1))
+        for subtract in self._subtract[0 if self.count else 1 :]:
+            self._dots()  # 4.
+            subtract.set(_COUNT, self.count)
+            subtract()  # 5. to 8.

@@ -9,11 +9,10 @@ a step is
 with beta that makes p conjugate to the last d, alpha the step of Barzilai and Borwein, and lambda exact along
 d' or as far as the bounds allow. On a face of the box these are conjugate gradients, which need few products
 because R has few large eigenvalues; clipping changes many active bounds at once, as projected gradients do
-(Moré and Toraldo, SIAM J. Optimization 1, 1991, take the two in turns). Where p does not descend, or the last
-lambda was short, p = z. Every step lowers the error and takes two products: in closed boxes of rho(R) = 0.8
-and 4, with 5 to 50 % of the pixels at a bound, 14 and 36 of them to a certificate of 0.1 %, where accelerated
-projected gradients (FISTA with restarts) take 22 and 50, and the active sets of MPRGP (Dostál) 26 and 50.
-Spectral projected gradients take fewer there, 12 and 32, but more to 0.001 %: 20 and 58 against 18 and 40.
+(Moré and Toraldo, SIAM J. Optimization 1, 1991, take the two in turns). Where the last lambda was
+short, or 0 as p did not descend, p = z. Every step takes two products: in closed boxes of rho(R) = 0.8
+and 4, with 5 to 50 % of the pixels at a bound, 14 and 36 of them to a certificate of 0.1 %, where FISTA with
+restarts takes 22 and 50 and MPRGP (Dostál) 26 and 50.
 
 A certificate comes with the gradient. For all y in the box g.(y - x) >= -gap with the Frank-Wolfe gap
 sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)); hence of the least error ||r*||, by Cauchy and Schwarz,
@@ -21,6 +20,7 @@ sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)); hence of the least error ||
     ||r*|| >= r.r* / ||r|| >= ||r|| - gap / ||r||,
 
 and the largest of these bounds so far is kept. Done when the error is within the tolerance, of 0 or of that.
+An iteration is six launches, and one wait for the few sums of this certificate.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ltcl.device import Array, vectors
+from ltcl.device import vectors
 from ltcl.operators import Operator
-from ltcl.solvers.box import Box, Look
-from ltcl.solvers.columns import ratio
+from ltcl.solvers.columns import Columns, ratio
 from ltcl.solvers.result import Solution, Status
 
-_DESCENT = 0.1  # of z.z: below, p.z is too little to follow p
-_STRAIGHT = 0.5  # of d': a shorter step tells that clipping has bent d' far from p, and conjugacy is lost
+_KERNELS = ("bounded_direction", "bounded_weigh", "bounded_move", "bounded_look")
 _ROUNDING = 2.0**-22  # of ||w b||: an error is not told from the least one by less
 _FAR = 1e30  # in units of b: a bound where none was meant, inside float32
+Box = tuple[np.ndarray, np.ndarray]  # lower, upper (N,)
 _PATIENCE = 50  # steps without a better certificate: rounding has the say
 
 
@@ -50,10 +50,8 @@ class Bounded(Solution):
 
     Attributes
     ----------
-    errors : (k,) float64
-        ``||w (A x - b)||`` of every column, none above that of the start.
-    least : (k,) float64
-        What no x within the bounds is below, by the gap and as exact as float32 products.
+    errors, least : (k,) float64
+        ``||w (A x - b)||`` of every column, and what no x within the bounds is below.
     held : (N, k) bool
         Where x is at a bound or all but there, and a step beyond would lower the error.
     gap : float
@@ -87,29 +85,23 @@ def minimise(
     maxiter: int = 1000,
     callback: Callable[[int, float], object] | None = None,
 ) -> Bounded:
-    """The x within the bounds for which A x is nearest to b.
+    """The x within the bounds for which A x is nearest to b; STAGNATED where rounding hides any further gain.
 
     Parameters
     ----------
     A : (M, N) Operator
         With columns of like size, for instance S.
-    b : (M, k)
+    b, weights : (M, k)
+        The weights are not negative; ones when not given.
     lower, upper : (N,)
-        Finite, of all columns alike.
+        Finite, of all columns alike; x is within them as float64 numbers, too.
     x0 : (N, k)
         Start; what lies outside the bounds is moved there.
-    weights : (M, k), optional
-        Of the rows, not negative; ones when not given.
     rtol, atol : float
         Done when the error, or what it is above the least possible one, is at most
         ``max(rtol ||w b||, atol)`` in every column. Where b = 0, rtol is of the error at the start.
     maxiter : int
     callback : callable(iteration, relative gap), optional
-
-    Returns
-    -------
-    Bounded
-        Of status CONVERGED, MAXITER, or STAGNATED where rounding hides any further gain.
 
     Examples
     --------
@@ -124,155 +116,142 @@ def minimise(
     largest = float(np.max(np.abs(b)))
     unit = _power(largest or max(float(np.max(np.abs(part))) for part in (lower, upper)))
     unit_w = 1.0 if weights is None else _power(float(np.max(weights)))
-    upload = A.device.upload
-    box = Box(*(upload(np.clip(part / unit, -_FAR, _FAR)) for part in (lower, upper)))
-    w = None if weights is None else upload(weights / unit_w)
-    descent = _Descent(
-        A, upload(b / unit), w, box, upload(np.clip(x0, lower[:, None], upper[:, None]) / unit)
-    )
-    judge = _Judge(descent.scale, rtol, atol / (unit * unit_w), maxiter, callback)
-    first = descent.x.get()
-    while not judge.done(descent):
-        descent.step(judge.unsolved)
-    x, worse = descent.x.get(), ~(judge.errors <= judge.first)
-    x = np.where(worse, first, x)  # rounding alone can do that
-    held = np.where(worse, False, descent.held(x))
-    errors = np.where(worse, judge.first, judge.errors)
-    assert judge.status is not None  # noqa: S101 - it is set when done
+    box = inwards(*(np.clip(np.asarray(part, np.float64) / unit, -_FAR, _FAR) for part in (lower, upper)))
+    first = np.clip((x0 / unit).astype(np.float32), *(part[:, None] for part in box))
+    descent = _Descent(A, b / unit, None if weights is None else weights / unit_w, box, first)
+    initial, _ = descent.read()
+    scale = np.where(descent.scale > 0.0, descent.scale, np.where(initial > 0.0, initial, 1.0))
+    tolerance, least = np.maximum(rtol * scale, atol / (unit * unit_w)), np.zeros_like(scale)
+
+    def excess(errors: np.ndarray) -> np.ndarray:  # over the least, at most, (k,)
+        return np.where(np.isfinite(errors), np.maximum(errors - least, _ROUNDING * scale), np.inf)
+
+    residuals: list[float] = []
+    lowest, lowest_at, status = np.inf, 0, None
+    while True:
+        errors, gap = descent.read()
+        least = np.fmax(least, np.minimum(errors - ratio(gap, errors, errors > 0.0), errors))
+        unsolved, steps = excess(errors) > tolerance, len(residuals)
+        status = Status.STAGNATED if steps - lowest_at > _PATIENCE else None
+        status = Status.MAXITER if steps >= maxiter else status
+        status = status if unsolved.any() else Status.CONVERGED
+        if status is not None and not descent.true:  # to be said only of a true residual
+            descent.refresh()
+            continue
+        above = float(np.max(excess(errors) / scale))
+        if above < lowest:
+            lowest, lowest_at = above, steps
+        if callback is not None:
+            callback(steps, above)
+        residuals.append(float(np.max(errors / scale)))
+        if status is not None:
+            break
+        descent.step(unsolved)
+    x, worse = descent.x.get(), ~(errors <= initial)  # rounding alone can do that
+    errors, held = np.where(worse, initial, errors), np.where(worse, False, descent.held(x))
+    x = (np.where(worse, first, x) * unit).astype(np.float32)
     return Bounded(
-        x=(x * unit).astype(np.float32),
-        status=judge.status,
-        iterations=len(judge.residuals) - 1,
+        x=np.clip(x, *(part[:, None] for part in inwards(lower, upper))),
+        status=status,
+        iterations=len(residuals) - 1,
         products=descent.products,
-        residuals=tuple(judge.residuals),
+        residuals=tuple(residuals),
         seconds=time.perf_counter() - start,
         method="bounded",
         errors=errors * unit * unit_w,
-        least=judge.least * unit * unit_w,
+        least=least * unit * unit_w,
         held=held,
-        gap=float(np.max(judge.excess(errors) / judge.scale)),
+        gap=float(np.max(excess(errors) / scale)),
     )
 
 
-class _Descent:
-    """The iterate and what is kept with it: r = w (b - A x), g = -A^T w r, d, and h = A^T w^2 A d."""
+def inwards(lower: ArrayLike, upper: ArrayLike) -> Box:
+    """Bounds in float32, rounded into the interval; where it holds no float32, the nearest one.
 
-    def __init__(self, A: Operator, b: Array, w: Array | None, box: Box, x: Array) -> None:
-        self.A, self.b, self.w, self.box, self.x = A, b, w, box, x
-        self.products = 0
-        self.r, self.g = b.like(), x.like()
-        self.d, self.h = (vectors.fill(x.like(), 0.0) for _ in range(2))
-        self._Ad = b.like()
-        self._alpha, self._curvature = np.ones(x.columns), np.zeros(x.columns)
-        self.scale = vectors.norm(self._weighted(b.copy()))
-        self.true = False
+    >>> low, high = inwards(0.1, 0.7)
+    >>> bool(np.float32(0.7) > 0.7 >= high), bool(low >= 0.1)
+    (False, True)
+    """
+    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+    nearest = low, high = lower.astype(np.float32), upper.astype(np.float32)
+    low = np.where(low < lower, np.nextafter(low, np.float32(np.inf)), low)
+    high = np.where(high > upper, np.nextafter(high, np.float32(-np.inf)), high)
+    return np.where(low > high, nearest[0], low), np.where(low > high, nearest[0], high)
+
+
+class _Descent:
+    """The iterate and, on the device, r = w (b - A x), g = -A^T w r, d, and h = A^T w^2 A d."""
+
+    def __init__(self, A: Operator, b: np.ndarray, w: np.ndarray | None, box: Box, x: np.ndarray) -> None:
+        device, (lower, upper) = A.device, box
+        self.A, self.products, self._box = A, 0, box
+        self.scale = np.linalg.norm(b if w is None else w * b, axis=0)
+        self.b, self.x, lower, upper = (device.upload(part) for part in (b, x, lower, upper))
+        columns = Columns(self.x, "bounded", *_KERNELS)
+        k, slices, weighted = columns.k, columns.slices, int(w is not None)
+        self._slices, self._resting = slices, np.zeros(k, bool)
+        self._rest = device.upload(self._resting, np.int32)
+        numbers = np.zeros((4 + 3 * slices, k))
+        numbers[0] = 1.0  # the first alpha
+        self._numbers = numbers = device.upload(numbers)
+        sums, shares, curvatures, self._norms = (columns.sums(count) for count in (2, 1, 1, 1))
+        self.r, Ad = self.b.like(), self.b.like()
+        self._u = self.r.like() if weighted else self.r  # w r
+        W = self.r if w is None else device.upload(w)
+        self.g, self._q, d, h = (vectors.fill(self.x.like(), 0.0) for _ in range(4))
+        bounds, rows = (lower, upper, self.x), b.shape[0]
+        weigh_Ad, self._weigh_r = (
+            columns.bind(_KERNELS[1], how, W, v, self._u, found, rows=rows)
+            for how, v, found in ((weighted, Ad, curvatures), (2 * weighted, self.r, self._norms))
+        )
+        look, self._look_anew = (
+            columns.bind(_KERNELS[3], anew, *bounds, self._q, self.g, h, numbers) for anew in (0, 1)
+        )
+        direction = (slices, self._rest, numbers, *bounds, self.g, d, sums, shares)
+        sizes, found = (rows, slices, weighted), (sums, shares, curvatures)
+        move = (*sizes, numbers, *found, lower, upper, d, self.x, W, Ad, self.r, self._u)
+        self._queued = (
+            columns.bind(_KERNELS[0], *direction, extra=2),
+            A.bind(d, Ad),
+            weigh_Ad,
+            columns.bind(_KERNELS[2], *move, extra=4),
+            A.bind(self._u, self._q, transpose=True),
+            look,
+        )
+        self.refresh()
 
     def refresh(self) -> None:
         """r and g from x itself, instead of by recursion."""
         self.A.apply(self.x, self.r, scale=-1.0, add=self.b)
-        self._weighted(self.r)
-        self._gradient(self.g)
-        self.products += 1
+        self._weigh_r()
+        self._numbers.set_rows(4 + 2 * self._slices, self._norms)
+        self.A.apply_transpose(self._u, self._q)
+        self._look_anew()
+        self.products += 2
         self.true = True
 
-    def look(self) -> tuple[np.ndarray, Look]:
-        """The error of every column, and what the box says."""
-        self._seen = self.box.look(self.x, self.g, self.d, self.h)
-        return vectors.norm(self.r), self._seen
+    def step(self, unsolved: np.ndarray) -> None:
+        """Lower the error in the columns `unsolved`: six launches."""
+        if np.any(self._resting == unsolved):
+            self._resting = ~unsolved
+            self._rest.set(self._resting)
+        for launch in self._queued:
+            launch()
+        self.products += 2
+        self.true = False
 
-    def step(self, where: np.ndarray) -> None:
-        """Lower the error in the columns `where`."""
-        _, zz, zh, zd = self._seen
-        beta = -ratio(zh, self._curvature, self._curvature > 0.0)
-        beta = np.where(zz + beta * zd > _DESCENT * zz, beta, 0.0)
-        along = self.box.direction(np.where(where, self._alpha, 0.0), beta, self.x, self.g, self.d)
-        self._weighted(self.A.apply(self.d, self._Ad))
-        self.products += 1
-        self._curvature = vectors.dot(self._Ad, self._Ad)
-        moves = where & (along.slope < 0.0) & (self._curvature > 0.0)
-        step = np.minimum(ratio(-along.slope, self._curvature, moves), along.room)
-        step = np.where(moves, step, 0.0)
-        self._alpha = np.where(moves, ratio(along.square, self._curvature, moves), self._alpha)
-        self._curvature = np.where(step >= _STRAIGHT, self._curvature, 0.0)  # else the next p is z
-        self.box.move(step, self.d, self.x)
-        vectors.axpby_columns(-step, self._Ad, 1.0, self.r, self.r)
-        g = self._gradient(self.g.like())
-        inverse = ratio(np.ones_like(step), step, step > 0.0)
-        vectors.axpby_columns(inverse, g, -inverse, self.g, self.h)
-        self.g, self.true = g, False
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """The error and the Frank-Wolfe gap of every column; the wait."""
+        found = self._numbers.get().astype(np.float64)
+        self._alpha = found[0]
+        looks, squares = found[4 : 4 + 2 * self._slices], found[4 + 2 * self._slices :]
+        return np.sqrt(squares.sum(axis=0)), looks[::2].sum(axis=0)
 
     def held(self, x: np.ndarray) -> np.ndarray:
         """Entries that a step along -g takes beyond a bound; some come close to it without touching."""
-        lower, upper = (part.get()[:, None] for part in (self.box.lower, self.box.upper))
+        lower, upper = (part[:, None] for part in self._box)
         beyond = x - self._alpha * self.g.get()
         return (lower < upper) & ((beyond < lower) | (beyond > upper))
-
-    def _gradient(self, out: Array) -> Array:
-        wr = self.r if self.w is None else vectors.multiply(self.w, self.r, self.r.like())
-        self.products += 1
-        return self.A.apply_transpose(wr, out, scale=-1.0)
-
-    def _weighted(self, r: Array) -> Array:
-        return r if self.w is None else vectors.multiply(self.w, r, r)
-
-
-class _Judge:
-    """When to end: the errors, what they cannot go below, and the columns `unsolved`."""
-
-    def __init__(
-        self, scale: np.ndarray, rtol: float, atol: float, maxiter: int, callback: Callable | None
-    ) -> None:
-        self.scale, self._rtol, self._atol = scale, rtol, atol
-        self._maxiter, self._callback = maxiter, callback
-        self.status: Status | None = None
-        self.residuals: list[float] = []
-        self.least = np.zeros_like(scale)
-        self._lowest, self._lowest_at = np.inf, 0
-
-    def done(self, descent: _Descent) -> bool:
-        """Whether the descent ends here; that is said only of a true residual."""
-        if not self.residuals:
-            descent.refresh()
-            self._begin(*descent.look())
-        self._read(*descent.look())
-        if self._verdict() is not None and not descent.true:
-            descent.refresh()
-            self._read(*descent.look())
-        self.status = self._verdict()
-        self._record()
-        return self.status is not None
-
-    def _begin(self, errors: np.ndarray, _: Look) -> None:
-        self.first = errors
-        self.scale = np.where(self.scale > 0.0, self.scale, np.where(errors > 0.0, errors, 1.0))
-        self._tolerance = np.maximum(self._rtol * self.scale, self._atol)
-
-    def _read(self, errors: np.ndarray, look: Look) -> None:
-        self.errors = errors
-        bound = errors - ratio(look.gap, errors, errors > 0.0)
-        self.least = np.fmax(self.least, np.minimum(bound, errors))
-        self.unsolved = self.excess(errors) > self._tolerance
-
-    def excess(self, errors: np.ndarray) -> np.ndarray:
-        """What errors are above the least, at most, (k,)."""
-        above = np.maximum(errors - self.least, _ROUNDING * self.scale)
-        return np.where(np.isfinite(errors), above, np.inf)
-
-    def _verdict(self) -> Status | None:
-        if not self.unsolved.any():
-            return Status.CONVERGED
-        if len(self.residuals) >= self._maxiter:
-            return Status.MAXITER
-        waited = len(self.residuals) - self._lowest_at
-        return Status.STAGNATED if waited > _PATIENCE else None
-
-    def _record(self) -> None:
-        above = float(np.max(self.excess(self.errors) / self.scale))
-        if above < self._lowest:
-            self._lowest, self._lowest_at = above, len(self.residuals)
-        if self._callback is not None:
-            self._callback(len(self.residuals), above)
-        self.residuals.append(float(np.max(self.errors / self.scale)))
 
 
 def _power(largest: float) -> float:

@@ -7,10 +7,13 @@ albedo, so that with pixels of equal area w = 1 / F does for S = T F^-1: the def
 transport. Elsewhere it is w = 1, that of one albedo. Any other S is solved with its normal equations
 S^T S x = S^T b (CGNR), at two products a step and the square of the condition number.
 
-Each right-hand side has coefficients of its own and rests once it is solved. Two or three inner products
-a step are read back.
+A step is a product (two of CGNR), inner products, and one update of all vectors, by the recurrences of
+Chronopoulos and Gear, where both inner products come after the product: with w = S r,
+<p, S p> = <w, r> - beta <r, r> / alpha. Coefficients stay on the device, and several steps
+are queued between two readings of the residuals. Each right-hand side rests once it is solved.
 
-Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithms 6.18 and 8.4.
+Numbers in comments: Chronopoulos and Gear, J. Comput. Appl. Math. 25 (1989), section 3; for the normal
+equations Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithm 8.4.
 """
 
 from __future__ import annotations
@@ -22,13 +25,16 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array, vectors
-from ltcl.errors import InputError, InputTypeError
+from ltcl.errors import InputError
 from ltcl.operators import Operator
-from ltcl.solvers.columns import ratio
+from ltcl.solvers.columns import Columns
 from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import Monitor, System
 
-_ORTHOGONAL = 2.0**-20  # ||S^T r|| / (||S|| ||r||), below which float32 makes the rest of S^T r
+_PAIRS = 0b0001_0000  # <z, z> and <w, z>, of arrays z, w, r; left operand in the upper bits
+_NORMAL_PAIRS = 0b1010_0101_0000  # <z, z>, <w, w> and <r, r>
+_BROKEN = 2, 6  # rows of the state, of even and of odd steps
+_STEP, _ANEW = 4, 5  # arguments of the update
 
 
 @dataclass(frozen=True)
@@ -49,24 +55,14 @@ class CG:
     normal: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.normal, (bool, np.bool_)):
-            raise InputTypeError(f"normal is {self.normal!r}; it must be True or False")
+        checks.flag("normal", self.normal)
         if self.weights is None:
             return
         if self.normal:
-            raise InputError("weights are of no use with normal=True; give one of them")
-        weights = checks.finite("weights", checks.real("weights", self.weights))
-        if not np.all(weights > 0):
-            raise InputError(
-                f"weights has {np.sum(~(weights > 0))} value(s) that are not positive; all must be"
-            )
-
-    def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
-        """Improve `x`, whose residual is `r`, until the monitor ends it."""
-        if self.normal:
-            _normal_equations(system, x, r, monitor)
-        else:
-            _conjugate_gradients(system, x, r, monitor, _Inner(system, self.inner(system.S)))
+            raise InputError("weights cannot be combined with normal=True; give one of them")
+        few = int(np.sum(~(checks.finite("weights", checks.real("weights", self.weights)) > 0)))
+        if few:
+            raise InputError(f"weights has {few} value(s) that are not positive; all must be")
 
     def inner(self, S: Operator) -> Any:
         """The weights of the inner product that a solve with S has, (N,), or None of the plain one."""
@@ -74,65 +70,48 @@ class CG:
             return None
         return S.weights if self.weights is None else self.weights
 
+    def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
+        """Improve `x`, whose residual is `r`, until the monitor ends it."""
+        if monitor.check(x, r):
+            return
+        S, normal, weights = system.S, int(self.normal), self._weights(system, r)
+        columns = Columns(r, "krylov", "krylov_pairs", "krylov_cg")
+        w, p, q = r.like(), vectors.fill(r.like(), 0.0), vectors.fill(r.like(), 0.0)
+        z = r.like() if normal else r
+        state, sums = columns.state(), columns.sums(2 + normal)
+        rest = r.device.upload(~monitor.unsolved, np.int32)
+        codes = _NORMAL_PAIRS if normal else _PAIRS
+        pairs = (codes, int(weights is not r), weights, z, w, r, sums)
+        moves = (columns.slices, normal, 0, 1, rest, sums, state, z, w, p, q, x, r)
+        update = columns.bind("krylov_cg", *moves, extra=2 + normal)
+        queued = [S.bind(r, z, transpose=True)] if normal else []
+        queued += [S.bind(z, w), columns.bind("krylov_pairs", *pairs, across=2 + normal), update]
+        step, unsolved, anew = 0, monitor.unsolved, 1
+        while True:
+            first = step
+            for _ in range(monitor.steps_ahead()):
+                update.set(_STEP, step)
+                update.set(_ANEW, anew)
+                for launch in queued:
+                    launch()
+                step, anew = step + 1, 0
+            system.products += (1 + normal) * (step - first)
+            numbers, norms = columns.read(state, first, step)
+            if monitor.check(x, r, norms, recursive=True):
+                return
+            broken = numbers[_BROKEN[step % 2]] > 0.0
+            if broken.any() and broken[monitor.unsolved].all():
+                monitor.give_up(Status.BREAKDOWN if normal else Status.INDEFINITE)
+                return
+            anew = int(not np.array_equal(monitor.norms, norms[-1]))  # r is the true residual now
+            if (monitor.unsolved != unsolved).any():
+                unsolved = monitor.unsolved
+                rest.set(~unsolved)
 
-class _Inner:
-    """<x, y> = sum_i w_i x_i y_i of every column, in units of the largest weight."""
-
-    def __init__(self, system: System, weights: Any) -> None:
-        self._w = None
-        if weights is not None:
-            w = checks.shape("weights", np.asarray(weights, np.float64), system.b.shape[:1])
-            self._w = system.S.device.upload(w / w.max())
-            self._weighted = system.b.like()
-
-    def __call__(self, x: Array, y: Array) -> np.ndarray:
-        return vectors.dot(x, y if self._w is None else vectors.scale_rows(self._w, y, self._weighted))
-
-    def square(self, r: Array, norms: np.ndarray) -> np.ndarray:
-        """<r, r>, where the Euclidean `norms` of r are known."""
-        return norms**2 if self._w is None else self(r, r)
-
-
-def _conjugate_gradients(system: System, x: Array, r: Array, monitor: Monitor, inner: _Inner) -> None:
-    p, q = r.copy(), r.like()  # 1.
-    broken = np.zeros(r.columns, bool)
-    square = None
-    while not monitor.done(x, r, replace=True):
-        step = monitor.unsolved & ~broken
-        previous, square = square, inner.square(r, monitor.norms)
-        if previous is not None:
-            beta = ratio(square, previous, step)  # 6.
-            vectors.axpby_columns(step, r, np.where(step, beta, 1.0), p, p)  # 7.
-        system.apply(p, q)
-        curvature = inner(q, p)
-        broken |= step & (curvature <= 0.0)
-        step &= ~broken
-        if not step.any() and broken.any():
-            return monitor.give_up(Status.INDEFINITE)
-        alpha = ratio(square, curvature, step)  # 3.
-        vectors.axpby_columns(alpha, p, 1.0, x, x)  # 4.
-        vectors.axpby_columns(-alpha, q, 1.0, r, r)  # 5.
-    return None
-
-
-def _normal_equations(system: System, x: Array, r: Array, monitor: Monitor) -> None:
-    z, p, w = r.like(), r.like(), r.like()
-    broken = np.zeros(r.columns, bool)
-    square, largest = None, np.zeros(r.columns)
-    while not monitor.done(x, r, replace=True):
-        step = monitor.unsolved & ~broken
-        system.apply_transpose(r, z)  # 1. and 6.
-        previous, square = square, vectors.dot(z, z)
-        largest = np.maximum(largest, ratio(square, monitor.norms**2, step))  # of ||S||^2, from below
-        # Least squares: r is orthogonal to all that S can make. More steps are rounding, and make x grow.
-        broken |= step & (square <= largest * (_ORTHOGONAL * monitor.norms) ** 2)
-        step &= ~broken
-        if not step.any() and broken.any():
-            return monitor.give_up(Status.BREAKDOWN)
-        beta = np.zeros_like(square) if previous is None else ratio(square, previous, step)  # 7.
-        vectors.axpby_columns(1.0, z, beta, p, p)  # 8.
-        system.apply(p, w)  # 3.
-        alpha = ratio(square, vectors.dot(w, w), step)  # 4.
-        vectors.axpby_columns(alpha, p, 1.0, x, x)  # 5.
-        vectors.axpby_columns(-alpha, w, 1.0, r, r)
-    return None
+    def _weights(self, system: System, r: Array) -> Array:
+        """Of all values, in units of the largest one; `r` itself, which is not read, where there are none."""
+        weights = self.inner(system.S)
+        if weights is None:
+            return r
+        w = checks.shape("weights", np.asarray(weights, np.float64), system.b.shape[:1])
+        return r.device.upload(np.broadcast_to((w / w.max()).reshape(-1, *[1] * (len(r.shape) - 1)), r.shape))

@@ -3,53 +3,36 @@
 
     l^(k+1)_i = l_out(i) - |R_i| mean of sign(R_ij) l^(k)_j over a few columns j, drawn by eq. 25
 
-Each iteration draws fresh columns, so that noise of one is damped by those after it as light is. It costs
-`samples` loads a pixel in place of a row, and leaves the noise of the last product; final gather makes that
-product exactly. It converges in the mean where rho(R) < 1, as Jacobi does. Its noise stays bounded with
-enough samples (`ltcl.theory.sampled_products`); with fewer it is refused. It has no standard error. The three
-S of a transport in colour draw the same columns (`ltcl.operators.links`), where the samples are enough for
-that: where they are not, or memory is not, each draws its own, and the reason is told.
+Each iteration draws fresh columns, `samples` loads a pixel in place of a row, so that later ones damp its
+noise as they damp light. That of the last product is left, and no standard error known; final gather makes
+that product exactly. It converges in the mean where rho(R) < 1, as Jacobi does, with bounded noise from
+enough samples on (`ltcl.theory.walks`); fewer are refused. The three S of a transport in colour draw the same
+columns where samples and memory are enough for that; else each draws its own, and says why.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from ltcl import checks, theory
-from ltcl.errors import InputError, MemoryLimitError
-from ltcl.operators.alias import SAMPLERS, Tables
-from ltcl.operators.entrywise import rows_of_R
-from ltcl.operators.walks import Walker, whole
-from ltcl.solvers import sampled
-from ltcl.solvers.sampled import Channel, Estimate
-from ltcl.solvers.stopping import System
-from ltcl.theory.sampled_products import least_samples, noise_of_iteration
-from ltcl.theory.walks import second_moment_radius, second_moments
+from ltcl.operators import CSR, Dense
+from ltcl.operators.walks import SAMPLERS, Lengths, Tables, Walker
+from ltcl.solvers.monte_carlo import Sampled, Sampler, Start, Watch, check_seed
+from ltcl.theory.walks import enough_samples, weights
 
 _MOST = 10_000  # iterations
 
 
 @dataclass(frozen=True)
-class Hybrid:
-    """Options.
+class Hybrid(Sampler):
+    """Jacobi with sampled products; `ltcl.solve` tells the options.
 
-    Parameters
-    ----------
-    samples : int
-        Columns drawn of each row in an iteration.
-    seed : int
-        Below 2^64. The same seed gives the same bits on every device, but for final gather.
-    iterations : int, optional
-        As many as Jacobi needs to rtol when not given, and at most maxiter. `reason` tells of too few.
-    sampler : str
-        "alias" (eq. 25), "uniform" or "cdf"; see `MonteCarlo`.
-    gather : bool
-        Final gather: one exact product at the end, b - R x.
+    Iterations: those of Jacobi to rtol when not given. A seed gives the same bits everywhere, final gather
+    aside.
     """
 
     name: ClassVar[str] = "hybrid"
@@ -61,77 +44,55 @@ class Hybrid:
     gather: bool = False
 
     def __post_init__(self) -> None:
-        sampled.check_samples(self.samples)
-        sampled.check_seed(self.seed)
+        checks.count("samples", self.samples, most=(1 << 32) - 1)
+        check_seed(self.seed)
         if self.iterations is not None:
             checks.count("iterations", self.iterations, most=_MOST)
         checks.one_of("sampler", self.sampler, SAMPLERS)
         checks.flag("gather", self.gather)
 
-    def estimate(self, channels: Sequence[Channel]) -> list[Estimate]:
-        """The start plus what the iterations make of its residual r, begun at zero; columns are shared."""
-        try:  # rows that overflow have no spectral radius either
-            made, sign = sampled.tables_of(channels, self)
-            wanted = max(self._wanted(one) for one in channels)
-            self._check_noise(channels, made)
-        except (InputError, MemoryLimitError) as error:
-            if len(channels) == 1:
-                raise
-            why = sampled.cause(error)
-        else:
-            return self._iterate(channels, made, sign, wanted)
-        return sampled.each_alone(self, channels, why)
-
-    def _iterate(self, channels: Sequence[Channel], made: Tables, sign: float, wanted: int) -> list[Estimate]:
-        count = self.iterations or min(wanted, channels[0].rule.maxiter)
-        watch = sampled.watch(channels)
-        walker = Walker(made, whole(np.array([-sign])), "endpoint", self.seed, watch=watch)
-        l = start = sampled.side_by_side([one.r.get().astype(np.float64) for one in channels])
-        for k in range(count):
-            product = walker.rows(made.device.upload(l), np.arange(len(l)), 0, self.samples, stream=k)
-            l = sampled.within_float32(start + product.mean)
-        found = zip(channels, sampled.each(l, channels), strict=True)
-        return [self._estimate(one.system, one.x.get() + l, count, wanted) for one, l in found]
-
-    def _check_noise(self, channels: Sequence[Channel], made: Tables) -> None:
-        """Refuse as few samples as let noise of a channel grow from product to product."""
-        Rs = [rows_of_R(one.system.S, self.name)[0] for one in channels]
-        if second_moment_radius(Rs[0], made) < 1.0:
-            return
-        if made.least is None:
-            each = zip(Rs, second_moments(Rs[0], made), strict=True)
-            made.least = max(least_samples(R, Q) for R, Q in each)
-        if not self.samples >= made.least:
-            least = "more than can be told"
-            if math.isfinite(made.least):
-                least = f"{made.least:.0f} at least"
-                noise = noise_of_iteration(Rs[0], made.least, second_moment_radius(Rs[0], made))
-                least += f", which leave noise of about {noise:.2g} times the light"
-            raise InputError(
-                f"samples is {self.samples}; over this R noise grows from one product to the next then: "
-                f"samples= must be {least}, or use method='auto'"
+    def _refusal(self, starts: list[Start], made: Tables) -> str:
+        rho = max(_spectral_radius(one.R) for one in starts)
+        if not rho < 1.0:
+            return (
+                f"the spectral radius of R is {rho:.3g}; method='hybrid' is Jacobi with noise and needs < 1"
             )
+        if weights(starts[0].R, made).radius < 1.0:  # then any number of samples will do
+            return ""
+        if "enough" not in made.kept:
+            each = zip(starts, made.second_moments(starts[0].R), strict=True)
+            made.kept["enough"] = max(enough_samples(one.R, Q) for one, Q in each)
+        if self.samples >= made.kept["enough"]:
+            return ""
+        return (
+            f"samples is {self.samples}; over this R noise may grow from one product to the next; it does "
+            f"not from samples={made.kept['enough']:g} on"
+        )
 
-    def _estimate(self, system: System, x: np.ndarray, count: int, wanted: int) -> Estimate:
-        x = sampled.gathered(system, x) if self.gather else x
+    def _estimate(self, starts: list[Start], made: Tables, sign: float, watch: Watch) -> list[Sampled]:
+        rho, rtol = max(_spectral_radius(one.R) for one in starts), min(one.channel.rtol for one in starts)
+        wanted = math.ceil(math.log(min(max(rtol, 1e-6), 1.0)) / math.log(rho)) if rho > 0.0 else 1
+        count = self.iterations or min(max(1, wanted), starts[0].channel.maxiter)
+        walker = Walker(made, Lengths(np.array([-sign])), "endpoint", self.seed, watch)
+        r = np.stack([one.r.astype(np.float64) for one in starts], axis=-1)
+        l = start = r.reshape(len(r), -1)  # (N, columns * channels)
+        for k in range(count):
+            l = start + walker.rows(made.device.upload(l), np.arange(len(l)), self.samples, stream=k).mean
         reason = f"Jacobi, {self.samples} columns of each row drawn in each of {count} iterations"
         advice = "try more samples=" + ("" if self.gather else ", or gather=True")
         if count < wanted:
             more = "maxiter" if self.iterations is None else "iterations"
             advice = f"stopped at {count} of the {wanted} iterations that rtol asks for: raise {more}="
-        return Estimate(x, iterations=count, reason=reason, advice=advice)
+        found = []
+        for one, rest in zip(starts, np.moveaxis(l.reshape(r.shape), -1, 0), strict=True):
+            x = one.x + rest
+            x = x + one.residual(x) if self.gather else x
+            found.append(one.sampled(x, None, count, reason, advice))
+        return found
 
-    def _wanted(self, channel: Channel) -> int:
-        """Iterations that rtol asks for."""
-        (R, _), rule = rows_of_R(channel.system.S, self.name), channel.rule
-        key = "spectral radius"
-        if key not in R.tables:
-            R.tables[key] = theory.spectral_radius(R).value
-        rho = R.tables[key]
-        if not rho < 1.0:
-            raise InputError(
-                f"the spectral radius of R is {rho:.3g}; method='hybrid' is Jacobi with noise and needs one "
-                "below 1: use method='auto'"
-            )
-        wanted = math.log(max(rule.rtol, 1e-6)) / math.log(rho) if rho > 0.0 else 1.0
-        return max(1, math.ceil(wanted))
+
+def _spectral_radius(R: CSR | Dense) -> float:
+    """Found once, and kept with R."""
+    if "spectral radius" not in R.tables:
+        R.tables["spectral radius"] = theory.spectral_radius(R).value
+    return R.tables["spectral radius"]

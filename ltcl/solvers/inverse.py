@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import channels, checks, first_bounces, layout
+from ltcl import checks, layout
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus, Operator, stored
 from ltcl.operators.interreflection import nbytes
-from ltcl.solvers import units
+from ltcl.solvers.bounded import inwards
 from ltcl.solvers.result import Solution, Status
+from ltcl.solvers.solve import scale_rhs, unscale
 
 
 class Inverse:
@@ -32,20 +33,10 @@ class Inverse:
         A of each channel.
     errors : sequence of float
         Bound on ``||x~ - x|| / ||x||`` of every solution in each channel.
-    grid : (h, w)
-    first_bounce : (N,) or (channels, N)
-        F of T; 0 at masked pixels.
-    mixing : (3, 3), optional
-        Of the projector's colours, as in `ltcl.Transport`.
+    grid, first_bounce, mixing
+        As of `ltcl.Transport`; F (N,) or (channels, N) is 0 at masked pixels.
     confidence : float
         Of each of these bounds, over the random starts of `theory.two_norm`.
-
-    Attributes
-    ----------
-    A : Operator or tuple of 3
-        One physical bounce: ``inv.A @ picture`` is the light of the picture after one more bounce.
-    error : float
-        The largest of `errors`.
 
     Examples
     --------
@@ -77,15 +68,13 @@ class Inverse:
         self.errors = tuple(checks.number("error", error, least=0.0) for error in errors)
         F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce)).astype(np.float64)
         self._F = checks.shape("first_bounce", np.atleast_2d(F), (len(bounces), n))
-        self.mixing = None if mixing is None else channels.mixing(mixing, len(bounces), None)
+        self.mixing = None if mixing is None else layout.mixing(mixing, len(bounces), None)
         self.confidence = checks.number("confidence", confidence, above=0.0, most=1.0)
 
     def __repr__(self) -> str:
-        (h, w), kind = self.grid, {1: "grey", 3: "colour"}[self.channels]
-        return (
-            f"<ltcl Inverse {h * w} x {h * w}, {kind}, grid {h} x {w}, {checks.size(self.nbytes)} "
-            f"with an error of {self.error:.2g}>"
-        )
+        (h, w), kind, size = self.grid, {1: "grey", 3: "colour"}[self.channels], checks.size(self.nbytes)
+        what = f"{h * w} x {h * w}, {kind}, grid {h} x {w}, {size} with an error of {self.error:.2g}"
+        return f"<ltcl Inverse {what}>"
 
     @property
     def channels(self) -> int:
@@ -127,17 +116,12 @@ class Inverse:
         channel : int
             0, or 0 to 2 in colour.
         rtol : float, optional
-            Relative error of x that is allowed; that of the inverse when not given.
+            Relative error of x that is allowed; InputError where that of the inverse is above.
 
         Returns
         -------
         Solution
             Its status is PRECOMPUTED, `error` the bound, and there are no residuals.
-
-        Raises
-        ------
-        InputError
-            Shapes that do not fit, NaN, or an `rtol` below the error of the inverse.
         """
         start = time.perf_counter()
         self.refuse_beyond(rtol)
@@ -147,12 +131,10 @@ class Inverse:
         b = checks.finite("b", checks.real("b", b))
         if b.ndim not in (1, 2) or b.shape[0] != X.shape[0] or b.size == 0:
             raise InputError(f"b has shape {b.shape}; it must be ({X.shape[0]},) or ({X.shape[0]}, k)")
-        unit = units.of(b)
-        x = units.restored(X.apply(X.device.upload(units.scaled(b, unit))).get(), unit)
-        seconds = time.perf_counter() - start
-        return Solution(
-            x, Status.PRECOMPUTED, 1, 1, (math.nan,), seconds, "precomputed", error=self.errors[channel]
-        )
+        light, unit = scale_rhs(b)
+        x = unscale(X.apply(X.device.upload(light)).get(), unit)
+        spent, error = time.perf_counter() - start, self.errors[channel]
+        return Solution(x, Status.PRECOMPUTED, 1, 1, (math.nan,), spent, "precomputed", error=error)
 
     def pattern(
         self,
@@ -175,12 +157,8 @@ class Inverse:
         Returns
         -------
         array like `desired`, float32
-
-        Notes
-        -----
-        What clamping takes from one pixel is not made up for by others, as `ltcl.compensate` does within the
-        bounds, and nothing tells how far the scene will be off: for single pictures use that, with
-        ``inverse=`` and perhaps ``clamp=True``.
+            What clamping takes from one pixel is not made up for by others, and nothing tells how far off the
+            scene will be: for single pictures use `ltcl.compensate` with ``inverse=``.
 
         Examples
         --------
@@ -189,65 +167,51 @@ class Inverse:
         >>> ltcl.invert(T).pattern(numpy.array([[0.3, 0.3]])).round(2).tolist()
         [[0.5, 0.5]]
         """
-        low, high = _bounds(bounds)
+        try:
+            low, high = bounds
+        except (TypeError, ValueError):
+            raise InputError(f"bounds is {bounds!r}; it must be (low, high)") from None
+        low = checks.number("bounds[0]", low)
+        high = checks.number("bounds[1]", high, above=low)
         gain, dark = checks.number("gain", gain, above=0.0), checks.number("background", background)
         columns, shape = layout.unpack("desired", desired, self.grid, self.channels)
         solved = [self.solve(gain * b - dark, channel).x for channel, b in enumerate(columns)]
-        light = first_bounces.undone(solved, self._F, self.mixing)
+        light = layout.to_light(solved, self._F, self.mixing)
         limited = [
-            np.where(f[:, None] > 0.0, np.clip(p, low, high), 0.0)
+            np.where(f[:, None] > 0.0, np.clip(p.astype(np.float32), *inwards(low, high)), np.float32(0.0))
             for p, f in zip(light, self._F, strict=True)
         ]
-        return shape.pack(limited, self.grid).astype(np.float32)
+        return shape.pack(limited, self.grid)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays by name, as files hold them; `from_arrays` makes the same of them, to the bit."""
-        mixed = {} if self.mixing is None else {"mixing": self.mixing}
-        return {
-            "grid": np.array(self.grid),
+        own = {
+            "grid": self.grid,
             "first_bounce": self._F,
-            "errors": np.array(self.errors),
-            "confidence": np.array(self.confidence),
-            **mixed,
-            **stored.to_arrays(self.systems),
+            "errors": self.errors,
+            "confidence": self.confidence,
         }
+        own |= {} if self.mixing is None else {"mixing": self.mixing}
+        return {name: np.array(value) for name, value in own.items()} | stored.to_arrays(self.systems)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], device: Device | str | None = None) -> Inverse:
-        """Of what `to_arrays` gave, on a device that is opened at once.
-
-        Raises
-        ------
-        InputError
-            Arrays that are missing, or do not fit each other.
-        """
+        """Of what `to_arrays` gave, on a device that is opened at once; InputError where they do not fit."""
         for name in ("grid", "first_bounce", "errors", "confidence"):
             if name not in arrays:
                 raise InputError(f"an inverse has the array {name!r}, which is missing")
         systems = stored.from_arrays(open_device(device), arrays)
         if any(X.sign != -1.0 for X in systems):
             raise InputError("the operators are I + R; those of an inverse are I - A")
-        errors = np.ravel(arrays["errors"]).tolist()
+        errors, F = np.ravel(arrays["errors"]).tolist(), arrays["first_bounce"]
+        grid = checks.shape("grid", arrays["grid"], (2,)).tolist()
         confidence = float(checks.shape("confidence", arrays["confidence"], ()))
-        grid, F = checks.shape("grid", arrays["grid"], (2,)), arrays["first_bounce"]
-        return cls([X.R for X in systems], errors, grid.tolist(), F, arrays.get("mixing"), confidence)
+        return cls([X.R for X in systems], errors, grid, F, arrays.get("mixing"), confidence)
 
     def refuse_beyond(self, rtol: float | None) -> None:
         """Refuse a tolerance that is below the error."""
-        if rtol is None:
-            return
-        rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
-        if rtol < self.error:
+        if rtol is not None and checks.number("rtol", rtol, least=0.0, below=1.0) < self.error:
             raise InputError(
                 f"rtol is {rtol:g}, but what this inverse gives may be off by {checks.upwards(self.error)}; "
                 "ask for no less, or make a better one with ltcl.invert(T, rtol=...)"
             )
-
-
-def _bounds(value: Any) -> tuple[float, float]:
-    try:
-        low, high = value
-    except (TypeError, ValueError):
-        raise InputError(f"bounds is {value!r}; it must be (low, high)") from None
-    low = checks.number("bounds[0]", low)
-    return low, checks.number("bounds[1]", high, above=low)

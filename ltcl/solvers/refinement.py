@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Iterative refinement: a compressed S~ solves, and the S that it stands for judges.
+"""Where a solve runs, on coefficients or pixels, and iterative refinement, where an exact S judges.
+
+Of S = I + W^T C W in an orthonormal basis W, S x = b is (I + C) a = W b with x = W^T a: two transforms in
+all, where pixels take two for every product. W keeps lengths, so that residuals, tolerances and the spectrum
+are those of pixels. Where W has but some coefficients of such a basis, W W^T = I still, S is the identity on
+the rest of b, and x = b + W^T (a - W b). Inner products with weights, diagonal in pixels, are not so in
+coefficients: `cg` with weights runs in pixels.
+
+Where S~ is a compressed S, S~ solves and S judges:
 
     x^(k+1) = x^(k) + S~^-1 (b - S x^(k))
 
-With S~ = S + E and each solve to a tolerance t, the error shrinks by about ||S~^-1 E|| + t a step, the first
-of which the `solution_error` of S~ bounds. Below 1, any tolerance is reached that products by S can tell, one
-of them a step; the others are by S~, and run on its coefficients. Otherwise residuals may grow, which the
-monitor sees. (Wilkinson, Rounding Errors in Algebraic Processes, 1963; Higham, Accuracy and Stability of
-Numerical Algorithms, 2nd ed., chapter 12.)
-
-Float32 products tell residuals of about 1e-7 to 1e-6 of b. Tolerances below 1e-6 are therefore refined in
-float64, x and residuals both, where the numbers of S are at hand on the host (`double`), and are then met
-down to about 1e-15; where they are not, the least that can be asked is told.
-
-A solve reports true residuals, those of S; its iterations are steps of refinement, and its products those by
-S and by S~ together.
+With S~ = S + E and each solve to a tolerance t, the error shrinks by about ||S~^-1 E|| + t a step. Below 1,
+any tolerance is reached that products by S can tell; otherwise residuals may grow, which the monitor sees
+(Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., chapter 12). x is float64 on the host; so
+are residuals where the numbers of S are at hand and a product with them is cheap, or float32 could not tell:
+that reaches about 1e-15. Iterations are steps of refinement, and products those by S and by S~ together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+import weakref
 from typing import Any
 
 import numpy as np
@@ -28,57 +28,32 @@ import numpy as np
 from ltcl import checks
 from ltcl.device import Array, vectors
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import Operator, as_operator
-from ltcl.solvers import coefficients
-from ltcl.solvers.direct import Direct
-from ltcl.solvers.double import Product
-from ltcl.solvers.result import Solution, Status
+from ltcl.operators import Compressed, IdentityPlus, Operator
+from ltcl.solvers import precision
+from ltcl.solvers.cg import CG
+from ltcl.solvers.precision import Direct
+from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import Monitor, Rule, System
 
-_OF_S = "exact=T.interreflection of the uncompressed T"
-_OF_A_TASK = "exact=T, the uncompressed transport"
+_FLOAT32 = 2.0**-20  # relative residual, below which float32 products are left
 _LEAST, _MOST = 1e-3, 0.1  # of the tolerance of a step: many short steps waste products by S, long ones by S~
-FINE = 2.0**-20  # relative residual, below which float32 products are left
-_MARGIN = 1.5  # times what was reached: what is reached again
 _HALF = 0.5  # of a residual: a solve that ended early but left no more is a step, too
-
-
-def refuse_beyond(S: Operator, rule: Rule, wanted: float) -> None:
-    """Refuse a relative residual `wanted` that says less about the solution than S itself."""
-    error = S.solution_error
-    if wanted < error:
-        atol = f" and atol {rule.atol:g}" if np.any(rule.atol) else ""
-        raise InputError(
-            f"rtol is {rule.rtol:g}{atol}; S is compressed and its solutions may be off by "
-            f"{checks.upwards(error)}: ask for no less, or give {_OF_S}"
-        )
-
-
-@contextmanager
-def of_a_task() -> Iterator[None]:
-    """Refusals of the block advise what a task takes as `exact`, a transport and no S."""
-    try:
-        yield
-    except InputError as error:
-        if _OF_S not in str(error):
-            raise
-        raise type(error)(str(error).replace(_OF_S, _OF_A_TASK)) from None
 
 
 def exact_operator(exact: Any, S: Operator) -> Operator:
     """`exact` on the device of S, checked."""
     if hasattr(type(exact), "interreflection"):  # asked of the object, it would upload
-        raise InputTypeError(f"exact is a {type(exact).__name__}; it must be like S: give {_OF_S}")
+        raise InputTypeError(f"exact is a {type(exact).__name__}; it must be like S: give T.interreflection")
     if isinstance(exact, (tuple, list)) and any(isinstance(part, Operator) for part in exact):
         raise InputTypeError(f"exact is {len(exact)} operators, S is one; give that of the same colour")
     if not hasattr(exact, "shape"):
         checks.real("exact", exact)
-    found = as_operator(exact, S.device)
-    if found.shape != S.shape:
-        raise InputError(f"exact has shape {found.shape}; it must be that of S, {S.shape}")
-    if found.device is not S.device:
-        raise InputError(f"exact is on another device, {found.device}; it must be on {S.device}")
-    return found
+    E = precision.operator(exact, S.device)
+    if E.shape != S.shape:
+        raise InputError(f"exact has shape {E.shape}; it must be that of S, {S.shape}")
+    if E.device is not S.device:
+        raise InputError(f"exact is on another device, {E.device}; it must be on {S.device}")
+    return E
 
 
 def step_tolerance(S: Operator) -> float:
@@ -91,85 +66,97 @@ def step_tolerance(S: Operator) -> float:
     return min(max(S.solution_error, _LEAST), _MOST)
 
 
+_entered: weakref.WeakKeyDictionary[IdentityPlus, OnCoefficients] = weakref.WeakKeyDictionary()
+
+
+class OnCoefficients(IdentityPlus):
+    """I + sign C of S = I + sign W^T C W. `row_sums`, which bound the spectrum, are those of S in pixels."""
+
+    def __init__(self, S: IdentityPlus, core: Operator) -> None:
+        super().__init__(core, S.sign)
+        self.weights = S.weights
+        self._row_sums = S.row_sums()
+
+
 def iterate(
-    method: Any, S: Operator, exact: Operator, b: Array, guess: Array | None, rule: Rule
-) -> tuple[Array, Monitor]:
-    """Refine solutions of S~ x = b, `S` being S~, until the monitor ends it; the iterate to return."""
-    system = System(exact, b)
-    x, r = coefficients.start(system, guess)
+    method: Any,
+    S: Operator,
+    b: Array,
+    guess: Array | None,
+    rule: Rule,
+    host: np.ndarray | None = None,
+    with_residual: bool = False,
+) -> tuple[Array, Monitor, Array | None]:
+    """Run an iterative method on S x = b; x in pixels, and what watched it.
+
+    `host` is b before it became float32; `guess` is None for zero. Where it converged and that is wanted, the
+    residual b - S x comes back, too.
+    """
+    W, right = None, b
+    weighted = isinstance(method, CG) and method.inner(S) is not None
+    if isinstance(S, IdentityPlus) and isinstance(S.R, Compressed) and S.R.two_sided and not weighted:
+        if S not in _entered:  # what is learnt of it serves all solves
+            _entered[S] = OnCoefficients(S, S.R.core)
+        W, S = S.R.into, _entered[S]
+        assert W is not None  # noqa: S101 - two_sided says so
+        right, guess, host = W.apply(b), None if guess is None else W.apply(guess), None
+    system = System(S, right, b, host)
+    if guess is None:  # whose residual is b and costs no product
+        x, r = vectors.fill(right.like(), 0.0), right.copy()
+        system.whole_norms, *own = vectors.norms(b) if W is None else vectors.norms(b, right)
+        system.start_norms = own[0][None] if own else system.whole_norms[None]
+    else:
+        x, r = guess, system.residual(guess, right.like())
     monitor = Monitor(system, rule)
-    while not monitor.done(x, r):
-        step = _step(method, S, r, Rule(_tolerance(S, monitor), 0.0, rule.maxiter), system)
-        if isinstance(step, Status):
-            monitor.give_up(step)
-            break
-        vectors.axpy(1.0, step, x)
-        system.residual(x, r)
-    best = x if monitor.status is Status.CONVERGED or monitor.best is None else monitor.best
-    return best, monitor
+    method.iterate(system, x, r, monitor)
+    x = monitor.result(x)
+    left = r if with_residual and monitor.status is Status.CONVERGED else None
+    if W is None:
+        return x, monitor, left
+    left = left and W.apply_transpose(left)
+    if not W.orthonormal:
+        return W.apply_transpose(vectors.axpby(1.0, x, -1.0, right, x.like()), add=b), monitor, left
+    return W.apply_transpose(x), monitor, left
 
 
-class _Double(System):
-    """S x = b with b and residuals in float64, (N, k) on the host."""
-
-    least = 2.0**-52
-
-    def __init__(self, S: Operator, b: np.ndarray, product: Product) -> None:
-        super().__init__(S, S.device.upload(b))
-        self._exact, self._times = b.reshape(len(b), -1), product
-
-    def left(self, x: np.ndarray, r: Array) -> Array:
-        """r = b - S x, rounded once."""
-        self.products += 1
-        return r.set((self._exact - self._times(x.reshape(self._exact.shape))).reshape(r.shape))
-
-
-def iterate_in_double(
-    method: Any, S: Operator, exact: Operator, product: Product, b: np.ndarray, guess: Any, rule: Rule
+def refine(
+    method: Any,
+    S: Operator,
+    exact: Operator,
+    b: np.ndarray,
+    guess: np.ndarray | None,
+    rule: Rule,
+    required: float,
 ) -> tuple[np.ndarray, Monitor]:
-    """As `iterate`, with x and residuals in float64 on the host, by the `product` of `exact`."""
-    system = _Double(exact, b.astype(np.float64), product)
-    x = np.zeros(b.shape) if guess is None else guess.astype(np.float64)
-    r = system.b.copy() if guess is None else system.left(x, system.b.like())
-    monitor, best, told = Monitor(system, rule), x, system.b.like()
-    while not monitor.done(told.set(x), r):
-        best = x if monitor.residuals[-1] == monitor.lowest else best
-        step = _step(method, S, r, Rule(_tolerance(S, monitor), 0.0, rule.maxiter), system)
+    """Refine solutions of S~ x = b, `S` being S~, until `exact` finds the `required` relative residual."""
+    system = System(exact, S.device.upload(b), host=b)
+    system.fine = system.times is not None and (precision.is_small(exact) or required < _FLOAT32)
+    if guess is None:
+        x, r = np.zeros(b.shape), system.b.copy()
+    else:
+        x = guess.astype(np.float64)
+        r = system.residual(x, system.b.like())
+    monitor = Monitor(system, rule)
+    while not monitor.check(x, r):
+        tolerance = min(max(step_tolerance(S), _HALF * monitor.left), _MOST)
+        step = _step(method, S, r, Rule(tolerance, 0.0, rule.maxiter), system)
         if isinstance(step, Status):
             monitor.give_up(step)
             break
-        x = x + step.get()
-        system.left(x, r)
-    last = monitor.status is Status.CONVERGED or monitor.residuals[-1] == monitor.lowest
-    return (x if last else best), monitor
+        x = x + step
+        system.residual(x, r)
+    x = monitor.result(x)
+    return (x if system.fine else x.astype(np.float32)), monitor
 
 
-def failure(found: Solution, rule: Rule, exact: Operator | None) -> str:
-    """Why a solve failed, with the least tolerance where it was beyond what rounding leaves of `exact`."""
-    if exact is None or found.status is not Status.STAGNATED or found.residual > _HALF * FINE:
-        return str(found)
-    floor = System.least if found.x.dtype == np.float32 else _Double.least
-    least = checks.upwards(max(_MARGIN * found.residual, floor))
-    atol = f" and atol {rule.atol:g}" if np.any(rule.atol) else ""
-    return (
-        f"rtol is {rule.rtol:g}{atol}, but products with exact= are rounded, which left {found.residual:.2g} "
-        f"after {found.iterations} iterations of {found.method}; the least that can be asked is {least}"
-    )
-
-
-def _tolerance(S: Operator, monitor: Monitor) -> float:
-    """Of the next step: that of S~, or more where less is left to do."""
-    return min(max(step_tolerance(S), _HALF * monitor.left), _MOST)
-
-
-def _step(method: Any, S: Operator, r: Array, rule: Rule, system: System) -> Array | Status:
+def _step(method: Any, S: Operator, r: Array, rule: Rule, system: System) -> np.ndarray | Status:
     """S~^-1 r, or why there is none."""
     if isinstance(method, Direct):
         try:
-            return S.device.upload(method.solve(S, r.get().astype(np.float64))[0])
+            return method.solve(S, r.get())[0]
         except np.linalg.LinAlgError:
             return Status.BREAKDOWN
-    step, inner = coefficients.iterate(method, S, r, None, rule)
+    step, inner, _ = iterate(method, S, r, None, rule)
     system.products += inner.system.products
     assert inner.status is not None  # noqa: S101 - iterate returns only when the monitor said so
-    return step if inner.status is Status.CONVERGED or inner.lowest <= _HALF else inner.status
+    return step.get() if inner.status is Status.CONVERGED or inner.lowest <= _HALF else inner.status

@@ -38,11 +38,7 @@ _SERIES = ("jacobi", "neumann", "matrix_iteration", "matrix_series")
 
 
 def _advice(status: Status, method: str) -> str:
-    """Why a solve ended and what else to try: never the method that just failed.
-
-    >>> _advice(Status.DIVERGED, "chebyshev")
-    "the residual grew; try method='gmres' or 'direct'"
-    """
+    """Why a solve ended and what else to try: never the method that just failed."""
     if status is Status.STAGNATED and method != "direct":
         return f"{status.value} or try method='direct'"
     if status is not Status.DIVERGED:
@@ -58,8 +54,8 @@ class Solution:
 
     Attributes
     ----------
-    x : like b, float32 (float64 of method "direct", of values beyond float32, and of what `exact` refined to
-        a tolerance below 1e-6)
+    x : like b, float32 (float64 of "direct", of values beyond float32 or too small for it, and of what
+        `exact` refined in float64)
         The solution; where `converged` is False, the iterate with the smallest residual, or what was sampled.
         Of `pixels=` (P,) or (P, k), in their order; of three S (3, P) or (3, P, k).
     status : Status
@@ -76,22 +72,16 @@ class Solution:
     reason : str
         Why "auto" chose it, or what a method that samples has sampled, else empty.
     lowest : float, optional
-        Residual of the best iterate; the least of `residuals` when not given. Residuals that gmres foresees
-        are no iterate's.
+        Residual of the best iterate; the least of `residuals` when not given.
     standard_error : like x, optional
-        Of "monte_carlo": of the noise, without the bias of a polynomial, and without that of alias tables,
-        which leave out entries drawn less than once in about 2^19 times the entries of their row: beyond
-        2^20 samples it may show, and sampler="cdf" hardly has it. 0 only where there is none for
-        certain; NaN or infinite of a single sample. It has two parts. That of the spread of n samples falls
-        as 1 / sqrt(n). That of light which they may not have met falls as 1 / n: by the rule of three it is
-        about 1.7 |R_i| max |b| / n, whatever walks have found, and more where rows far heavier than others
-        are seldom met: but not of uniform walks, of those from b, or of those that channels share.
-        Of pictures with ordinary contrast and 256
-        samples the second is small, and x is within 2 of both together some 95 times in 100. Where most of
-        the light is in few pixels it is the larger one until walks have met them, and x within 2 of it more
-        often; so, too, of few samples, and of polynomials that the picture leaves hardly any noise.
+        Of "monte_carlo": of the noise of n samples, without the bias of alias tables, which leave out entries
+        drawn less than once in about 2^19 times the entries of their row. Its first part, of the spread of
+        samples, falls as 1 / sqrt(n); that of light which they may not have met as 1 / n (by the rule of
+        three about 1.7 |R_i| max |b| / n), and is the larger one where few pixels hold most of the light.
     error : float, optional
         Bound on the relative error of x, where one is known: of a precomputed inverse.
+    rest : like x, optional
+        b - S x, where a task asked for it and the method has it.
     """
 
     x: np.ndarray
@@ -105,6 +95,7 @@ class Solution:
     lowest: float | None = None
     standard_error: np.ndarray | None = None
     error: float | None = None
+    rest: np.ndarray | None = None
 
     @property
     def converged(self) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import checks, parts
+from ltcl import checks
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import as_path
 from ltcl.solvers import Inverse
@@ -22,7 +22,7 @@ from ltcl.store.blocks import BlockStore, StoredRows
 from ltcl.store.compressed import Parts
 from ltcl.store.inverses import load_inverse, save_inverse
 from ltcl.store.record import Matrix, Record
-from ltcl.transport import Transport
+from ltcl.transport import Transport, from_arrays, to_arrays
 
 __all__ = ["BlockStore", "Parts", "Record", "StoredRows", "load", "load_inverse", "save", "save_inverse"]
 
@@ -78,7 +78,7 @@ def load(
     with formats.about(path):
         if isinstance(record, Parts):
             same = {"grid": grid or camera_grid, "first_bounce": first_bounce}
-            return parts.assemble(record.arrays, **same, on_dark=on_dark, device=device)
+            return from_arrays(record.arrays, **same, on_dark=on_dark, device=device)
         rows, columns = record.shape
         grid = checks.grid("grid", grid or record.grid or _unknown("grid", columns, "projector"), columns)
         camera_grid = camera_grid or record.camera_grid
@@ -138,7 +138,7 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
         raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
     held = (np.ndarray, scipy.sparse.csr_array, StoredRows)
     if not any(isinstance(matrix, held) for matrix in T.matrices):
-        formats.write(as_path(path), Parts(parts.of(T)))
+        formats.write(as_path(path), Parts(to_arrays(T)))
         return
     matrices = tuple(_entries(matrix) for matrix in T.matrices)
     bounce = T.first_bounce if T.is_square else None

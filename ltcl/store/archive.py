@@ -21,6 +21,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.errors import FileError
+from ltcl.files import refuse_appended
 from ltcl.store import arrays
 
 _MOST_MEMBERS = 10_000
@@ -62,6 +63,11 @@ class Archive:
         with _refusing("the archive"):
             self._zip = zipfile.ZipFile(path)
         self._size = path.stat().st_size
+        try:
+            refuse_appended(path, self._zip.comment)
+        except FileError:
+            self._zip.close()
+            raise
         members = [info for info in self._zip.infolist() if info.filename.endswith(".npy")]
         self._members = {info.filename.removesuffix(".npy"): info for info in members}
         self._headers: dict[str, arrays.Header] = {}

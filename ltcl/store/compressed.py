@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compressed transports in .npz archives: one array for each part of their operators.
 
-`format` is "ltcl-compressed-1"; names and meaning of all others are those of `ltcl.parts` and
+`format` is "ltcl-compressed-1"; names and meaning of all others are those of `ltcl.transport` and
 `ltcl.operators.stored`. Here they are plain arrays: finite, of declared sizes, with a grid and a first bounce
 that fit; what they make is checked where it is made.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ltcl import channels, checks
+from ltcl import checks, layout
 from ltcl.errors import FileError, InputError
 from ltcl.store.archive import Archive
 
@@ -49,7 +49,7 @@ class Parts:
             if array.dtype.kind == "f" and not name.endswith(_MAY_BE_INFINITE):
                 checks.finite(f"array {name!r}", array)
         if "mixing" in self.arrays:
-            channels.mixing(self.arrays["mixing"], len(F), None)
+            layout.mixing(self.arrays["mixing"], len(F), None)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse
 
-from ltcl import channels, checks
+from ltcl import checks, layout
 from ltcl.errors import InputError, InputTypeError
 from ltcl.store.blocks import StoredRows
 
@@ -65,7 +65,7 @@ class Record:
             columns = self.shape[1]
             checks.shape("first_bounce", self.first_bounce, (columns,), (3, columns))
         if self.mixing is not None:
-            channels.mixing(self.mixing, len(self.matrices), None)
+            layout.mixing(self.mixing, len(self.matrices), None)
 
     @property
     def shape(self) -> tuple[int, int]:

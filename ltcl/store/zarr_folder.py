@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Transports as stores (`ltcl.store.blocks`): folders that are read block by block. Values become float32.
 
-A compressed transport is kept in extra arrays under the names of `ltcl.parts`, its texts in the attributes,
+A compressed transport is kept in extra arrays under the names of `ltcl.transport`, its texts in attributes,
 and the names of the arrays there too: other extra arrays are no part of it, and are not read.
 """
 

@@ -23,7 +23,7 @@ from ltcl.theory.series import (
     inverse_error_bound,
     norm_bound,
 )
-from ltcl.theory.spectrum import SpectralRadius, free_bounds, spectral_radius
+from ltcl.theory.spectrum import SpectralRadius, free_bounds, row_sum_range, spectral_radius
 
 __all__ = [
     "Forecast",
@@ -40,6 +40,7 @@ __all__ = [
     "inverse_error_bound",
     "norm_bound",
     "richardson_products",
+    "row_sum_range",
     "series_products",
     "spectral_radius",
     "two_norm",

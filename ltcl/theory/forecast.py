@@ -72,7 +72,7 @@ def forecasts(
     southwell nan none
     cg 6 ritz values
     gmres 6 ritz values
-    bicgstab 7 ritz values
+    bicgstab 8 ritz values
     """
     require_operator("S", S)
     if not isinstance(rho, SpectralRadius):
@@ -84,7 +84,7 @@ def forecasts(
     krylov = {
         "cg": degree + 1 if self_adjoint else math.nan,  # one to confirm the end, as of the others
         "gmres": degree + 1,
-        "bicgstab": 2 * math.ceil(degree / 2) + 1 if spectrum else math.nan,  # two products, two degrees
+        "bicgstab": 2 * math.ceil(degree / 2) + 2 if spectrum else math.nan,  # and one by S^T to begin
     }
     found = {
         "jacobi": series,
@@ -173,8 +173,8 @@ def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     _numbers(lower=lower, upper=upper, rtol=rtol)
     if upper <= lower:
         return 1
-    centre = (upper + lower) / (upper - lower)
-    return max(1, math.ceil(math.acosh(1.0 / rtol) / math.acosh(centre)))
+    angle = 2.0 * math.asinh(math.sqrt(lower / (upper - lower)))  # acosh of the centre, which may round to 1
+    return max(1, math.ceil(math.acosh(1.0 / rtol) / angle))
 
 
 def richardson_products(lower: float, upper: float, rtol: float) -> int:
@@ -188,7 +188,7 @@ def richardson_products(lower: float, upper: float, rtol: float) -> int:
     """
     _numbers(lower=lower, upper=upper, rtol=rtol)
     factor = (upper - lower) / (upper + lower)
-    return 1 if factor <= rtol else math.ceil(math.log(rtol) / math.log(factor))
+    return 1 if factor <= rtol else math.ceil(math.log(rtol) / math.log1p(-2.0 * lower / (upper + lower)))
 
 
 def _numbers(**values: object) -> None:

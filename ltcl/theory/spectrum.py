@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import weakref
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from ltcl.device import Array, vectors
 from ltcl.errors import InputTypeError
 from ltcl.operators import Norms, Operator
 
+_ranges: weakref.WeakKeyDictionary[Operator, tuple[float, float, float]] = weakref.WeakKeyDictionary()
 _FLOOR = 1e-12  # of the largest value of a vector: far above what underflows
 
 
@@ -155,8 +157,20 @@ def free_bounds(S: Operator) -> tuple[float, float]:
     >>> free_bounds(as_operator([[1.0, 0.5], [0.5, 1.0]]))
     (0.5, 1.5)
     """
-    sums = require_operator("S", S).row_sums()
-    if float(np.mean(sums)) >= 1.0:
-        return 0.5, float(np.max(sums))
-    g = float(np.max(1.0 - sums))
-    return max(1.0 - g, 1e-3), 1.0 + g
+    least, mean, most = row_sum_range(require_operator("S", S))
+    if mean >= 1.0:
+        return 0.5, most
+    return max(least, 1e-3), 2.0 - least
+
+
+def row_sum_range(S: Operator) -> tuple[float, float, float]:
+    """The least, the mean and the largest row sum of S, computed once in its life.
+
+    The mean is the Rayleigh quotient of the even picture, in the inner product of `S.weights`.
+    """
+    if S not in _ranges:
+        sums = S.row_sums()
+        with np.errstate(all="ignore"):  # sums that left float32 stay infinite
+            mean = np.average(sums.astype(np.float64), weights=S.weights)
+        _ranges[S] = float(np.min(sums)), float(mean), float(np.max(sums))
+    return _ranges[S]

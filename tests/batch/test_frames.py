@@ -430,7 +430,7 @@ def test_resuming_nothing_begins(T, source, tmp_path):
         (
             {"exact": np.eye(64)},
             InputTypeError,
-            "exact is a ndarray; it must be a ltcl.Transport: give exact=T",
+            "exact is a ndarray; it must be a ltcl.Transport",
         ),
         ({"nonsense": 1}, InputTypeError, "frames 1 to 8: unknown option 'nonsense'"),
         ({"encoding": "log"}, InputError, "encoding is 'log'"),

@@ -10,6 +10,7 @@ import pytest
 import ltcl
 from ltcl import images, scenes, store
 from ltcl.cli import compensate_pictures
+from ltcl.operators import IdentityPlus, ScaledColumns
 
 from .conftest import Program
 
@@ -316,9 +317,16 @@ def test_a_compressed_transport_keeps_to_what_it_is_worth(
     images.write(picture, np.full((5, 10), 0.4, np.float32))
     arguments = ("compensate", compressed_transport, picture, "--out", tmp_path / "out")
     assert program(*arguments, "--rtol", "0.0041").code == 0
+    worse, few = tmp_path / "worse.npz", ltcl.load(compressed_transport)
+    S = IdentityPlus(few.systems[0].R, solution_error=0.03)
+    F = few.first_bounce
+    ltcl.save(worse, ltcl.Transport(ScaledColumns(S, F), few.grid, first_bounce=F))
+    told = program("compensate", worse, picture, "--out", tmp_path / "worse", "--json")
+    assert told.code == 0, told.err
+    assert told.json["options"]["rtol"] == 0.03  # and not 0.01
     program(*arguments, "--rtol", "1e-5").refused(
         "error: --rtol is 1e-05; ",
-        "solutions may be off by 0.0041: ask for no less, or give --exact FILE, the uncompressed transport",
+        "solutions may be off by 0.0041: ask for no less, or give --exact FILE, the uncompressed one",
     )
 
 

@@ -71,13 +71,12 @@ def test_refusals(program: Program, transport: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_budget_is_refused_with_what_fits(program: Program, transport: Path, tmp_path: Path) -> None:
+def test_a_budget_is_refused_with_what_it_takes(program: Program, transport: Path, tmp_path: Path) -> None:
     out = tmp_path / "C.npz"
     outcome = program("compress", transport, "--out", out, "--budget", "10B", "--basis", "db2")
     assert (outcome.code, outcome.out) == (1, "")
-    last = outcome.err.splitlines()[-1]  # a search that takes more than two seconds tells of it before
+    last = outcome.err.splitlines()[-1]
     assert last.startswith("ltcl: error: --budget is 10 bytes, but rtol 0.01 needs ")
-    assert "; it allows rtol " in last
     assert not list(tmp_path.iterdir())
 
 

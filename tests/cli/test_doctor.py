@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ltcl.cli import device_checks, doctor
-from ltcl.device import Device, discovery, sources
+from ltcl.device import Device, discovery, kernels
 from ltcl.errors import DeviceError, FileError
 
 from .conftest import Program
@@ -25,7 +25,7 @@ def test_json_covers_every_kernel_file(program: Program, device: Device) -> None
     assert outcome.code == 0
     assert outcome.json["passed"] is True
     checks = {check["check"] for check in outcome.json["checks"]}
-    assert {f"kernels/{file.name}" for file in sources.folder().glob("*.cl")} <= checks
+    assert {f"kernels/{file.name}" for file in kernels.folder().glob("*.cl")} <= checks
 
 
 def test_wrong_device_fails_with_a_fix(program: Program, device: Device) -> None:
@@ -48,11 +48,36 @@ def test_unusable_cache_fails(
     assert "LTCL_CACHE" in outcome.out
 
 
-def test_crashing_driver_is_named(program: Program, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_checks.trial, "hide_fatal_drivers", lambda: ["/etc/OpenCL/vendors/bad.icd"])
-    outcome = program("doctor")
+# What the loader would do, with a driver that does as its file says.
+TRIAL = """
+import os, time
+action = open(os.environ["OCL_ICD_VENDORS"]).read()
+if action == "crash":
+    os.abort()
+if action == "hang":
+    time.sleep(60)
+if action == "refuse":
+    raise RuntimeError("a Python error harms nobody")
+"""
+
+
+@pytest.mark.parametrize("action", ["crash", "hang"])
+def test_crashing_driver_is_named_and_not_loaded(
+    program: Program, device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, action: str
+) -> None:
+    monkeypatch.setattr(device_checks, "TRIAL", TRIAL)
+    monkeypatch.setattr(device_checks, "_SECONDS", 2)
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
+    for name, does in (("bad", action), ("good", "work"), ("odd", "refuse")):
+        (tmp_path / f"{name}.icd").write_text(does)
+    outcome = program("doctor", "--json")
     assert outcome.code == 1
-    assert "bad.icd" in outcome.out
+    *_, drivers = outcome.json["checks"]
+    crashing, working = drivers["found"].split("working")
+    assert "bad.icd" in crashing
+    assert "odd.icd" in working
+    assert "good.icd" in working
+    assert "OCL_ICD_VENDORS" in drivers["fix"]
 
 
 def test_wrong_results_are_a_failure() -> None:

@@ -75,7 +75,6 @@ def test_the_largest_gain_at_a_loss(T, bounds, ambient, allowed):
     for more in (1.5, 3.0, 10.0):  # nor is there a larger one further up
         assert loss(more * c.gain, *arguments) > allowed
     assert c.clipped > 0.0
-    assert c.limited[0].products > 2 * c.limited[0].iterations + 2  # the search is counted
 
 
 @pytest.mark.parametrize("bounds", [(0.0, 1.0), (0.1, 0.6)])
@@ -115,12 +114,6 @@ def test_without_a_loss_a_tenth_above_the_least(T, bounds, rtol, contrast):
     assert at(1.0101 * c.gain) > 0.999 * allowed
 
 
-def test_a_loss_below_what_float32_tells_is_refused_before_anything_is_solved():
-    T = ltcl.Transport(SCENE.T, GRID, device="there is no such device")
-    with pytest.raises(InputError, match=r"loss is 1e-12, .* float32 .* it must be at least 1e-06"):
-        ltcl.compensate(T, np.ones(GRID), gain="auto", loss=1e-12)
-
-
 def test_the_least_loss_that_is_allowed(T):
     desired = within_reach(1)[0]
     u = np.linalg.solve(SCENE.T, desired.ravel())
@@ -141,13 +134,6 @@ def test_a_picture_out_of_reach_at_any_gain(T):
         ltcl.compensate(T, desired, gain="auto", loss=0.05)
 
 
-def test_a_room_brighter_than_every_picture(T):
-    """A flat background has no place in a picture of stripes: too dim is as wrong as too bright."""
-    desired, background = np.tile([1.0, 0.0, 1.0, 0.0, 1.0], (3, 1)), np.full(GRID, 5.0)
-    with pytest.raises(InputError, match=r"no gain brings the picture within a loss of 0.1"):
-        ltcl.compensate(T, desired, background=background, gain="auto", loss=0.1)
-
-
 def test_weights_allow_a_larger_gain(T):
     """Where one bright pixel does not matter, it does not hold the others back."""
     desired = within_reach(1)[0]
@@ -157,20 +143,6 @@ def test_weights_allow_a_larger_gain(T):
     held, free = (ltcl.compensate(T, desired, gain="auto", loss=0.02, weights=w) for w in (None, weights))
     assert free.gain > 1.2 * held.gain
     assert free.error <= 0.02 * (1 + 1e-4)
-
-
-def test_a_rectangular_T(device):
-    matrix = random.uniform(0, 1, (28, N))
-    T = ltcl.Transport(matrix, GRID, camera_grid=(4, 7), device=device)
-    pattern = random.uniform(0.2, 0.5, N)
-    c = ltcl.compensate(T, (matrix @ pattern).reshape(4, 7), gain="auto", loss=0.01)
-    errors = [
-        np.sqrt(2 * lsq_linear(matrix, g * matrix @ pattern, (0, 1), tol=1e-14).cost)
-        / np.linalg.norm(g * matrix @ pattern)
-        for g in (c.gain, 1.03 * c.gain)
-    ]
-    assert errors[0] <= 0.01 < errors[1]
-    assert c.gain > 1.0 / pattern.max()
 
 
 @pytest.mark.parametrize("desired", [np.zeros(GRID), -np.ones(GRID)])
@@ -195,3 +167,23 @@ def test_masked_pixels_and_colours_of_their_own(device):
     np.testing.assert_allclose(c.pattern.reshape(N, 3), c.gain * pattern, atol=1e-3)
     assert not c.out_of_reach.any()
     assert c.error < 1e-3
+
+
+@pytest.mark.parametrize("loss", [None, 1e-3, 0.05])
+@pytest.mark.parametrize("camera", [(2, 5), (5, 7), (6, 7)])
+def test_fewer_and_more_camera_than_projector_pixels(device, camera, loss):
+    """Many patterns make one picture, so that certificates take thousands of steps on the device."""
+    rng = np.random.default_rng(119)
+    matrix = rng.normal(size=(camera[0] * camera[1], 36))
+    T = ltcl.Transport(matrix, (6, 6), camera_grid=camera, device=device)
+    desired = (rng.uniform(0.2, 0.9, (2, 36)) @ matrix.T).reshape(2, *camera)
+    c = ltcl.compensate(T, desired, gain="auto", loss=loss)
+    assert c.limited[0].products < 400  # 8000, and up to 40 s, where the device does it all
+    allowed = 1e-2 if loss is None else loss
+    least = [
+        np.sqrt(sum(2 * lsq_linear(matrix, g * d.ravel(), (0, 1), tol=1e-14).cost for d in desired))
+        / (g * np.linalg.norm(desired))
+        for g in (c.gain, 1.03 * c.gain)
+    ]
+    assert least[0] <= c.error <= allowed * (1 + 1e-4)
+    assert least[1] > allowed * 0.999

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Rows of whatever holds a matrix, and of R = T F^-1 - I."""
+"""`ltcl.compress` of rows from wherever they come, with and without room on the host."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,116 +11,146 @@ import scipy.sparse
 import scipy.sparse.linalg
 import zarr
 
+import ltcl
 from ltcl import checks
-from ltcl.compression import sources
-from ltcl.compression.sources import Interreflection, source
+from ltcl.compression import RowSource
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.operators import CSR, Dense, interreflections
-from tests import gallery
+from ltcl.operators import CSR, Dense
+from tests.compression.helpers import dense_systems, smooth, spilled, worst_error
 
-MATRIX = gallery.signed(40, 23)
+SUM = "db2 + pixels"
+
+
+@pytest.fixture(scope="module")
+def corner() -> ltcl.Transport:
+    return ltcl.scenes.dihedral(8, albedo=0.8).transport()
 
 
 class Rows:
-    shape = MATRIX.shape
+    """Rows of a matrix, of so many columns, and so many more than were asked for."""
+
+    def __init__(
+        self, matrix: Any = None, columns: int = 128, more: int = 0, shape: Any = (128, 128)
+    ) -> None:
+        self.matrix = np.eye(128) if matrix is None else matrix
+        self.columns, self.more, self.shape = columns, more, shape
 
     def rows(self, start: int, stop: int) -> np.ndarray:
-        return MATRIX[start:stop]
+        return self.matrix[start : stop + self.more, : self.columns]
 
 
-def _file(tmp_path) -> np.memmap:
-    path = tmp_path / "matrix.npy"
-    np.save(path, MATRIX)
-    return np.load(path, mmap_mode="r")
+def mapped(matrix, folder):
+    np.save(folder / "T.npy", matrix)
+    return np.load(folder / "T.npy", mmap_mode="r")
 
 
-def _chunked(tmp_path):
-    array = zarr.create_array(tmp_path / "matrix.zarr", shape=MATRIX.shape, chunks=(7, 5), dtype="f4")
-    array[:] = MATRIX
+def chunked(matrix, folder):
+    array = zarr.create_array(folder / "T.zarr", shape=matrix.shape, chunks=(7, 5), dtype=matrix.dtype)
+    array[:] = matrix
     return array
 
 
 HOLDERS = {
-    "array": lambda path: MATRIX,
-    "file": _file,
-    "zarr": _chunked,
-    "csr": lambda path: scipy.sparse.csr_array(MATRIX),
-    "csc": lambda path: scipy.sparse.csc_matrix(MATRIX),
-    "rows": lambda path: Rows(),
-    "linear operator": lambda path: scipy.sparse.linalg.aslinearoperator(MATRIX),
+    "array": lambda matrix, folder: matrix,
+    "file": mapped,
+    "zarr": chunked,
+    "csc": lambda matrix, folder: scipy.sparse.csc_matrix(matrix),
+    "rows": lambda matrix, folder: Rows(matrix),
+}
+OPERATORS = {
+    "SciPy's": lambda matrix, device: scipy.sparse.linalg.aslinearoperator(matrix),
+    "dense": lambda matrix, device: Dense(device, matrix),
+    "csr": lambda matrix, device: CSR(device, scipy.sparse.csr_array(matrix)),
 }
 
 
 @pytest.mark.parametrize("kind", HOLDERS)
-def test_rows_of(kind, tmp_path):
-    rows = source("T", HOLDERS[kind](tmp_path))
-    assert rows.shape == MATRIX.shape
-    for start, stop in ((0, 40), (0, 1), (13, 30), (39, 40)):
-        np.testing.assert_array_equal(rows.rows(start, stop), MATRIX[start:stop])
+def test_rows_from_elsewhere_give_the_same_bits(kind, corner, tmp_path):
+    held = HOLDERS[kind](corner.matrices[0], tmp_path)
+    least = 32 * 128 * 16  # bytes of the smallest block
+    whole, blocks = (
+        ltcl.compress(held, 0.02, basis="db2", grid=corner.grid, memory=memory) for memory in (None, least)
+    )
+    kept = ltcl.compress(corner, 0.02, basis="db2")
+    for streamed in (whole, blocks):
+        np.testing.assert_array_equal(kept.systems[0].R.to_dense(), streamed.systems[0].R.to_dense())
+        np.testing.assert_array_equal(kept.first_bounce, streamed.first_bounce)
+    assert isinstance(Rows(), RowSource)
 
 
-@pytest.mark.parametrize("kind", [Dense, CSR])
-def test_rows_of_an_operator_on_the_device(device, kind):
-    A = kind(device, scipy.sparse.csr_array(MATRIX) if kind is CSR else MATRIX)
-    np.testing.assert_array_equal(source("T", A).rows(5, 17), MATRIX[5:17])
+@pytest.mark.parametrize("kind", OPERATORS)
+def test_operators_give_their_rows_by_products(kind, corner, device):
+    operator = OPERATORS[kind](corner.matrices[0], device)
+    F = corner.first_bounce if kind == "SciPy's" else None
+    C = ltcl.compress(operator, 0.05, basis="db2", grid=corner.grid, first_bounce=F)
+    np.testing.assert_allclose(C.first_bounce, corner.first_bounce, rtol=1e-6)
+    assert worst_error(dense_systems(corner)[0], C.systems[0].to_dense()) <= C.error <= 0.05
 
 
-@pytest.mark.parametrize("masked", [[], [0, 11]])
-def test_rows_of_R_are_those_on_the_device(device, masked):
-    T, F = np.abs(gallery.signed(30, 30)), np.full(30, 0.7)
-    F[masked] = 0.0
-    R = Interreflection(source("T", T), F)
-    (S,) = interreflections([T], F[None], device)
-    np.testing.assert_array_equal(np.vstack([R.rows(0, 13), R.rows(13, 30)]), S.R.to_dense())
+def test_three_channels_of_rows():
+    T = ltcl.scenes.dihedral(4, albedo=(0.8, 0.5, 0.2)).transport()
+    C = ltcl.compress(list(T.matrices), 0.02, basis="haar", grid=T.grid)
+    for S, found in zip(dense_systems(T), C.systems, strict=True):
+        assert worst_error(S, found.to_dense()) <= C.error <= 0.02
 
 
-def test_bad_rows_are_refused_by_number():
-    class Broken:
-        shape = (4, 4)
-
-        def rows(self, start: int, stop: int) -> np.ndarray:
-            return np.full((stop - start, 4), np.nan) if start else np.ones((stop - start, 3))
-
-    R = Interreflection(source("T", Broken()), np.ones(4))
-    with pytest.raises(InputError, match=r"T in rows 2 to 3 has 8 NaN"):
-        R.rows(2, 4)
-    with pytest.raises(InputError, match=r"T\.rows\(0, 2\) gave shape \(2, 3\); it must be \(2, 4\)"):
-        R.rows(0, 2)
+@pytest.mark.parametrize("basis", ["db2", "db2 rows", "pixels"])
+def test_rows_may_be_dropped_where_no_memory_holds_them(basis, monkeypatch):
+    T = ltcl.scenes.dihedral(16, albedo=0.8).transport()
+    assert T.systems  # before there is no memory left
+    monkeypatch.setattr(checks, "host_memory", lambda: 1 << 20)  # half of it for 512 x 512 numbers
+    rtol = {"db2": 0.05, "db2 rows": 0.2, "pixels": 0.6}[basis]
+    C = ltcl.compress(T, rtol, basis=basis, memory=1 << 20)
+    monkeypatch.undo()
+    assert worst_error(dense_systems(T)[0], C.systems[0].to_dense()) <= C.error <= rtol
 
 
-@pytest.mark.parametrize("wrong", ["text", 3.0, None])
-def test_what_has_no_rows_is_refused(wrong):
-    with pytest.raises(InputTypeError, match="T is a"):
-        source("T", wrong)
+def test_bases_are_compared_in_the_middle_of_a_large_picture():
+    S = np.eye(512) + smooth((4, 128))
+    T = ltcl.Transport(S, (4, 128), first_bounce=np.ones(512))
+    C = ltcl.compress(T, 0.02)
+    assert C.compression.window == (4, 64)
+    assert len(C.compression.channels[0].trials) == 5
+    assert worst_error(S, C.systems[0].to_dense()) <= C.error <= 0.02
 
 
-def test_other_dimensions_are_refused():
-    with pytest.raises(InputError, match=r"T has shape \(2, 3, 4\)"):
-        source("T", np.zeros((2, 3, 4)))
-    with pytest.raises(InputTypeError, match="T holds complex128"):
-        source("T", np.zeros((2, 3), complex))
+def test_without_room_on_the_host_a_sum_is_left_or_refused(monkeypatch):
+    T = spilled(8, 0.1)
+    assert T.systems
+    monkeypatch.setattr(checks, "host_memory", lambda: 300_000)  # 4 of 128 x 128 numbers
+    (channel,) = ltcl.compress(T, 0.1, basis=["haar", SUM]).compression.channels
+    assert channel.basis == "haar"
+    assert "128 pixels" in channel.trials[1].left
+    with pytest.raises(MemoryLimitError, match="128 pixels"):
+        ltcl.compress(T, 0.1, basis=SUM)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (53, 7), (7, 53)])
-def test_the_difference_of_two_sources(shape):
-    A, B = gallery.signed(*shape), gallery.signed(*shape, seed=1)
-    found = sources.difference(source("A", A), source("B", B), memory=32 * shape[1] * 16)
-    wanted = np.linalg.norm(A.astype(np.float64) - B)
-    assert found == pytest.approx(wanted, rel=1e-12)
+@pytest.mark.parametrize("first_bounce", [None, np.ones(128)])
+@pytest.mark.parametrize(
+    ("rows", "kind", "words"),
+    [
+        (Rows(columns=3), InputError, r"T.*\(1, 3\).* \(1, 128\)"),
+        (Rows(more=1), InputError, r"T.*\(2, 128\).* \(1, 128\)"),
+        (Rows(np.eye(128) * 1j), InputTypeError, r"T.*complex128"),
+        (Rows(shape=128), InputError, "T has shape 128"),
+        (Rows(np.diag([np.nan] * 128)), InputError, "NaN"),
+        ([np.eye(128)] * 2, InputError, "T has 2 channels"),
+        (np.eye(128)[:, :5], InputError, r"T has shape \(128, 5\)"),
+        (np.zeros((2, 3, 4)), InputError, r"T has shape \(2, 3, 4\)"),
+        ("T.npz", InputTypeError, "T is a str"),
+    ],
+)
+def test_rows_must_be_what_the_shape_says(rows, kind, words, first_bounce):
+    with pytest.raises(kind, match=words):
+        ltcl.compress(rows, grid=(8, 16), first_bounce=first_bounce)
 
 
-def test_an_operator_without_transpose_is_refused():
-    class Half(scipy.sparse.linalg.LinearOperator):
-        def _matvec(self, x: np.ndarray) -> np.ndarray:
-            return x
-
-    with pytest.raises(InputError, match="without rmatvec"):
-        source("T", Half(np.float64, (3, 3))).rows(0, 1)
-
-
-def test_blocks_fit_into_memory(monkeypatch):
-    assert sources.at_once(100, 32 * 100 * 50) == 48
-    with pytest.raises(MemoryLimitError, match="blocks of 16 rows of 100 values need 50 KiB"):
-        sources.at_once(100, 32 * 100 * 15)
-    monkeypatch.setattr(checks, "host_memory", lambda: 4 * 32 * 100 * 16)
-    assert sources.at_once(100) == 16
+@pytest.mark.parametrize("first_bounce", [None, np.arange(128) != 2])
+def test_dark_pixels_and_operators_without_a_transpose_are_refused(first_bounce):
+    rows = np.eye(128) * (np.arange(128) != 2)
+    with pytest.raises(InputError, match=r"first_bounce .* 1 of 128 pixels, the first 2"):
+        ltcl.compress(rows, grid=(8, 16), first_bounce=first_bounce)
+    parts: dict[str, Any] = {"shape": (128, 128), "matvec": lambda x: x, "dtype": float}
+    half = scipy.sparse.linalg.LinearOperator(**parts)
+    with pytest.raises(InputError, match="rmatvec"):
+        ltcl.compress(half, grid=(8, 16), first_bounce=np.ones(128))

@@ -28,29 +28,10 @@ def test_strided_and_other_types_are_converted(device):
         np.testing.assert_array_equal(device.upload(view).get(), view.astype(np.float32))
 
 
-def test_copies_are_independent(device):
-    first = device.upload([1.0, 2.0])
-    second = first.copy()
-    first.set(np.zeros(2))
-    assert second.get().tolist() == [1.0, 2.0]
-
-
-def test_other_shapes_are_refused(device):
-    array = device.empty((3, 2))
-    with pytest.raises(InputError, match=r"values have shape \(6,\); the array on the device has \(3, 2\)"):
-        array.set(np.zeros(6))
-    with pytest.raises(InputError, match=r"cannot copy an array of shape \(2, 3\) into one of \(3, 2\)"):
-        array.copy_from(device.empty((2, 3)))
-
-
-@pytest.mark.parametrize("value", [1e39, -1e300])
-def test_numbers_beyond_float32_are_refused_instead_of_made_infinite(device, value):
-    for act in (lambda: device.upload([value]), lambda: device.empty(1).set(np.array([value]))):
-        with pytest.raises(InputError, match="a value is beyond float32"):
+def test_numbers_beyond_float32_are_refused_and_others_pass(device):
+    for act in (lambda: device.upload([1e39]), lambda: device.empty(1).set(np.array([-1e300]))):
+        with pytest.raises(InputError, match="float32"):
             act()
-
-
-def test_infinite_and_tiny_numbers_pass(device):
     values = np.array([np.inf, -np.inf, np.nan, 1e-45, 3.4e38])
     np.testing.assert_array_equal(device.upload(values).get(), values.astype(np.float32))
 
@@ -65,7 +46,15 @@ def test_rows_are_copied_out_and_in(device, tail):
     values[4:7] = values[2:5].copy()
     np.testing.assert_array_equal(x.get(), values)
     assert x.rows(7, 0).shape == (0, *tail)
-    with pytest.raises(InputError, match="rows 5 to 8 are not among 7"):
-        x.rows(5, 3)
-    with pytest.raises(InputError, match="rows 5 on of an array of shape"):
-        x.set_rows(5, part)
+
+
+def test_what_does_not_fit_is_refused(device):
+    x = device.empty((3, 2))
+    for act, match in (
+        (lambda: x.set(np.zeros(6)), r"\(6,\).*\(3, 2\)"),
+        (lambda: x.copy_from(device.empty((2, 3))), r"\(2, 3\).*\(3, 2\)"),
+        (lambda: x.rows(2, 2), "2 to 4 .*3"),
+        (lambda: x.set_rows(2, x), "rows 2"),
+    ):
+        with pytest.raises(InputError, match=match):
+            act()

@@ -11,7 +11,7 @@ import pytest
 
 import ltcl
 from ltcl.device import discovery
-from ltcl.device.description import Description
+from ltcl.device.discovery import Description
 from ltcl.errors import DeviceError, InputTypeError
 
 
@@ -32,14 +32,9 @@ ALL = [BIG, LITTLE, STRANGE, NEWER, NEW, OLD, SIMULATOR]  # the best first
 def test_ranking():
     shuffled = [ALL[i] for i in (3, 0, 6, 2, 5, 1, 4)]
     assert sorted(shuffled, key=lambda device: device.rank) == ALL
-
-
-@pytest.mark.parametrize(
-    ("older", "newer"), [("3.0-rc2", "3.1+debian"), ("3.0", "3.0.1"), ("9.2", "10.0"), ("none", "0.1")]
-)
-def test_newer_drivers_come_first(older, newer):
-    devices = [describe(f"{i}:0", "cpu", "cpu", f"PoCL {driver}") for i, driver in enumerate((older, newer))]
-    assert min(devices, key=lambda device: device.rank).driver == f"PoCL {newer}"
+    drivers = ["none", "0.1", "3.0-rc2", "3.0.1", "3.1+debian", "9.2", "10.0"]  # the newest last
+    devices = [describe("0:0", "cpu", "cpu", f"PoCL {driver}") for driver in drivers]
+    assert sorted(devices, key=lambda device: device.rank) == devices[::-1]
 
 
 @pytest.mark.parametrize(
@@ -62,16 +57,12 @@ def test_selection(select, found):
     assert discovery.choose(ALL, select) is found
 
 
-@pytest.mark.parametrize("select", ["9:0", "tpu"])
+@pytest.mark.parametrize("select", ["9:0", "tpu", "cpu"])
 def test_selection_of_nothing_lists_what_there_is(select):
-    with pytest.raises(DeviceError, match=f"device is '{select}'; it must be gpu, cpu") as error:
+    with pytest.raises(DeviceError, match=f"'{select}'") as error:
         discovery.choose([BIG, SIMULATOR], select)
-    assert "4:1 Radeon (gpu); 0:0 Oclgrind Simulator (simulator)" in str(error.value)
-
-
-def test_a_kind_that_is_missing_is_said():
-    with pytest.raises(DeviceError, match=r"^no cpu here; there are: 4:1 Radeon \(gpu\)$"):
-        discovery.choose([BIG], "cpu")
+    assert "4:1 Radeon" in str(error.value)
+    assert "0:0 Oclgrind" in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -85,25 +76,22 @@ def test_a_kind_that_is_missing_is_said():
 )
 def test_no_device_at_all_tells_the_fix_of_the_system(monkeypatch, system, fix):
     monkeypatch.setattr(sys, "platform", system)
-    for name in discovery._HIDING:
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(DeviceError, match=r"^no OpenCL device was found; install a driver: ") as error:
+    with pytest.raises(DeviceError, match="no OpenCL device") as error:
         discovery.choose([], "gpu")
     assert fix in str(error.value)
 
 
-def test_no_device_at_all_names_the_variables_that_may_hide_it(monkeypatch):
+def test_no_device_at_all_names_what_may_hide_it(monkeypatch, tmp_path):
+    (tmp_path / "home").touch()  # a file: PoCL can make no cache in it
+    monkeypatch.delenv("POCL_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home" / "cache"))
     monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
-    monkeypatch.setenv("POCL_CACHE_DIR", "/somewhere/ltcl-abc")  # our own
-    monkeypatch.delenv("OCL_ICD_FILENAMES", raising=False)
-    with pytest.raises(
-        DeviceError, match="found with OCL_ICD_VENDORS=/nowhere; unset that, or install a driver"
-    ):
+    with pytest.raises(DeviceError, match=r"OCL_ICD_VENDORS=/nowhere.*POCL_CACHE_DIR.*home"):
         discovery.choose([], None)
 
 
 def test_simulator_is_never_taken_unasked():
-    with pytest.raises(DeviceError, match=r"only a simulator was found; name it \(Oclgrind Simulator\)"):
+    with pytest.raises(DeviceError, match="Oclgrind Simulator"):
         discovery.choose([SIMULATOR], None)
 
 
@@ -112,7 +100,7 @@ def test_environment_names_the_default(device, monkeypatch):
     assert ltcl.open_device() is device
     assert ltcl.open_device("") is device
     monkeypatch.setenv("LTCL_DEVICE", "no such device")
-    with pytest.raises(DeviceError, match="device is 'no such device'"):
+    with pytest.raises(DeviceError, match="no such device"):
         ltcl.open_device()
     assert ltcl.open_device(device.description.index) is device  # an argument overrides it
 
@@ -124,7 +112,7 @@ def test_a_device_is_opened_once(device):
 
 
 def test_other_types_are_refused():
-    with pytest.raises(InputTypeError, match="device is 0; it must be a Device, a name or an index"):
+    with pytest.raises(InputTypeError, match="device is 0"):
         ltcl.open_device(0)  # pyright: ignore[reportArgumentType]
 
 

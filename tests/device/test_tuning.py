@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The fastest of several variants is found by timing, remembered, and survives spoilt memory."""
+"""What is timed once per device and remembered: the fastest variant, machine speeds."""
 
 from __future__ import annotations
 
 import json
+import os
+import stat
 
 import pytest
 
-from ltcl.device import cache, tuning
+from ltcl.device import tuning
 from ltcl.errors import DeviceError, MemoryLimitError
 
 
 class Race:
-    """Variants that take as long as told, on a clock of their own."""
+    """Variants that take as long as they are set to, on a clock of their own."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **seconds: float | Exception) -> None:
         self.now = 0.0
@@ -28,18 +30,26 @@ class Race:
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("LTCL_CACHE", str(tmp_path))
+def folder(tmp_path, monkeypatch):
+    """The cache folder, which is not there yet."""
+    monkeypatch.setenv("LTCL_CACHE", str(tmp_path / "a" / "cache"))
     monkeypatch.delenv("LTCL_TUNE", raising=False)
+    return tmp_path / "a" / "cache"
 
 
-def test_the_fastest_is_found_and_remembered(device, monkeypatch, tmp_path):
+@pytest.fixture
+def hardware(device, monkeypatch):
+    """The device as one whose speed means something."""
+    monkeypatch.setattr(device, "kind", "cpu" if device.is_cpu else device.kind)
+    return device
+
+
+def test_the_fastest_is_chosen_and_remembered(device, monkeypatch):
     race = Race(monkeypatch, slow=2.0, fast=1.0, slower=3.0)
     assert tuning.choose(device, "csr", "k=1", race.variants) == "fast"
     race.launches.clear()
     assert tuning.choose(device, "csr", "k=1", race.variants) == "fast"
     assert race.launches == []
-    assert [file.name for file in tmp_path.iterdir()] == ["tuning.json"]
 
 
 @pytest.mark.parametrize(
@@ -68,19 +78,83 @@ def test_nothing_is_timed_where_there_is_no_choice(device, monkeypatch, tune):
 def test_a_variant_that_fails_is_left_out(device, monkeypatch, kind):
     race = Race(monkeypatch, broken=kind("no"), works=1.0)
     assert tuning.choose(device, "csr", "k=1", race.variants) == "works"
+    race = Race(monkeypatch, a=kind("no"), b=kind("no"))
+    with pytest.raises(DeviceError, match=r"kernels/csr\.cl"):
+        tuning.choose(device, "csr", "k=2", race.variants)
 
 
-def test_variants_that_all_fail_are_an_error(device, monkeypatch):
-    race = Race(monkeypatch, a=DeviceError("no"), b=DeviceError("no"))
-    with pytest.raises(DeviceError, match=r"no variant of kernels/csr\.cl runs on"):
-        tuning.choose(device, "csr", "k=1", race.variants)
+def test_seconds_are_measured_once_for_a_key(hardware, monkeypatch):
+    race = Race(monkeypatch, one=0.5, other=0.25, broken=DeviceError("no"))
+    assert [tuning.seconds(hardware, "a", race.variants["one"]) for _ in range(3)] == [0.5] * 3
+    assert tuning.seconds(hardware, "a", race.variants["other"]) == 0.5  # not asked
+    assert tuning.seconds(hardware, "b", race.variants["other"]) == 0.25
+    assert len(race.launches) < 20
+    with pytest.raises(DeviceError, match=r"\bc\b"):
+        tuning.seconds(hardware, "c", race.variants["broken"])
 
 
-@pytest.mark.parametrize("answer", ["gone", 7, None, ["fast"], {"fast": 1}])
-def test_a_spoilt_memory_is_measured_over(device, monkeypatch, tmp_path, answer):
+@pytest.mark.parametrize("answer", ["gone", 7, None, ["fast"], {}, 0.0, -1.0, float("nan"), float("inf")])
+def test_a_damaged_memory_is_measured_over(hardware, monkeypatch, folder, answer):
     race = Race(monkeypatch, slow=2.0, fast=1.0)
-    tuning.choose(device, "csr", "k=1", race.variants)
-    (key,) = json.loads((tmp_path / "tuning.json").read_text())
-    cache.remember("tuning.json", key, answer)
-    assert tuning.choose(device, "csr", "k=1", race.variants) == "fast"
-    assert cache.recall("tuning.json", key) == "fast"
+    for measure, wanted in (
+        (lambda: tuning.choose(hardware, "csr", "k=1", race.variants), "fast"),
+        (lambda: tuning.seconds(hardware, "a", race.variants["fast"]), 1.0),
+    ):
+        measure()
+        (key,) = json.loads((folder / "tuning.json").read_text())
+        tuning.remember(key, answer)
+        assert measure() == wanted == tuning.recall(key)
+        (folder / "tuning.json").unlink()
+
+
+@pytest.mark.parametrize("speed", [tuning.bandwidth, lambda _: tuning.factorization_flops()])
+def test_speeds_of_the_machine_are_remembered(device, speed):
+    measured = speed(device)
+    assert 1e6 < measured < 1e16
+    assert speed(device) == measured
+
+
+def test_without_tuning_speeds_are_constants(device, monkeypatch, folder):
+    monkeypatch.setenv("LTCL_TUNE", "0")
+    assert tuning.seconds(device, "a", pytest.fail) == tuning.SECONDS
+    assert tuning.seconds(device, "a", pytest.fail, default=3.0) == 3.0
+    assert tuning.bandwidth(device) == pytest.approx(tuning.BANDWIDTH[device.is_cpu])
+    assert tuning.factorization_flops() == pytest.approx(tuning.FLOPS)
+    assert not folder.exists()
+
+
+def test_what_was_remembered_is_recalled_and_nothing_else_is_written(folder):
+    assert tuning.recall("key") is None
+    for key, value in (("key", ["a", 1]), ("other", None), ("key", ["b"])):
+        tuning.remember(key, value)
+    assert tuning.recall("key") == ["b"]
+    assert json.loads((folder / "tuning.json").read_text()) == {"key": ["b"], "other": None}
+    assert [file.name for file in folder.iterdir()] == ["tuning.json"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes are POSIX's")
+def test_a_new_folder_is_private_and_an_old_one_keeps_its_mode(folder):
+    tuning.remember("key", 1)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert stat.S_IMODE((folder / "tuning.json").stat().st_mode) == 0o600
+    folder.chmod(0o755)
+    tuning.remember("key", 2)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o755
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'"key"', b"\xff\xfe\0", b"null"])
+def test_a_spoilt_file_is_as_good_as_none(folder, content):
+    tuning.remember("key", 1)
+    (folder / "tuning.json").write_bytes(content)
+    assert tuning.recall("key") is None
+    tuning.remember("key", 2)
+    assert tuning.recall("key") == 2
+
+
+def test_an_unwritable_place_is_no_error(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("LTCL_CACHE", str(tmp_path / "file" / "cache"))
+    tuning.remember("key", 1)
+    assert tuning.recall("key") is None
+    monkeypatch.delenv("LTCL_CACHE")
+    assert "ltcl" in tuning.folder().parts[-1]

@@ -10,20 +10,27 @@ import pytest
 
 from ltcl.device import Array, Device
 from ltcl.operators import Operator
-from ltcl.operators.rows import Launch, RowOperator
+from ltcl.operators.rows import RowOperator, Variant
 from tests import gallery, reference
 
 COLUMNS = (None, 1, 2, 3, 5, 6, 8, 11)  # None: (N,), not (N, 1)
+# scale, what is added and how often, shift (of square operators)
 EPILOGUES = {
-    "plain": (1.0, None),
-    "scaled": (-0.75, None),
-    "added": (0.5, "other"),
-    "onto itself": (-1.0, "out"),
+    "plain": (1.0, None, 1.0, 0.0),
+    "scaled": (-0.75, None, 1.0, 0.0),
+    "added": (0.5, "other", 1.0, 0.0),
+    "onto itself": (-1.0, "out", 1.0, 0.0),
+    "all": (0.5, "other", -2.0, 0.75),
+    "all onto itself": (-1.0, "out", 0.5, 1.0),
 }
-# How a product may be launched: end of the kernel's name and items that share a row.
-LAUNCHES = {"item": ("", 0), "stream": ("_stream", 0)} | {
-    f"group{items}": ("_group", items)
-    for items in (7, 32, 64, 128)  # sums in trees work for any size
+# How a product may be launched on CPUs and GPUs.
+LAUNCHES = {
+    "item": Variant("", 16, shared=False),
+    "item64": Variant("", 64, shared=False),
+    "stream": Variant("_stream", 16, shared=False),
+} | {
+    f"group{items}": Variant("_group", items, shared=True)
+    for items in (7, 32, 64, 128, 256)  # sums in trees work for any size
 }
 Twin = Callable[..., np.ndarray]
 
@@ -38,12 +45,18 @@ def meets_twin(A: Operator, matrix: np.ndarray, twin: Twin | None = None, *, tra
     apply = A.apply_transpose if transpose else A.apply
     for k in COLUMNS:
         x = gallery.vectors(matrix.shape[1], k)
-        for scale, kind in EPILOGUES.values():
+        for scale, kind, add_scale, shift in EPILOGUES.values():
+            shift = shift if matrix.shape[0] == matrix.shape[1] else 0.0
             add, out = operands(A, gallery.vectors(matrix.shape[0], k, 2), kind)
-            expected_add = None if add is None else add.get()
-            assert apply(A.device.upload(x), out, scale=scale, add=add) is out
-            expected = twin(x, scale, expected_add)
-            close(out.get(), expected, reference.product_error(matrix, x, scale, expected_add))
+            terms = [] if add is None else [add_scale * add.get().astype(np.float64)]
+            terms += [shift * x.astype(np.float64)] if shift else []
+            total = sum(terms[1:], terms[0]) if terms else None
+            numbers = {"scale": scale, "add_scale": add_scale, "shift": shift}
+            assert apply(A.device.upload(x), out, add=add, **numbers) is out
+            magnitudes: list[np.ndarray] = [np.abs(term) for term in terms]
+            sizes = sum(magnitudes[1:], magnitudes[0]) if magnitudes else None
+            error = reference.product_error(matrix, x, scale, sizes)
+            close(out.get(), twin(x, scale, total), error)
 
 
 def operands(A: Operator, values: np.ndarray, kind: str | None) -> tuple[Array | None, Array]:
@@ -82,19 +95,30 @@ def same_rows(device: Device, a: np.ndarray, b: np.ndarray, error: np.ndarray) -
         same_bits(a, b)
 
 
-def norms_match(A: Operator, matrix: np.ndarray, rel: float) -> None:
-    norms = A.norms()
-    assert norms.one == pytest.approx(np.linalg.norm(matrix, 1), rel=rel)
-    assert norms.inf == pytest.approx(np.linalg.norm(matrix, np.inf), rel=rel)
-    assert norms.frobenius == pytest.approx(np.linalg.norm(matrix, "fro"), rel=rel)
-    assert norms.lowest == pytest.approx(min(float(matrix.min(initial=0.0)), 0.0), rel=rel)
-
-
 def force(monkeypatch: pytest.MonkeyPatch, A: RowOperator, name: str) -> None:
     """Let A run all its products as `name` says; small operators take the first variant unasked."""
-    suffix, group = LAUNCHES[name]
+    monkeypatch.setattr(A, "variants", lambda: {name: LAUNCHES[name]})
 
-    def variants(width: int, columns: int) -> dict[str, Launch]:
-        return {name: Launch(A.kernel(f"{A.file}_matvec{suffix}", width, columns), group)}
 
-    monkeypatch.setattr(A, "variants", variants)
+def steps_match(S: Operator, matrix: np.ndarray, columns: tuple[int | None, ...] = COLUMNS) -> None:
+    """Assert that steps of S are those of `matrix` in float64 to rounding, norms of residuals included."""
+    n = len(matrix)
+    for k in columns:
+        x, r = gallery.vectors(n, k, 7).astype(np.float64), gallery.vectors(n, k, 8).astype(np.float64)
+        on_device = S.device.upload(x), S.device.upload(r)
+        stepper = S.stepper(*on_device)
+        stepper.start(0.5)
+        d, norms = 0.5 * r, []
+        for keep, gain in ((0.0, 1.0), (0.25, 0.5), (-0.5, 0.75)):
+            stepper.step(keep, gain)
+            x, r = x + d, r - matrix @ d
+            d = keep * d + gain * r
+            norms.append(np.atleast_1d(np.linalg.norm(r, axis=0)))
+        assert stepper.waiting == 3
+        scale = (
+            1e-5 * (1.0 + np.abs(matrix).sum(axis=1).max()) ** 3 * (1.0 + np.abs(gallery.vectors(n, k)).max())
+        )
+        for array, expected in zip((*on_device, stepper.d), (x, r, d), strict=True):
+            np.testing.assert_allclose(array.get(), expected, atol=scale)
+        np.testing.assert_allclose(stepper.norms(), norms, rtol=1e-4, atol=scale)
+        assert stepper.waiting == 0

@@ -13,14 +13,18 @@ from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import (
     CSR,
     Chained,
+    Compressed,
+    Coupled,
     Dense,
+    Epilogue,
     Host,
     IdentityPlus,
     Operator,
-    Ordered,
     Pyramid,
     ScaledColumns,
     Shifted,
+    SubsetBasis,
+    Sum,
     Wavelet,
     as_operator,
     base,
@@ -35,6 +39,29 @@ SCALES = gallery.vectors(7, None, 9)
 PICTURES = np.eye(30).reshape(5, 6, 30)  # of one lit pixel each
 DB2 = reference.wavelet_split_all(PICTURES, 3, wavelets.filters("db2")).reshape(30, 30)
 ORDER = np.random.default_rng(4).permutation(30)
+SUMS = reference.pyramid_gather(PICTURES)
+CORE, TALLER = gallery.sparse(30, 30), gallery.sparse(44, 44)
+C = CORE.toarray()
+BLOCKS = [[gallery.signed(7, 5, 3 * c + j) for j in range(3)] for c in range(3)]
+MIXING = np.array([[1.0, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.0, 0.1, 1.1]])
+
+
+def between(device, out, into):
+    """C between bases that are named, pixels where None."""
+    bases = {
+        "db2": Wavelet(device, (5, 6)),
+        "order": SubsetBasis(device, (5, 6), ORDER),
+        "some": Chained(SubsetBasis(device, (5, 6), ORDER[:9]), Wavelet(device, (5, 6))),
+        "sums": Pyramid(device, (5, 6)),
+        None: None,
+    }
+    sizes = [30 if name is None else bases[name].shape[0] for name in (out, into)]
+    return Compressed(CSR(device, TALLER[: sizes[0]][:, : sizes[1]]), bases[out], bases[into])
+
+
+def coupled(device, blocks, mixing):
+    return Coupled([[Dense(device, block) for block in row] for row in blocks], mixing)
+
 
 # An operator and the float64 matrix it stands for; all are kept well scaled, so that one bound serves all.
 OPERATORS = {
@@ -57,11 +84,32 @@ OPERATORS = {
     "I + transposed": (lambda device: IdentityPlus(Dense(device, SQUARE).T), np.eye(53) + SQUARE.T),
     "I + (A - I)": (lambda device: IdentityPlus(Shifted(Dense(device, SQUARE))), SQUARE),
     "wavelet": (lambda device: Wavelet(device, (5, 6), "db2"), DB2),
-    "order": (lambda device: Ordered(device, (5, 6), ORDER), np.eye(30)[ORDER]),
-    "pyramid": (lambda device: Pyramid(device, (5, 6)), reference.pyramid_gather(PICTURES)),
+    "order": (lambda device: SubsetBasis(device, (5, 6), ORDER), np.eye(30)[ORDER]),
+    "pyramid": (lambda device: Pyramid(device, (5, 6)), SUMS),
     "wavelet and order": (
-        lambda device: Chained(Ordered(device, (5, 6), ORDER), Wavelet(device, (5, 6))),
+        lambda device: Chained(SubsetBasis(device, (5, 6), ORDER), Wavelet(device, (5, 6))),
         DB2[ORDER],
+    ),
+    "sum": (lambda device: Sum(CSR(device, CORE), Dense(device, C.T)), C + C.T),
+    "both sides": (lambda device: between(device, "db2", "db2"), DB2.T @ TALLER.toarray()[:30, :30] @ DB2),
+    "rows": (lambda device: between(device, None, "db2"), TALLER.toarray()[:30, :30] @ DB2),
+    "columns": (lambda device: between(device, "db2", None), DB2.T @ TALLER.toarray()[:30, :30]),
+    "two bases": (
+        lambda device: between(device, "order", "db2"),
+        np.eye(30)[:, ORDER] @ TALLER.toarray()[:30, :30] @ DB2,
+    ),
+    "more than pixels": (lambda device: between(device, "sums", "sums"), SUMS.T @ TALLER @ SUMS),
+    "fewer than pixels": (
+        lambda device: between(device, "some", "some"),
+        DB2[ORDER[:9]].T @ TALLER.toarray()[:9, :9] @ DB2[ORDER[:9]],
+    ),
+    "coupled": (
+        lambda device: coupled(device, BLOCKS, MIXING),
+        np.block(BLOCKS).astype(np.float64) @ np.kron(MIXING, np.eye(5)),
+    ),
+    "mixed": (
+        lambda device: Coupled.mixed([Dense(device, SQUARE)] * 3, MIXING),
+        np.kron(MIXING, SQUARE.astype(np.float64)),
     ),
 }
 
@@ -76,6 +124,27 @@ def test_products_meet_their_twin(pair):
     A, matrix = pair
     helpers.meets_twin(A, matrix)
     helpers.meets_twin(A, matrix, transpose=True)
+
+
+def test_steps_meet_their_twin(pair):
+    A, matrix = pair
+    if matrix.shape[0] == matrix.shape[1]:
+        helpers.steps_match(A, matrix, (None, 1, 3, 11))
+
+
+def test_a_bound_product_reads_its_arrays_at_every_call(pair):
+    A, matrix = pair
+    x, y = gallery.vectors(A.shape[1], 3), gallery.vectors(A.shape[0], 3, 5)
+    for transpose, before, after, M in ((False, x, y, matrix), (True, y, x, matrix.T)):
+        operand, out = A.device.empty(before.shape), A.device.upload(after)
+        launch = A.bind(operand, out, Epilogue(0.5, -1.0, out), transpose=transpose)
+        operand.set(before)
+        launch()
+        expected = 0.5 * M @ before - after
+        helpers.close(out.get(), expected, reference.product_error(M, before, 0.5, after))
+        launch()  # adds to what the first has left
+        twice = 0.5 * M @ before - expected
+        helpers.close(out.get(), twice, 3 * reference.product_error(M, before, 1.5, after))
 
 
 def test_adjoint(pair):
@@ -114,7 +183,8 @@ def test_facts(pair):
     assert A.row_sums() is A.row_sums()
     # A column is one value times 1, plus what the identity brings: a few roundings.
     np.testing.assert_allclose(A.to_dense(), matrix, rtol=0, atol=8 * reference.UNIT * np.abs(matrix).max())
-    if not isinstance(A, Host | Wavelet | Chained):
+    silent = isinstance(A, Host | Wavelet | Chained) or (isinstance(A, Coupled) and A.shape[0] != A.shape[1])
+    if not silent:
         np.testing.assert_allclose(A.diagonal(), matrix.diagonal(), atol=4 * reference.UNIT)
 
 
@@ -134,13 +204,18 @@ def test_unfit_operands_are_refused(pair):
         (lambda: A.apply(x, device.empty((rows, 3))), "out has shape"),
         (lambda: A.apply(x, device.empty(rows)), "out has shape"),
         (lambda: A.apply(x, out, add=device.empty((rows, 1))), "add has shape"),
-        (lambda: A.apply(device.empty((columns, 2), np.float64)), "float64"),
+        (lambda: A.apply(device.empty((columns, 2), np.float64)), "x holds float64"),
         (lambda: A.apply(Device(device.description).empty(columns)), "another device"),
     ):
         with pytest.raises(InputError, match=part):
             bad()
     with pytest.raises(InputTypeError, match="real numbers"):
         A.matvec(np.full(columns, 1j))
+
+
+def test_a_shift_needs_a_square_operator(device):
+    with pytest.raises(InputError, match=r"shift is 2"):
+        Dense(device, TALL).apply(device.empty(7), shift=2.0)
 
 
 def test_product_over_its_own_operand_is_refused(device):

@@ -3,14 +3,32 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
 import numpy as np
 import pytest
+import scipy.sparse
 import scipy.sparse.linalg
 
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import Dense, Host, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators import (
+    CSR,
+    Compressed,
+    Coupled,
+    Dense,
+    Host,
+    IdentityPlus,
+    ScaledColumns,
+    Shifted,
+    Sum,
+    composed,
+)
 from tests import gallery
+from tests.bases import Given, rotation, two_sided
 from tests.operators import helpers
+
+N = 33
 
 
 class Plain(scipy.sparse.linalg.LinearOperator):
@@ -83,6 +101,11 @@ def test_host_operators_without_a_transpose_say_so(device):
     helpers.meets_twin(A, np.eye(3))
     with pytest.raises(InputError, match="Plain has no rmatvec"):
         A.rmatvec(np.ones(3))
+    known: dict[str, Any] = {"shape": (3, 3), "matvec": lambda x: 2.0 * x, "dtype": float}
+    for parts in ({}, {"matmat": lambda x: 2.0 * x}):  # SciPy's own TypeError, for several columns
+        own = scipy.sparse.linalg.LinearOperator(**known, **parts)
+        with pytest.raises(InputError, match="no rmatvec"):
+            Host(device, own).rmatmat(np.ones((3, 2)))
 
 
 def test_host_operators_are_asked_for_their_diagonal(device, monkeypatch):
@@ -109,3 +132,98 @@ def test_complex_host_operators_are_refused(device):
 def test_entries_that_cannot_be_seen_have_no_norms(device):
     with pytest.raises(InputError, match="cannot see its entries"):
         Host(device, Plain(np.eye(2))).norms()
+
+
+def test_one_pixel(device):
+    W = Given(device, np.array([[-1.0]]))
+    R = Compressed(Dense(device, [[0.5]]), W, W)
+    assert R.matmat(np.array([[2.0, 4.0]])).tolist() == [[1.0, 2.0]]
+
+
+def test_threads_share_an_operator(device):
+    R = two_sided(device, gallery.bounces(N, 0.5))
+    pictures = [gallery.vectors(N, 1 + seed % 3, seed) for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        for x, product in zip(pictures, pool.map(R.matmat, pictures), strict=True):
+            helpers.same_bits(product, R.matmat(x))
+
+
+def test_a_diagonal_of_many_pixels_has_to_be_told(device, monkeypatch):
+    monkeypatch.setattr(composed, "_FEW", N - 1)
+    R = two_sided(device, gallery.bounces(N, 0.5))
+    with pytest.raises(InputError, match=rf"{N} pixels.*diagonal="):
+        R.diagonal()
+    told = Compressed(R.core, R.out, R.into, diagonal=np.arange(N))
+    assert told.diagonal().tolist() == list(range(N))
+    assert len(Compressed(Dense(device, np.eye(N)), None, None).diagonal()) == N  # of pixels, at hand
+
+
+def test_parts_that_do_not_fit_are_refused(device, small_device):
+    W = Given(device, rotation(N))
+    tall = Given(device, gallery.signed(N + 1, N))
+    core = Dense(device, np.eye(N))
+    for make, kind, part in (
+        (lambda: Compressed(core, tall, W), InputError, rf"out has {N + 1} .* must have {N}"),
+        (lambda: Compressed(core, None, tall), InputError, rf"into has {N + 1} "),
+        (
+            lambda: Compressed(core, W, Given(small_device, np.eye(N))),
+            InputError,
+            "into is on another device",
+        ),
+        (lambda: Compressed(core, W, W, -1.0), InputError, "error is -1.0; it must be"),
+        (lambda: Compressed(core, W, W, np.nan), InputError, "error is nan"),
+        (lambda: Compressed(core, W, W, diagonal=np.ones(2)), InputError, r"diagonal has shape \(2,\)"),
+        (lambda: Compressed(core, W, W, diagonal=np.full(N, np.nan)), InputError, "diagonal has 33 NaN"),
+        (lambda: Compressed(core, W, W, diagonal=np.array(["a"] * N)), InputTypeError, "diagonal holds"),
+    ):
+        with pytest.raises(kind, match=part):
+            make()
+
+
+def test_an_error_of_coefficients_is_none_of_pixels_in_a_skew_basis(device):
+    tall = Given(device, gallery.signed(N, N))
+    core = Dense(device, np.eye(N))
+    core.error = 0.1
+    with pytest.raises(InputError, match=r"error is None.*it must be given"):
+        Compressed(core, tall, tall)
+    assert Compressed(core, tall, tall, 0.3).error == 0.3
+
+
+def test_sums_that_do_not_fit_are_refused(device, small_device):
+    A = CSR(device, scipy.sparse.csr_array(np.eye(3)))
+    for parts, part in (
+        ((), r"shapes \[\]"),
+        ((A, Dense(device, np.eye(2))), r"shapes \[\(2, 2\), \(3, 3\)\]"),
+        ((A, Dense(small_device, np.eye(3))), "several devices"),
+    ):
+        with pytest.raises(InputError, match=part):
+            Sum(*parts)
+
+
+@pytest.mark.parametrize("bad", [-1e-9, np.nan])
+def test_bad_errors_of_solutions_are_refused(device, bad):
+    with pytest.raises(InputError, match=r"solution_error is .*at least 0"):
+        IdentityPlus(Dense(device, np.eye(2)), solution_error=bad)
+
+
+def test_what_is_known_of_compressed_operators(device):
+    W, V = Given(device, rotation(N)), Given(device, rotation(N, 1))
+    tall, core = Given(device, gallery.signed(N + 12, N, 2) / 4), Dense(device, np.eye(N))
+    assert Compressed(core, W, W).two_sided
+    assert not any(
+        Compressed(core, *sides).two_sided for sides in ((None, None), (W, None), (None, W), (W, V))
+    )
+    assert not Compressed(Dense(device, np.eye(N + 12)), tall, tall).two_sided
+    assert Compressed(core, W, W).nbytes == core.nbytes + W.nbytes
+    assert Compressed(core, W, V).nbytes == core.nbytes + 2 * W.nbytes
+    assert Compressed(core, W, W).error == 0.0
+    core.error = 0.5
+    assert Compressed(core, W, None).error == 0.5
+    assert IdentityPlus(Compressed(core, W, W, 0.25)).error == Sum(core, core).error / 4 == 0.25
+
+
+def test_blocks_that_do_not_fit_are_refused(device):
+    a, b = Dense(device, gallery.signed(3, 3)), Dense(device, gallery.signed(3, 2))
+    for blocks in ([[a] * 3] * 2, [[a] * 2] * 3, [[a, a, b], [a] * 3, [a] * 3], [[None] * 3] * 3):
+        with pytest.raises(InputError, match="blocks"):
+            Coupled(blocks)

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Sweeps over rows: both parts of a launch meet their twins, whatever block, slabs and format."""
+"""Sweeps and steps over rows meet their twins as launched on CPUs and GPUs, whatever block and slabs."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse
 
+from ltcl.device import Device
 from ltcl.errors import InputError, MemoryLimitError
-from ltcl.operators import CSR, Dense, IdentityPlus, ScaledColumns, Shifted, blocks
-from ltcl.operators.blocks import Rows
-from ltcl.operators.relaxation import Relaxation, Sweep, block_relaxation, relaxation
+from ltcl.operators import CSR, Dense, IdentityPlus, ScaledColumns, Shifted
+from ltcl.operators.relaxation import Relaxation, Steps, Sweeps, readable, relaxation
 from tests import gallery, reference
+from tests.conftest import SMALL
 from tests.operators import helpers
 
 FORMATS = {"csr": lambda device, M: CSR(device, scipy.sparse.csr_array(M)), "dense": Dense}
@@ -19,134 +21,169 @@ MATRICES = {
     "1x1": np.array([[0.25]], np.float32),
     "no entries": np.zeros((5, 5), np.float32),
     "53": gallery.signed(53, 53, 3) / 20,
-    "sparse 53": gallery.sparse(53, 53, 0.3).toarray() / 20,
+    "sparse 97": gallery.sparse(97, 97, 0.3).toarray() / 20,
     "empty rows": np.where(np.arange(40)[:, None] % 3 == 1, gallery.signed(40, 40) / 20, np.float32(0)),
-    "runs": np.tril(np.triu(gallery.signed(97, 97, 5), -40), 40) / 30,
+    "runs": np.tril(np.triu(gallery.signed(150, 150, 5), -70), 70) / 40,
     "below only": np.tril(gallery.signed(33, 33, 6), -1) / 9,
     "above only": np.triu(gallery.signed(33, 33, 7), 1) / 9,
 }
+METHODS = {"sor": 1.3, "block_gauss_seidel": None}  # omega
+SHAPES = {"cpu": 1, "gpu7": 7, "gpu32": 32, "gpu256": 256}  # items of a work-group
 
 
-def sweep_state(device, n: int, k: int | None) -> tuple[Sweep, np.ndarray, np.ndarray, np.ndarray]:
-    x, b, carry = (gallery.vectors(n, k, seed) for seed in (1, 2, 3))
-    state = Sweep(device.upload(x), device.upload(b), device.upload(np.full_like(x, np.nan)))
-    for array in (state.before, state.s, state.delta):
+@pytest.fixture(scope="module", params=SHAPES)
+def shaped(request, device) -> tuple[Device, int]:
+    """A device whose kernels are launched as on a CPU or a GPU, and the size of its work-groups."""
+    if request.param == "cpu" and not device.is_cpu:
+        pytest.skip("strips hand on their turn within a launch, which OpenCL promises on no GPU")
+    other = Device(device.description)
+    other.kind = request.param[:3]
+    return other, SHAPES[request.param]
+
+
+def sweeps_of(relax: Relaxation, k: int | None) -> tuple[Sweeps, np.ndarray, np.ndarray]:
+    """Sweeps that start with NaN wherever nothing is read."""
+    n, device = relax.rows.M.shape[0], relax.rows.M.device
+    x, b = gallery.vectors(n, k, 1), gallery.vectors(n, k, 2)
+    sweeps = Sweeps(relax, device.upload(x), device.upload(b), device.upload(np.full_like(x, np.nan)))
+    for array in (sweeps.before, sweeps.s, sweeps.carry):
         array.set(np.full_like(x, np.nan))
-    state.carry.set(carry)
-    return state, x, b, carry
+    return sweeps, x, b
 
 
-def made(rows: Rows, kind: str, block: int, omega: float) -> Relaxation:
-    """Sweeps whose blocks are finished in the way `kind`, which is not the one chosen for the device."""
-    cut = blocks.cut(rows.M.shape[0], block, overlap=kind != "in sequence")
-    if kind == "in sequence":
-        return Relaxation(rows, list(blocks.in_sequence(rows, cut)), omega)
-    return Relaxation(
-        rows, list(blocks.by_inverse(rows, cut, None if kind == "all" else omega, "sor")), omega
-    )
-
-
-KINDS = [
-    (form, kind)
-    for form in FORMATS
-    for kind in ("in sequence", "by inverse", "all")
-    if form == "csr" or kind[0] != "i"
-]
-
-
-@pytest.mark.parametrize("launch", ["item", "stream", "group7", "group64"])
-@pytest.mark.parametrize("k", [None, 3, 8])
+@pytest.mark.parametrize("k", [None, 5])
 @pytest.mark.parametrize("name", MATRICES)
-@pytest.mark.parametrize(("form", "kind"), KINDS)
-def test_product_and_finish_meet_their_twins(device, monkeypatch, form, kind, name, k, launch):
-    """The launches of two blocks: product, product beside finish, finish."""
-    M = MATRICES[name]
-    n, half, omega = len(M), -(-len(M) // 2), 1.0 if kind == "all" else 1.3
-    A = FORMATS[form](device, M)
-    helpers.force(monkeypatch, A, launch)
-    state, x, b, carry = sweep_state(device, n, k)
-    made(Rows(A, 1.0, -1.0), kind, half, omega).sweep(state)
-    csr, S = scipy.sparse.csr_array(M), np.eye(n) - M.astype(np.float64)
-    entries = (csr.indptr, csr.indices, csr.data) if form == "csr" else (M,)
-    y, delta, wanted = np.array(x, np.float64), np.zeros_like(x, np.float64), []
-    for start in range(0, n, half):
-        before, stop = 0 if kind != "in sequence" else start, min(start + half, n)
-        found = getattr(reference, f"relax_{form}")(*entries, before, 1.0, -1.0, x, y, b, carry)
-        wanted.append([values[start:stop] for values in found])
-        s = np.concatenate([values[0] for values in wanted])
-        chosen = None if kind == "all" else omega
-        delta[start:stop] = reference.relax_substitute(S, chosen, before, start, stop, s, delta)
-        y[start:stop] = x[start:stop] + delta[start:stop]
-    right, r, carry = (np.concatenate(values) for values in zip(*wanted, strict=True))
-    found = [(state.r, r), (state.carry, carry), (state.x, y), (state.before, x)]
-    if kind == "in sequence":
-        found.append((state.s, (delta.T * S.diagonal() / omega).T))
-    else:
-        found += [(state.s, right), (state.delta, delta)]
-    for array, values in found:
-        np.testing.assert_allclose(array.get(), values, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("block", [1, 2, 7, 16, 53, 64])
-@pytest.mark.parametrize(("form", "kind"), KINDS)
-def test_sweeps_are_those_of_the_textbook(device, form, kind, block):
-    M = MATRICES["sparse 53"]
-    S, omega = np.eye(53) + M.astype(np.float64), 1.0 if kind == "all" else 1.3
-    relax = made(Rows(FORMATS[form](device, M), 1.0, 1.0), kind, block, omega)
-    state, x, b, _ = sweep_state(device, 53, 3)
-
-    def after(sweeps: int) -> np.ndarray:
-        if kind == "all":
-            return reference.block_gauss_seidel(S, x, b, block, sweeps)
-        return reference.sor(S, x, b, omega, sweeps)
-
-    for sweeps in range(1, 4):
-        relax.sweep(state)
-        np.testing.assert_allclose(state.x.get(), after(sweeps), rtol=0, atol=1e-5)
-        np.testing.assert_allclose(state.before.get(), after(sweeps - 1), rtol=0, atol=1e-5)
-        if sweeps > 1:
-            np.testing.assert_allclose(state.r.get(), b - S @ after(sweeps - 1), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("omega", [1.0, 0.7, 1.6])
-@pytest.mark.parametrize("block", [1, 2, 7, 16, 53, 64, None])
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("form", FORMATS)
-def test_the_block_does_not_change_the_iterates(device, form, block, omega):
-    M = MATRICES["53"]
-    S = np.eye(53) + M.astype(np.float64)
-    relax = relaxation(IdentityPlus(FORMATS[form](device, M)), "sor", block, omega)
-    state, x, b, _ = sweep_state(device, 53, 3)
-    for sweeps in range(1, 5):
-        relax.sweep(state)
-        np.testing.assert_allclose(state.x.get(), reference.sor(S, x, b, omega, sweeps), rtol=0, atol=1e-5)
-        if sweeps > 1:  # the residual is that of the iterate before
-            before = reference.sor(S, x, b, omega, sweeps - 1)
-            np.testing.assert_allclose(state.r.get(), b - S @ before, rtol=0, atol=1e-5)
+def test_sweeps_meet_their_twins(shaped, form, method, name, k):
+    """Blocks of 1 to all rows; what a sweep leaves behind is what the next one tells the residual from."""
+    (device, group), M, omega = shaped, MATRICES[name], METHODS[method]
+    A, S = FORMATS[form](device, M), np.eye(len(M)) - M.astype(np.float64)
+    for block in (1, 7, 64, None):
+        relax = relaxation(IdentityPlus(A, -1), method, block, omega)
+        sweeps, y, b = sweeps_of(relax, k)
+        sweeps.group, carry = group, np.full_like(y, np.nan)
+        for sweep in range(3):
+            before = y
+            how = (relax.block, omega, y, b, carry)
+            y, r, carry = reference.relax_strips(S, *how, in_place=not relax.inverses)
+            sweeps.sweep()
+            found = [(sweeps.x, y), (sweeps.before, before), (sweeps.carry, carry), (sweeps.r, r)]
+            for array, wanted in found:
+                np.testing.assert_allclose(array.get(), wanted, rtol=0, atol=1e-5)
+            if sweep:
+                np.testing.assert_allclose(sweeps.r.get(), b - S @ before, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("block", [1, 5, None])
 @pytest.mark.parametrize("form", FORMATS)
-def test_slabs_give_the_same_as_one_buffer(small_device, form, block):
+def test_many_strips_on_many_threads_repeat_to_the_bit(device, form):
+    """The strips of a panel end in any order; each waits for its turn all the same."""
+    M = np.random.default_rng(1).random((800, 800), np.float32) / 800
+    if form == "csr":
+        M[M > 0.2 / 800] = 0
+    relax, found = relaxation(IdentityPlus(FORMATS[form](device, M)), "sor", 2, 1.0), []
+    _, x, b = sweeps_of(relax, None)  # the same each time
+    for _ in range(5):
+        sweeps, _, _ = sweeps_of(relax, None)
+        for _ in range(4):
+            sweeps.sweep()
+        found.append(sweeps.x.get())
+    S = np.eye(800) + M.astype(np.float64)
+    for _ in range(4):
+        x = scipy.linalg.solve_triangular(S, b - np.triu(S, 1) @ x, lower=True)
+    np.testing.assert_allclose(found[0], x, rtol=0, atol=1e-5)
+    for other in found[1:]:
+        helpers.same_bits(found[0], other)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("block", [1, 5, 19, None])
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_block_may_cross_slabs(device, form, kind, block, method):
+    small = Device(device.description)
+    small.max_allocation, small.kind = SMALL, kind
     M = gallery.signed(53, 53, 4) / 20
+    A, omega = FORMATS[form](small, M), METHODS[method]
+    assert len(A.slabs) > 1
+    block = 16 if block is None and method == "block_gauss_seidel" else block  # inverses fit in one buffer
+    relax = relaxation(IdentityPlus(A), method, block if kind == "cpu" else block or 5, omega)
+    sweeps, y, b = sweeps_of(relax, 2)
+    S, before, carry = np.eye(53) + M.astype(np.float64), y, np.zeros_like(y)
+    for _ in range(3):
+        before, how = y, (relax.block, omega, y, b, carry)
+        y, _, carry = reference.relax_strips(S, *how, in_place=not relax.inverses)
+        sweeps.sweep()
+        np.testing.assert_allclose(sweeps.x.get(), y, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(sweeps.r.get(), b - S @ before, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", MATRICES)
+def test_rows_are_split_as_the_twin_splits_them(shaped, name):
+    (device, _), M = shaped, MATRICES[name]
+    A = FORMATS["csr"](device, M)
+    for block in (1, 7, 64):
+        relax = Relaxation(readable(IdentityPlus(A, -1), "sor"), "sor", block, 1.0)
+        expected = reference.relax_windows(M, relax.block, relax.panel, inverses=relax.inverses)
+        np.testing.assert_array_equal(relax.windows[0].get(), expected)
+
+
+def test_a_correction_meets_its_twin(device):
+    W, s, x = gallery.signed(9, 4), gallery.vectors(9, 3, 1), gallery.vectors(9, 3, 2)
+    X, before = device.upload(x), device.upload(x * np.nan)
+    kernel = device.kernel("relax", "relax_correct", K=3, PACKED=1)
+    group = kernel.group(32)
+    kernel(
+        3 * group,
+        group,
+        4,
+        3,
+        4,
+        3,
+        0,
+        device.upload(W),
+        X,
+        before,
+        device.upload(s),
+        device.local(3 * group),
+    )
+    expected = x.copy()
+    expected[4:7] = reference.relax_correct(W[4:7, :3], s[4:7], x[4:7])
+    np.testing.assert_allclose(X.get(), expected, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(before.get()[4:7], x[4:7])
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("parts", [1, 7, 1000])
+@pytest.mark.parametrize("name", ["1x1", "53", "empty rows", "runs"])
+@pytest.mark.parametrize("form", FORMATS)
+def test_steps_meet_their_twin(shaped, form, name, parts, k):
+    (device, group), M = shaped, MATRICES[name]
+    n, parts, S = len(M), min(parts, len(M)), np.eye(len(M)) - M.astype(np.float64)
+    x, r = gallery.vectors(n, k, 1), gallery.vectors(n, k, 2)
+    A = IdentityPlus(FORMATS[form](device, M), -1)
+    steps = Steps(A, "southwell", device.upload(x), device.upload(r), parts)
+    steps.group = group
+    for _ in range(3):
+        steps.step()
+        x, r = reference.southwell_step(S, parts, x, r)
+    steps.step(picks=False)
+    np.testing.assert_allclose(steps.x.get(), x, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(steps.r.get(), r, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_steps_over_slabs_give_the_same(small_device, form):
+    M, x, r = gallery.signed(53, 53, 4) / 20, np.zeros((53, 1)), gallery.vectors(53, 1)
     A = FORMATS[form](small_device, M)
     assert len(A.slabs) > 1
-    state, x, b, _ = sweep_state(small_device, 53, 2)
-    relax = relaxation(A if block == 1 else IdentityPlus(A, -1), "sor", block, 0.1)
-    S = M.astype(np.float64) if block == 1 else np.eye(53) - M.astype(np.float64)
-    relax.sweep(state)
-    wanted = reference.sor(S, x, b, 0.1)
-    np.testing.assert_allclose(state.x.get(), wanted, rtol=1e-3, atol=1e-3 * np.abs(wanted).max())
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_sweeps_repeat_to_the_bit(device, form):
-    S = IdentityPlus(FORMATS[form](device, MATRICES["53"]))
-    found = []
-    for _ in range(2):
-        state, *_ = sweep_state(device, 53, 5)
-        relaxation(S, "gauss_seidel", 8).sweep(state)
-        found.append(state.x.get())
-    helpers.same_bits(*found)
+    steps = Steps(IdentityPlus(A), "southwell", small_device.upload(x), small_device.upload(r), 5)
+    for picks in (True, True, False, True, False):
+        steps.step(picks=picks)
+        if picks:
+            x, r = reference.southwell_step(np.eye(53) + M, 5, x, r)
+    np.testing.assert_allclose(steps.x.get(), x, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(steps.r.get(), r, rtol=0, atol=1e-5)
 
 
 def test_it_is_made_once_and_lives_with_its_matrix(device):
@@ -154,71 +191,34 @@ def test_it_is_made_once_and_lives_with_its_matrix(device):
     S = IdentityPlus(R)
     assert relaxation(S, "sor", 8) is relaxation(S, "gauss_seidel", 8)
     assert relaxation(S, "sor", 8) is not relaxation(S, "sor", 9)
-    assert relaxation(S, "sor", 8) is not relaxation(IdentityPlus(S.R, -1), "sor", 8)
-    assert relaxation(S, "sor", 8) is not block_relaxation(S, "block_gauss_seidel", 8)
+    assert relaxation(S, "sor", 8) is not relaxation(IdentityPlus(R, -1), "sor", 8)
+    assert relaxation(S, "sor", 8) is not relaxation(S, "block_gauss_seidel", 8, None)
     assert relaxation(S, "sor", 8, 1.2).omega == 1.2
     assert relaxation(S, "sor", 8).omega == 1.0
     assert len(R.relaxations) == 4  # another omega takes the place of the one before
-
-
-def test_pieces_on_the_host_change_nothing(device, monkeypatch):
-    M = gallery.sparse(53, 53, 0.5)
-    M.data /= 20
-    state, x, b, _ = sweep_state(device, 53, None)
-    monkeypatch.setattr(blocks, "_PIECE", 10)
-    relaxation(IdentityPlus(CSR(device, M)), "sor", 7).sweep(state)
-    wanted = reference.sor(np.eye(53) + M.toarray().astype(np.float64), x, b)
-    np.testing.assert_allclose(state.x.get(), wanted, rtol=0, atol=1e-5)
-
-
-def test_the_default_block_shrinks_where_triangles_are_full(device):
-    full, empty = np.ones((1024, 1024)), np.eye(1024)
-    sizes = [blocks.best_size(CSR(device, scipy.sparse.csr_array(M)), sequential=True) for M in (full, empty)]
-    assert sizes[0] < 1024 < sizes[1]
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_a_block_may_cross_slabs(small_device, form):
-    M = gallery.signed(53, 53, 4) / 20
-    A = FORMATS[form](small_device, M)
-    assert len(A.slabs) > 1
-    S = np.eye(53) + M.astype(np.float64)
-    state, x, b, _ = sweep_state(small_device, 53, 2)
-    relax = block_relaxation(IdentityPlus(A), "block_gauss_seidel", 20)
-    for sweeps in (1, 2):
-        relax.sweep(state)
-        wanted = reference.block_gauss_seidel(S, x, b, 20, sweeps)
-        np.testing.assert_allclose(state.x.get(), wanted, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(
-        state.r.get(), b - S @ reference.block_gauss_seidel(S, x, b, 20), rtol=0, atol=1e-5
-    )
 
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_inverses_beyond_the_device_are_refused_with_both_sizes(device, monkeypatch, form):
     S = IdentityPlus(FORMATS[form](device, MATRICES["53"]))
     monkeypatch.setattr(device, "memory", 1000)
-    with pytest.raises(
-        MemoryLimitError, match=r"'block_gauss_seidel' with inverses of 4 blocks needs .* has"
-    ):
-        block_relaxation(S, "block_gauss_seidel", 16)
+    with pytest.raises(MemoryLimitError, match=r"'block_gauss_seidel'.* 4 blocks .*3.* KiB.*1000"):
+        relaxation(S, "block_gauss_seidel", 16, None)
 
 
 @pytest.mark.parametrize(
     "make", [lambda A: ScaledColumns(A, np.ones(5)), lambda A: IdentityPlus(Shifted(A)), lambda A: A.T]
 )
 def test_operators_without_rows_are_refused(device, make):
-    with pytest.raises(
-        InputError, match=r"method='sor' reads S row by row, which .*; give .*chebyshev"
-    ) as caught:
+    with pytest.raises(InputError, match=r"'sor'.*chebyshev") as caught:
         relaxation(make(Dense(device, np.eye(5))), "sor")
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_a_zero_on_the_diagonal_is_refused_by_row(device, form):
-    M = np.diag([1.0, -1.0, 0.0])
-    with pytest.raises(InputError, match=r"diagonal of S, which is 0 in 1 row\(s\), first in row 1"):
-        relaxation(IdentityPlus(FORMATS[form](device, M)), "gauss_seidel")
-    with pytest.raises(InputError, match="first in row 2"):
-        relaxation(FORMATS[form](device, M), "gauss_seidel")
+def test_a_zero_on_the_diagonal_is_refused_by_row(shaped, form):
+    A = FORMATS[form](shaped[0], np.diag([1.0, -1.0, 0.0]))
+    with pytest.raises(InputError, match=r"'gauss_seidel'.*diagonal.* 1 row.* row 1"):
+        relaxation(IdentityPlus(A), "gauss_seidel")
+    with pytest.raises(InputError, match="row 2"):
+        relaxation(A, "gauss_seidel")

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from ltcl.solvers.methods import ITERATIVE as _ITERATIVE
-from ltcl.solvers.methods import METHODS as ALL
-from ltcl.solvers.methods import SAMPLED as _SAMPLED
+from ltcl.device import Device
+from ltcl.device.kernels import Kernel
+from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
+from ltcl.solvers.solve import METHODS as ALL
+from ltcl.solvers.solve import SAMPLED as _SAMPLED
 
 ITERATIVE = tuple(_ITERATIVE)
 METHODS = tuple(method for method in ALL if method not in _SAMPLED)  # those that keep a tolerance
@@ -24,4 +26,16 @@ def small_blocks(method: str, block: int = 4) -> dict[str, Any]:
     return {"block": block} if method == "block_gauss_seidel" else {}
 
 
-__all__ = ["ALL", "ITERATIVE", "METHODS", "READS_ROWS", "small_blocks"]
+def force_groups(monkeypatch: Any, device: Device, group: int) -> None:
+    """Let all kernels run with work-groups of one size, as far as the device allows it."""
+    monkeypatch.setattr(device, "reductions", {})  # what was planned for other groups does not fit these
+    real = Kernel.group
+
+    def forced(kernel: Kernel, wanted: Any) -> Any:
+        wanted = group if isinstance(wanted, int) else tuple(min(n, group) for n in wanted)
+        return real(kernel, wanted)
+
+    monkeypatch.setattr(Kernel, "group", forced)
+
+
+__all__ = ["ALL", "ITERATIVE", "METHODS", "READS_ROWS", "force_groups", "small_blocks"]

@@ -8,10 +8,8 @@ import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl.compression.inverse_norm import inverse_norm
+from ltcl.compression import inverse_norm
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus
-from ltcl.solvers import coefficients
-from ltcl.solvers.jacobi import Jacobi
 from tests.bases import Given, rotation, stands_for
 from tests.problems import enclosure, residual
 from tests.solvers.helpers import ITERATIVE, METHODS
@@ -54,19 +52,6 @@ def test_every_method_on_active_coefficients(device, method, columns, sign):
 
 
 @pytest.mark.parametrize("method", ITERATIVE)
-def test_a_start_counts_and_leaves_nothing_behind(device, method):
-    """What x0 has beside the active coefficients is no part of the solution."""
-    S, truth = _system(device)
-    b, x0 = _light(2, N, 3)
-    s = ltcl.solve(S, b, method, rtol=1e-4, x0=x0)
-    assert residual(truth, s.x, b) <= 1e-4 * (1 + 2e-2)
-    exact = np.linalg.solve(truth, b)
-    s = ltcl.solve(S, b, method, rtol=1e-4, x0=exact)
-    assert s.iterations == 0
-    np.testing.assert_allclose(s.x, exact, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("method", ITERATIVE)
 def test_residuals_are_relative_to_the_whole_of_b(device, method):
     """The last one is that of x in pixels, by float64; both tolerances are those of pixels."""
     S, truth = _system(device)
@@ -79,32 +64,6 @@ def test_residuals_are_relative_to_the_whole_of_b(device, method):
         assert np.all(left <= np.maximum(rtol * norms, atol) * (1 + 1e-3))
         first = np.max(np.linalg.norm(rotation(N)[:M] @ b, axis=0) / norms)
         np.testing.assert_allclose(s.residuals[0], first, rtol=1e-5)
-
-
-def test_light_beside_all_active_coefficients_is_left_as_it_is(device):
-    S, _ = _system(device)
-    b = rotation(N)[M + 1]
-    s = ltcl.solve(S, b, "jacobi", rtol=1e-3)
-    assert (s.iterations, s.products) == (0, 0)
-    np.testing.assert_allclose(s.x, b, atol=1e-6)
-    assert not ltcl.solve(S, 0 * b, "jacobi").x.any()
-
-
-def test_products_are_of_active_coefficients_only(device):
-    S, _ = _system(device, -1.0)
-    where = coefficients.space(S, Jacobi())
-    assert where.S.shape == (M, M)
-    assert where.W is _inside(S).into
-    assert ltcl.theory.free_bounds(where.S) == ltcl.theory.free_bounds(S)
-
-
-def test_weights_of_pixels_do_not_matter_to_other_methods(device):
-    S, truth = _system(device)
-    weighted = IdentityPlus(S.R, weights=np.linspace(1.0, 2.0, N))
-    b = _light(N)
-    for method in ("chebyshev", "cg", "auto"):
-        assert residual(truth, ltcl.solve(weighted, b, method, rtol=1e-2, throw=False).x, b) < 0.1
-    assert residual(truth, ltcl.solve(weighted, b, "chebyshev", rtol=1e-4).x, b) <= 1.02e-4
 
 
 @pytest.mark.parametrize("method", ["chebyshev", "gmres", "direct"])

@@ -9,15 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
+from ltcl.device import Array
 from ltcl.operators import Dense
 from ltcl.solvers import Status
 from ltcl.solvers.bounded import minimise
-from ltcl.solvers.box import Box
+from ltcl.solvers.columns import Columns
 from tests import gallery, reference
-from tests.problems import lambertian
+from tests.problems import enclosure, lambertian
+from tests.solvers.helpers import force_groups
 
 random = np.random.default_rng(60)
-SHAPES = [(1, 1), (1, 5), (53, 1), (53, 5), (257, 3), (20_001, 1)]
+SHAPES = [(1, 1), (1, 5), (53, 5), (257, 3), (5_001, 1)]
+NAMES = ("direction", "weigh", "move", "look")
 
 
 def exact(A: np.ndarray, b: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -35,44 +38,58 @@ def errors(A: np.ndarray, x: np.ndarray, b: np.ndarray | float, w: np.ndarray | 
     return np.linalg.norm(w * (A.astype(np.float64) @ x.astype(np.float64) - b), axis=0)
 
 
-def box_of(device, rows: int) -> tuple[np.ndarray, np.ndarray, Box]:
+@pytest.mark.parametrize(("rows", "k"), SHAPES)
+@pytest.mark.parametrize("group", [1, 8, 256])
+def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
+    force_groups(monkeypatch, device, group)
     lower = np.asarray(gallery.vectors(rows, None, 5))
     upper = lower + np.abs(gallery.vectors(rows, None, 6))
-    return lower, upper, Box(device.upload(lower), device.upload(upper))
-
-
-def points(rows: int, k: int, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
-    """x with a third of its entries at each bound; g, d and h of either sign, and 0 here and there."""
     x = lower[:, None] + (upper - lower)[:, None] * random.random((rows, k)).astype(np.float32)
     x = np.where(random.random((rows, k)) < 0.3, lower[:, None], np.minimum(x, upper[:, None]))
-    x = np.where(random.random((rows, k)) < 0.3, upper[:, None], x)
-    g, d, h = (gallery.vectors(rows, k, seed) for seed in (7, 8, 9))
-    g[random.random((rows, k)) < 0.1] = 0
-    return [x, g, d, h]
+    q, g, d, h, r, Ad, w = (gallery.vectors(rows, k, seed) for seed in range(7, 14))
+    q[random.random((rows, k)) < 0.1] = 0
+    Q, G, D, H, R, Y, W, X, L, U = (device.upload(part) for part in (q, g, d, h, r, Ad, w, x, lower, upper))
+    columns = Columns(X, "bounded", *(f"bounded_{name}" for name in NAMES))
+    slices, tolerance = columns.slices, reference.gamma(rows / 64 + 40) * 8 * rows
+    start = np.zeros((4 + 3 * slices, k))
+    start[:3] = np.linspace(0.2, 1.0, k), np.linspace(0.5, 1.0, k), np.linspace(0.3, 0.9, k)
+    numbers, rest = device.upload(start), device.upload(np.zeros(k), np.int32)
+    sums, shares, squares = (columns.sums(count) for count in (2, 1, 1))
 
+    columns.bind("bounded_look", 0, L, U, X, Q, G, H, numbers)()
+    new = np.stack([(-q - g) / start[2], -q])
+    gap, zh = reference.bounded_look(lower, upper, x, new[1], new[0])
+    looks = numbers.get()[4 : 4 + 2 * slices].reshape(slices, 2, k).sum(axis=0)
+    np.testing.assert_allclose(looks, [gap, zh], rtol=0, atol=4 * tolerance)
 
-@pytest.mark.parametrize(("rows", "k"), SHAPES)
-def test_kernels_meet_their_twins(device, rows, k):
-    lower, upper, box = box_of(device, rows)
-    x, g, d, h = points(rows, k, lower, upper)
-    X, G, D, H = (device.upload(part) for part in (x, g, d, h))
-    tolerance = reference.gamma(rows / 4096 + 40) * 4 * rows
-    np.testing.assert_allclose(
-        box.look(X, G, D, H), reference.bounded_look(lower, upper, x, g, d, h), rtol=0, atol=tolerance
+    columns.bind("bounded_direction", slices, rest, numbers, L, U, X, G, D, sums, shares, extra=2)()
+    step, (gd, dd, share) = reference.bounded_direction(
+        start[0], -looks[1] / start[1], lower, upper, x, new[1], d
     )
-    alpha, beta = np.linspace(0.0, 1.0, k), np.linspace(-1.0, 0.5, k)
-    along = box.direction(alpha, beta, X, G, D)
-    step, sums = reference.bounded_direction(alpha, beta, lower, upper, x, g, d)
-    np.testing.assert_allclose(D.get(), step, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(along[:2], sums[:2], rtol=0, atol=tolerance)
-    with np.errstate(divide="ignore"):
-        np.testing.assert_allclose(along.room, np.maximum(1 / sums[2], 1), rtol=1e-4)
-    box.move(beta, D, X)
-    np.testing.assert_allclose(
-        X.get(), reference.bounded_move(beta, lower, upper, step, x), rtol=0, atol=1e-6
-    )
-    assert (X.get() >= lower[:, None]).all()
-    assert (X.get() <= upper[:, None]).all()
+    np.testing.assert_allclose(D.get(), step, rtol=0, atol=1e-4)
+    found = sums.get().reshape(slices, 2, k).sum(axis=0)
+    np.testing.assert_allclose(found, [gd, dd], rtol=1e-3, atol=tolerance)
+    np.testing.assert_allclose(shares.get().max(axis=0), share, rtol=1e-3)
+
+    columns.bind("bounded_weigh", 1, W, Y, R, squares)()
+    curvature = np.sum(np.square(w * Ad, dtype=np.float64), axis=0)
+    np.testing.assert_allclose(Y.get(), w * Ad, rtol=1e-6)
+    np.testing.assert_allclose(squares.get().sum(axis=0), curvature, rtol=1e-4)
+
+    V = R.like()
+    columns.bind(
+        "bounded_move", rows, slices, 1, numbers, sums, shares, squares, L, U, D, X, W, Y, R, V, extra=4
+    )()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        length = np.where(gd < 0, np.fmin(-gd / curvature, np.fmax(1 / share, 1)), 0.0)
+    moved, left = reference.bounded_move(length, lower, upper, step, x), r - length * w * Ad
+    np.testing.assert_allclose(numbers.get()[2], length, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(X.get(), moved, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(R.get(), left, rtol=0, atol=1e-3 * (1 + length.max()))
+    np.testing.assert_allclose(V.get(), w * R.get(), rtol=1e-6)
+    found = numbers.get()[4 + 2 * slices :].sum(axis=0)
+    np.testing.assert_allclose(found, np.sum(np.square(R.get(), dtype=np.float64), axis=0), rtol=1e-4)
+    assert ((X.get() >= lower[:, None]) & (X.get() <= upper[:, None])).all()
 
 
 @pytest.mark.parametrize("rho", [0.8, 4.0])
@@ -127,6 +144,43 @@ def test_never_above_the_start_and_never_certified_too_low(device, seed, shape, 
     assert (s.x <= upper.astype(np.float32)[:, None]).all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_bent_direction_starts_conjugacy_anew(device, seed):
+    """Without, some of these take ten times as many steps, or none of all that are allowed helps."""
+    S = enclosure(60, 0.8, seed=seed).S.astype(np.float32)
+    b = S @ np.random.default_rng(seed).uniform(-1, 2, (60, 1))
+    s = minimise(Dense(device, S), b, np.zeros(60), np.ones(60), np.full((60, 1), 0.5), rtol=1e-4, maxiter=40)
+    assert s.converged
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.1, 0.9), (0.0, 0.1), (-0.7, 0.3), (0.1, 0.1)])
+def test_bounds_hold_in_float64(device, low, high):
+    """Float32 rounds 0.1 up and 0.7 down; bounds that hold no float32 are met by the nearest."""
+    A = Dense(device, np.eye(4) + 0.1)
+    b = np.array([[-9.0], [9.0], [9.0], [-9.0]])
+    x = minimise(A, b, np.full(4, low), np.full(4, high), np.zeros((4, 1)), rtol=1e-6).x.astype(np.float64)
+    if low < high:
+        assert (x >= low).all() and (x <= high).all()  # noqa: PT018
+    np.testing.assert_allclose(np.sort(x.ravel()), [low, low, high, high], atol=1e-7)
+
+
+def test_an_iteration_is_six_launches_and_one_wait(device, monkeypatch):
+    S = lambertian(60, 4.0, seed=3).S.astype(np.float32)
+    b, w = S @ random.uniform(-1, 2, (60, 3)), random.uniform(0.5, 1.5, (60, 3))
+    reads, read, counts = [], Array.get, []
+    monkeypatch.setattr(Array, "get", lambda array: reads.append(array) or read(array))
+    for steps in (2, 7):
+        reads.clear()
+        with device.profile() as profile:
+            minimise(
+                Dense(device, S), b, np.zeros(60), np.ones(60), np.zeros((60, 3)), weights=w,
+                maxiter=steps, rtol=1e-9,
+            )  # fmt: skip
+        counts.append((sum(profile.launches.values()), len(reads), sum(array.size > 500 for array in reads)))
+    (first, reads_first, vectors), (last, reads_last, _) = counts
+    assert (last - first, reads_last - reads_first, vectors) == (30, 5, 0)
+
+
 def test_a_target_within_reach_costs_no_step(device):
     S = lambertian(30, 0.8).S.astype(np.float32)
     x = random.uniform(0.1, 0.9, (30, 2))
@@ -166,3 +220,14 @@ def test_what_ends_a_solve(device):
     assert s.status is Status.STAGNATED  # float32 cannot certify that
     assert s.gap < 1e-5
     assert (errors(S, s.x, b) <= errors(S, exact(S, b, np.zeros(40), np.ones(40)), b) * (1 + 1e-6)).all()
+
+
+def test_weighing_meets_its_twin(device):
+    w, v = gallery.vectors(53, 3), gallery.vectors(53, 3, 2)
+    V, U, sums = device.upload(v), device.empty((53, 3)), device.empty((1, 3))
+    kernel = device.kernel("bounded", "bounded_weigh", ADJACENT=1)
+    group = (kernel.group(16), 1, 1)
+    items = (group[0], 1, -(-3 // group[0]))
+    kernel(items, group, 53, 3, 2, device.upload(w), V, U, sums, device.local(group[0]))
+    for found, wanted in zip((V.get(), U.get(), sums.get()[0]), reference.bounded_weigh(w, v), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)

@@ -56,20 +56,6 @@ def test_as_many_steps_as_distinct_eigenvalues(device, distinct, options):
     assert s.iterations == distinct
 
 
-@pytest.mark.parametrize("options", [{}, {"normal": True}], ids=["symmetric", "normal"])
-def test_columns_do_not_know_of_each_other(device, options):
-    """Together or alone, a column takes the same steps; solved early, it rests."""
-    scene = enclosure(40, 0.8, seed=18)
-    S = IdentityPlus(Dense(device, scene.R))
-    eigenvectors = np.linalg.eigh(scene.S)[1]
-    b = np.stack([eigenvectors[:, 3], np.zeros(40), random.normal(size=40), np.ones(40)], axis=1)
-    together = ltcl.solve(S, b, "cg", rtol=1e-5, **options)
-    for column in range(4):
-        alone = ltcl.solve(S, b[:, column], "cg", rtol=1e-5, **options)
-        np.testing.assert_allclose(together.x[:, column], alone.x, rtol=0, atol=2e-5)
-    assert residual(scene.S, together.x, b) <= 1e-5 * (1 + 1e-2)
-
-
 def test_the_weights_are_what_makes_it_converge(device):
     """Weights spread over two decades: in the plain inner product S is far from symmetric."""
     scene = lambertian(40, 4.0, seed=19)
@@ -148,7 +134,7 @@ def test_normal_equations_of_a_singular_system_end_at_its_least_squares(device, 
         ({"weights": [1.0, 0.0, -1.0]}, InputError, "weights has 2 value.* not positive"),
         ({"weights": [1.0, np.nan, 1.0]}, InputError, "weights has 1 NaN"),
         ({"weights": "area"}, InputTypeError, "weights holds"),
-        ({"weights": np.ones(3), "normal": True}, InputError, "weights are of no use with normal=True"),
+        ({"weights": np.ones(3), "normal": True}, InputError, "weights.*normal=True"),
         ({"normal": "yes"}, InputTypeError, "normal is 'yes'; it must be True or False"),
     ],
 )

@@ -11,7 +11,7 @@ import pytest
 
 import ltcl
 from ltcl import theory
-from ltcl.operators import IdentityPlus, as_operator
+from ltcl.operators import as_operator
 from tests.problems import residual
 from tests.solvers.helpers import ITERATIVE
 
@@ -72,20 +72,6 @@ def test_every_method_passes_both_ways(device, method, dual, albedo):
         s = ltcl.solve(as_operator(S, device), b, method)
         assert residual(S, s.x, b) <= 1e-2 * (1 + 1e-3)
         assert s.products <= budget + 3, name
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-@pytest.mark.parametrize("n", [6, 10])
-def test_an_operator_and_its_matrix_are_solved_alike(device, n, sign):
-    forward, inverse, _ = room(n, 6, 0.95)
-    S = forward if sign < 0 else inverse
-    b = pictures(len(S))["with a dark column"]
-    R = as_operator(sign * (S - np.eye(len(S))), device)
-    plain, composed = (
-        ltcl.solve(one, b, "chebyshev") for one in (as_operator(S, device), IdentityPlus(R, sign=sign))
-    )
-    assert abs(plain.products - composed.products) <= 1
-    np.testing.assert_allclose(plain.x, composed.x, rtol=0, atol=1e-3 * np.abs(plain.x).max())
 
 
 @pytest.mark.parametrize("bounds", [(0.5, 2.0), (0.3, 1.2), (0.9, 1.1), (0.04, 0.9), (1.5, 4.0)])

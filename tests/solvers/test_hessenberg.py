@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ltcl.solvers.hessenberg import Hessenberg
+from ltcl.solvers.gmres import Hessenberg
 
 random = np.random.default_rng(21)
 
@@ -20,7 +20,7 @@ def small(k: int, m: int) -> np.ndarray:
 @pytest.mark.parametrize("k", [1, 3])
 def test_every_step_is_the_least_squares_solution(k, m):
     H, beta = small(k, m), random.uniform(0.5, 1.0, k)
-    problem = Hessenberg(beta, m)
+    problem = Hessenberg(beta)
     for j in range(m):
         assert problem.extend(H[:, : j + 2, j]).all()
         y = problem.solve()
@@ -34,7 +34,7 @@ def test_every_step_is_the_least_squares_solution(k, m):
 
 def test_a_column_that_rests_keeps_its_solution():
     H, beta = small(2, 4), np.ones(2)
-    problem = Hessenberg(beta, 4)
+    problem = Hessenberg(beta)
     for j in range(2):
         problem.extend(H[:, : j + 2, j])
     y, left = problem.solve(), problem.residuals
@@ -46,7 +46,7 @@ def test_a_column_that_rests_keeps_its_solution():
 
 
 def test_a_singular_matrix_makes_no_step():
-    problem = Hessenberg(np.ones(1), 2)
+    problem = Hessenberg(np.ones(1))
     assert problem.extend(np.array([[0.0, 1.0]])).all()
     assert not problem.extend(np.array([[0.0, 0.0, 0.0]])).any()
     assert problem.residuals.tolist() == [1.0]
@@ -56,7 +56,7 @@ def test_a_singular_matrix_makes_no_step():
 @pytest.mark.parametrize("m", [1, 2, 5])
 def test_ritz_values_are_eigenvalues_of_the_square_parts(m):
     H = small(2, m)
-    problem = Hessenberg(np.ones(2), m)
+    problem = Hessenberg(np.ones(2))
     for j in range(m):
         problem.extend(H[:, : j + 2, j] * ([[1.0], [1.0]] if j < 3 else [[1.0], [0.0]]))
     wanted = [np.linalg.eigvals(H[0, :m, :m]), np.linalg.eigvals(H[1, : min(m, 3), : min(m, 3)])]

@@ -20,11 +20,10 @@ from tests.problems import lambertian, residual
 SCENE = lambertian(43, rho=0.6, density=0.7)
 
 
-def jacobi(S: np.ndarray, b: np.ndarray, steps: int) -> np.ndarray:
-    l = b
-    for _ in range(steps):
-        l = b - S @ l + l
-    return l
+def signed(n: int, norm: float) -> np.ndarray:
+    """R of both signs and ||R||_2 = norm, whose walks have no finite variance."""
+    R = np.random.default_rng(n).standard_normal((n, n))
+    return R * (norm / np.linalg.norm(R, 2))
 
 
 @pytest.mark.parametrize("sampler", ["alias", "uniform"])
@@ -36,26 +35,14 @@ def test_the_mean_of_many_runs_is_the_iterate_of_jacobi(device, form, dual, samp
     b = gallery.vectors(43, 2)
     options: dict[str, Any] = {"samples": 16, "iterations": 3, "sampler": sampler}
     runs = [ltcl.solve(IdentityPlus(A, sign), b, "hybrid", seed=s, **options).x for s in range(100)]
-    x = np.stack(runs).astype(float)
-    wanted = jacobi(np.eye(43) + sign * M, b, 3)
+    x, wanted = np.stack(runs).astype(float), b
+    for _ in range(3):
+        wanted = b - sign * M @ wanted
     assert np.all(np.abs(x.mean(axis=0) - wanted) <= 4.2 * x.std(axis=0, ddof=1) / 10)
     assert x.std(axis=0).max() > 0.01
 
 
-def test_signs_and_empty_rows(device):
-    R = gallery.sparse(41, 41, 0.3, seed=5).toarray() / 10
-    R[[0, 9, 40]] = 0
-    b = gallery.vectors(41, None)
-    S = IdentityPlus(CSR(device, scipy.sparse.csr_array(R)))
-    x = np.stack([ltcl.solve(S, b, "hybrid", seed=s, samples=64).x for s in range(30)]).astype(float)
-    exact = np.linalg.solve(np.eye(41) + R.astype(float), b)
-    assert np.all(
-        np.abs(x.mean(axis=0) - exact) <= 4 * x.std(axis=0, ddof=1) / 30**0.5 + 1e-2 * np.abs(exact)
-    )
-    np.testing.assert_array_equal(x[:, [0, 9, 40]], np.broadcast_to(b[[0, 9, 40]], (30, 3)))
-
-
-def test_noise_falls_with_samples_and_with_final_gather(device):
+def test_noise_falls_with_samples_and_with_final_gather():
     b = np.random.default_rng(1).random((43, 3))
     exact = np.linalg.solve(SCENE.S, b)
 
@@ -68,16 +55,17 @@ def test_noise_falls_with_samples_and_with_final_gather(device):
     assert gathered < 0.4 * few
 
 
-def test_the_true_residual_decides(device):
+def test_the_true_residual_decides():
     b = np.random.default_rng(2).random(43)
     found = ltcl.solve(SCENE.S, b, "hybrid", samples=4)
     assert found.status is Status.SAMPLED
+    assert found.standard_error is None
     assert found.residual == pytest.approx(residual(SCENE.S, found.x, b), rel=1e-4)
     assert ltcl.solve(SCENE.S, b, "hybrid", samples=2000, gather=True).converged
     assert ltcl.solve(SCENE.S, np.zeros(43), "hybrid").converged
 
 
-def test_it_repeats_to_the_bit_and_takes_a_start(device):
+def test_it_repeats_to_the_bit_and_takes_a_start():
     b = np.random.default_rng(3).random((43, 2))
     first, second = (ltcl.solve(SCENE.S, b, "hybrid", seed=9) for _ in range(2))
     np.testing.assert_array_equal(first.x, second.x)
@@ -86,77 +74,56 @@ def test_it_repeats_to_the_bit_and_takes_a_start(device):
     np.testing.assert_allclose(ltcl.solve(SCENE.S, b, "hybrid", x0=exact).x, exact, rtol=0, atol=1e-5)
 
 
-def test_iterations_are_those_of_jacobi_and_never_above_maxiter(device):
-    b = np.ones(43)
-    assert ltcl.solve(SCENE.S, b, "hybrid", rtol=1e-2).iterations == int(np.ceil(np.log(1e-2) / np.log(0.6)))
-    assert ltcl.solve(SCENE.S, b, "hybrid", maxiter=3).iterations == 3
-    assert ltcl.solve(SCENE.S, b, "hybrid", iterations=5).iterations == 5
+def test_iterations_are_those_of_jacobi_and_too_few_are_told():
+    wanted = int(np.ceil(np.log(1e-2) / np.log(0.6)))
+    assert ltcl.solve(SCENE.S, np.ones(43), "hybrid", samples=2).iterations == wanted
+    tried: list[tuple[dict[str, Any], str]] = [({"maxiter": 3}, "maxiter"), ({"iterations": 5}, "iterations")]
+    for options, what in tried:
+        found = ltcl.solve(SCENE.S, np.ones(43), "hybrid", samples=2, **options)
+        assert found.iterations == options[what]
+        assert re.search(rf"{found.iterations} of the {wanted} iterations.*{what}=$", str(found))
 
 
-def test_too_few_iterations_are_told_and_are_no_noise(device):
-    rho = 0.999
-    wanted = int(np.ceil(np.log(1e-2) / np.log(rho)))
-    S = np.eye(4) - rho * np.ones((4, 4)) / 4
-    for options, what in [({}, "maxiter"), ({"maxiter": 20}, "maxiter"), ({"iterations": 30}, "iterations")]:
-        found = ltcl.solve(S, np.ones(4), "hybrid", **options)
-        count = found.iterations
-        says = rf"stopped at {count} of the (\d+) iterations that rtol asks for: raise {what}=$"
-        told = re.search(says, str(found))
-        assert told is not None
-        assert int(told[1]) == pytest.approx(wanted, rel=1e-2)  # the spectral radius is that of float32
-        assert "noise" not in str(found)
-        assert "try more samples" not in str(found)
-    assert "stopped at" not in ltcl.solve(SCENE.S, np.ones(43), "hybrid", samples=2).reason
+@pytest.mark.parametrize("form", ["csr", "dense"])
+def test_it_refuses_samples_with_which_noise_may_grow_and_names_what_does_not(device, form):
+    R = signed(31, 0.75)
+    S = IdentityPlus(CSR(device, scipy.sparse.csr_array(R)) if form == "csr" else Dense(device, R))
+    b = np.random.default_rng(0).standard_normal(31)
+    with pytest.raises(InputError, match=r"samples.*3\b.*method='auto'") as caught:
+        ltcl.solve(S, b, "hybrid", samples=3, iterations=200)
+    enough = int(re.findall(r"samples=(\d+)", str(caught.value))[0])
+    with pytest.raises(InputError, match=f"samples.*{enough - 1}"):
+        ltcl.solve(S, b, "hybrid", samples=enough - 1)
+    runs = [ltcl.solve(S, b, "hybrid", samples=enough, iterations=200, seed=s).x for s in range(5)]
+    assert np.abs(np.stack(runs) - np.linalg.solve(np.eye(31) + R, b)).max() < 20 * np.abs(b).max()
 
 
-def test_the_noise_that_the_least_samples_leave_is_told(device):
-    """Within a factor of three of what runs of many iterations end with."""
-    R = np.random.default_rng(0).standard_normal((43, 43))
-    R *= 0.75 / np.abs(np.linalg.eigvals(R)).max()
-    S, b = np.eye(43) + R, np.random.default_rng(1).random(43)
-    with pytest.raises(InputError, match="or use method='auto'") as caught:
-        ltcl.solve(S, b, "hybrid", samples=1)
-    told = re.search(r"must be (\d+) at least, which leave noise of about ([\d.]+) times", str(caught.value))
-    assert told is not None
-    exact, least = np.linalg.solve(S, b), int(told[1])
-    runs = [ltcl.solve(S, b, "hybrid", samples=least, iterations=300, seed=s).x for s in range(6)]
-    noise = np.sqrt(np.mean((np.stack(runs) - exact) ** 2) / np.mean(exact**2))
-    assert noise / 3 < float(told[2]) < 3 * noise
+def test_light_of_one_sign_needs_one_sample():
+    """R >= 0 of a scene: rho(Q) is about rho(R)^2, and nothing is to be refused."""
+    scene = lambertian(43, rho=0.9)
+    b = np.random.default_rng(1).random(43)
+    found = ltcl.solve(scene.S, b, "hybrid", samples=1, iterations=100)
+    assert np.sqrt(np.mean((found.x - np.linalg.solve(scene.S, b)) ** 2)) < 10 * np.abs(b).max()
 
 
-def test_iterations_tell_the_callback(device):
-    seen: list[tuple[int, float]] = []
-    found = ltcl.solve(SCENE.S, np.ones(43), "hybrid", iterations=2, callback=lambda *step: seen.append(step))
-    np.testing.assert_array_equal(seen, [(0, 1.0), (1, np.nan), (2, np.nan), (3, found.residual)])
+def test_where_jacobi_diverges_it_is_refused(device):
+    S = IdentityPlus(Dense(device, lambertian(30, 1.2).R))
+    with pytest.raises(InputError, match=r"1\.2.*hybrid.*method='auto'"):
+        ltcl.solve(S, np.ones(30), "hybrid")
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"samples": 0}, "samples is 0"),
-        ({"seed": -1}, "seed is -1"),
-        ({"seed": 1 << 64}, "it must be below 2"),
-        ({"iterations": 0}, "iterations is 0"),
-        ({"iterations": 10**6}, "iterations is 1000000; it must be at most 10000"),
-        ({"sampler": "none"}, "sampler is 'none'"),
-        ({"gather": 1}, "gather is 1; it must be True or False"),
+        ({"samples": 0}, "samples.*0"),
+        ({"seed": -1}, "seed.*-1"),
+        ({"iterations": 0}, "iterations.*0"),
+        ({"iterations": 10**6}, "iterations.*1000000.*10000"),
+        ({"sampler": "cdf"}, "sampler.*cdf.*alias, uniform"),
+        ({"gather": 1}, "gather.*1"),
     ],
 )
-def test_bad_options_are_refused_in_one_line(device, options, says):
+def test_bad_options_are_refused_in_one_line(options, says):
     with pytest.raises((InputError, InputTypeError), match=says) as caught:
         ltcl.solve(SCENE.S, np.ones(43), "hybrid", **options)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("value", [3e38, 1e38])
-def test_rows_that_overflow_are_refused(device, value):
-    R = np.zeros((4, 4))
-    R[2] = value
-    with pytest.raises(InputError, match=r"1 row\(s\) of R, first of row 2, sum to more than float32 holds"):
-        ltcl.solve(IdentityPlus(Dense(device, R)), np.ones(4), "hybrid")
-
-
-def test_where_jacobi_diverges_it_is_refused(device):
-    S = IdentityPlus(Dense(device, lambertian(30, 1.2).R))
-    with pytest.raises(InputError, match=r"spectral radius of R is 1.2; method='hybrid' .*use method='auto'"):
-        ltcl.solve(S, np.ones(30), "hybrid")

@@ -9,10 +9,10 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, as_operator
+from ltcl.operators import Compressed, Dense, IdentityPlus, as_operator
 from ltcl.solvers import Status
 from tests.bases import Given, stands_for, two_sided
-from tests.problems import enclosure, lambertian, residual
+from tests.problems import enclosure, residual
 from tests.solvers.helpers import METHODS
 
 N = 43
@@ -56,19 +56,17 @@ def test_exact_may_be_anything_that_S_may(device, kind):
     assert residual(S_EXACT, s.x, b) <= 1e-5 * (1 + 5e-2)
 
 
-def test_products_of_both_are_counted(device, monkeypatch):
-    S, exact = _compressed(device), CSR(device, scipy.sparse.csr_array(S_EXACT))
-    S.row_sums()
+def test_products_of_both_are_counted(device):
     made = []
-    assert isinstance(S.R, Compressed)
-    for operator in (S.R.core, exact):
-        original = operator._product
-        monkeypatch.setattr(
-            operator, "_product", lambda *a, original=original: (made.append(original), original(*a))
-        )
-    s = ltcl.solve(S, rng.uniform(0.0, 1.0, (N, 2)), "chebyshev", rtol=1e-5, exact=exact)
-    assert s.products == len(made)
-    assert sum(which.__self__ is exact for which in made) == s.iterations  # the start costs none
+
+    def act(x: np.ndarray) -> np.ndarray:
+        made.append(x)
+        return S_EXACT @ x
+
+    exact = scipy.sparse.linalg.LinearOperator((N, N), matvec=act, matmat=act, dtype=np.float64)
+    s = ltcl.solve(_compressed(device), rng.uniform(0.0, 1.0, (N, 2)), "chebyshev", rtol=1e-5, exact=exact)
+    assert len(made) == s.iterations  # the start costs none
+    assert s.products >= 2 * s.iterations
 
 
 def test_a_start_and_units_are_kept(device):
@@ -78,21 +76,6 @@ def test_a_start_and_units_are_kept(device):
     assert s.iterations == 0
     s = ltcl.solve(S, b, "gmres", rtol=1e-5, exact=S_EXACT)
     np.testing.assert_allclose(s.x / (1e-30, 1e30), x / (1e-30, 1e30), rtol=0, atol=1e-4)
-
-
-def test_an_S_without_an_error_is_a_preconditioner(device):
-    """Any S near enough will do, not only compressed ones."""
-    near = lambertian(N, rho=0.5)
-    S = as_operator(near.S * 1.02, device)
-    b = rng.uniform(0.0, 1.0, N)
-    assert residual(near.S, ltcl.solve(S, b, "gmres", rtol=1e-5, exact=near.S).x, b) <= 1.1e-5
-
-
-def test_dark_columns_stay_dark(device):
-    b = rng.uniform(0.5, 1.0, (N, 3)) * (1.0, 0.0, 1.0)
-    s = ltcl.solve(_compressed(device), b, "chebyshev", rtol=1e-5, exact=S_EXACT)
-    assert not s.x[:, 1].any()
-    assert not ltcl.solve(_compressed(device), 0 * b, "jacobi", exact=S_EXACT).x.any()
 
 
 @pytest.mark.parametrize("method", ["jacobi", "gmres", "direct"])
@@ -118,11 +101,9 @@ def test_a_step_that_fails_ends_the_solve_and_says_why(device):
 @pytest.mark.parametrize("rtol", [5e-7, 1e-7, 1e-9, 1e-13])
 @pytest.mark.parametrize("kind", EXACT)
 def test_below_float32_it_refines_in_float64(device, kind, rtol):
-    """Against the operator as it stands: its numbers are float32, but for those of a LinearOperator."""
+    """Against the numbers that were given; of an operator those that it has, float32."""
     given = EXACT[kind](device)
-    S = {"LinearOperator": S_EXACT, "operator": np.eye(N) + SCENE.R.astype(np.float32)}.get(
-        kind, S_EXACT.astype(np.float32).astype(np.float64)
-    )
+    S = np.eye(N) + SCENE.R.astype(np.float32) if kind == "operator" else S_EXACT
     for b in (rng.uniform(0.0, 1.0, N), rng.uniform(0.0, 1.0, (N, 5)) * 10.0 ** np.arange(-20, 5, 5)):
         for method in ("auto", "gmres"):
             s = ltcl.solve(_compressed(device), b, method, rtol=rtol, exact=given)
@@ -136,7 +117,7 @@ def test_below_float32_it_refines_in_float64(device, kind, rtol):
 @pytest.mark.parametrize("columns", [(), (1,), (5,)])
 def test_a_start_in_float64_is_kept(device, columns):
     b = rng.uniform(0.5, 1.0, (N, *columns))
-    x = np.linalg.solve(S_EXACT.astype(np.float32).astype(np.float64), b)
+    x = np.linalg.solve(S_EXACT, b)
     s = ltcl.solve(_compressed(device), b, "gmres", rtol=1e-12, exact=S_EXACT, x0=x)
     assert s.iterations == 0
     np.testing.assert_array_equal(s.x, x)
@@ -152,19 +133,12 @@ def _on_the_device(device):
     ("make", "rtol", "most"), [(_on_the_device, 1e-9, 1e-6), (lambda device: S_EXACT, 1e-17, 1e-15)]
 )
 @pytest.mark.parametrize("method", ["gmres", "auto"])
-def test_what_rounding_leaves_is_told_with_a_tolerance_that_works(device, make, rtol, most, method):
+def test_below_what_rounding_leaves_it_stagnates(device, make, rtol, most, method):
     b, exact = rng.uniform(0.0, 1.0, N), make(device)
     S = _compressed(device)
     s = ltcl.solve(S, b, method, rtol=rtol, exact=exact, throw=False)
     assert s.status is Status.STAGNATED
     assert s.residual < most
-    with pytest.raises(ConvergenceError) as refused:
-        ltcl.solve(S, b, method, rtol=rtol, exact=exact)
-    text = str(refused.value)
-    assert text.startswith(f"rtol is {rtol:g}, but products with exact= are rounded, which left ")
-    least = float(text.rpartition("; the least that can be asked is ")[2])
-    assert rtol < least < most
-    assert ltcl.solve(S, b, method, rtol=least, exact=exact).converged
 
 
 def test_maxiter_is_of_steps(device):
@@ -172,19 +146,6 @@ def test_maxiter_is_of_steps(device):
     s = ltcl.solve(_compressed(device), b, "gmres", rtol=1e-6, exact=S_EXACT, maxiter=1, throw=False)
     assert s.status is Status.MAXITER
     assert s.iterations == 1
-
-
-def test_the_callback_sees_true_residuals(device):
-    seen = []
-    s = ltcl.solve(
-        _compressed(device),
-        rng.uniform(0.0, 1.0, N),
-        "gmres",
-        rtol=1e-5,
-        exact=S_EXACT,
-        callback=lambda *step: seen.append(step),
-    )
-    assert seen == list(enumerate(s.residuals))
 
 
 @pytest.mark.parametrize(
@@ -199,19 +160,13 @@ def test_the_callback_sees_true_residuals(device):
             ltcl.Transport(S_EXACT, (1, N)),
             "auto",
             InputTypeError,
-            "exact is a Transport; it must be like S: give exact=T.interreflection of the uncompressed T",
+            "exact is a Transport; .*T.interreflection",
         ),
     ],
 )
 def test_unfit_exact_operators_are_refused(device, exact, method, kind, part):
     with pytest.raises(kind, match=part):
         ltcl.solve(_compressed(device), np.ones(N), method, exact=exact)
-
-
-def test_one_of_three_colours_is_to_be_chosen(device):
-    three = [Dense(device, S_EXACT)] * 3
-    with pytest.raises(InputTypeError, match="exact is 3 operators, S is one; give that of the same colour"):
-        ltcl.solve(_compressed(device), np.ones(N), exact=three)
 
 
 def test_exact_on_another_device_is_refused(device, small_device):

@@ -18,8 +18,8 @@ from ltcl.operators import (
     Compressed,
     Dense,
     IdentityPlus,
-    Ordered,
     ScaledColumns,
+    SubsetBasis,
     Sum,
     Tiles,
     Wavelet,
@@ -79,8 +79,8 @@ def test_the_same_transport_comes_back(device, tmp_path, channels, core):
 
 
 def test_orders_chains_and_sums_come_back(device, tmp_path):
-    order = Ordered(device, GRID, np.random.default_rng(0).permutation(N), "hilbert")
-    W = Chained(Ordered(device, (1, N), np.arange(N)[::-1]), Wavelet(device, GRID, "haar", 2))
+    order = SubsetBasis(device, GRID, np.random.default_rng(0).permutation(N), "hilbert")
+    W = Chained(SubsetBasis(device, (1, N), np.arange(N)[::-1]), Wavelet(device, GRID, "haar", 2))
     R = enclosure(N, 0.4).R / 2
     sharp = Compressed(_core(device, "tiles", order, R), order, order)
     smooth = Compressed(_core(device, "csr", W, R), W, W)
@@ -136,8 +136,8 @@ def test_what_is_known_without_a_device(device, tmp_path):
     assert parts.kinds == ("tiles", "db2")
     inside = [S.R.core for S in C.systems if isinstance(S.R, Compressed)]
     packed = [core.packed for core in inside if isinstance(core, Tiles)]
-    assert parts.entries == sum(np.count_nonzero(one.stored.codes) for one in packed)
-    assert parts.nbytes > sum(one.stored.codes.nbytes + one.starts.nbytes for one in packed)
+    assert parts.entries == sum(np.count_nonzero(one.codes) for one in packed)
+    assert parts.nbytes > sum(one.codes.nbytes + one.columns.nbytes for one in packed)
 
 
 def test_other_formats_and_operators_are_refused(device, tmp_path):
@@ -222,7 +222,8 @@ def _mutants(array):
         for value in lies:
             wide = np.result_type(array.dtype, np.min_scalar_type(value))
             changed = array.astype(wide if array.dtype.kind in "iu" else array.dtype)
-            changed.reshape(-1)[array.size // 2] = value
+            with np.errstate(over="ignore"):  # 1e30 is infinite in float16
+                changed.reshape(-1)[array.size // 2] = value
             yield changed
 
 

@@ -114,7 +114,7 @@ def test_only_one_block_is_in_memory(tmp_path: Path, device: Device, monkeypatch
     path = store(tmp_path / "T.zarr")
     monkeypatch.setattr(StoredRows, "tocsr", None)
     monkeypatch.setattr(scipy.sparse, "vstack", lambda parts, *rest: parts[0] if len(parts) == 1 else 1 / 0)
-    monkeypatch.setattr("ltcl.operators.row_blocks._SLAB", 1)
+    monkeypatch.setattr("ltcl.operators.csr._SLAB", 1)
     T = ltcl.load(path, device=device)
     x = np.random.default_rng(0).random((3, 4))
     expected = np.concatenate([part.toarray() for _, part in T.matrices[0].row_blocks()]) @ x.ravel()

@@ -183,3 +183,12 @@ WRONG = {
 def test_a_wrong_type_is_refused_by_name(name):
     with pytest.raises(InputTypeError, match=f"^{name.split()[0]} is .*; it must be "):
         WRONG[name]()
+
+
+@pytest.mark.parametrize("upper", [1e3, 1e16, 1e30])
+def test_products_of_the_widest_spectra_are_counted(upper):
+    """As sqrt(upper) and as upper, also where (upper + lower) / (upper - lower) rounds to 1."""
+    chebyshev = theory.chebyshev_products(1.0, upper, 1e-2)
+    assert chebyshev == pytest.approx(np.arccosh(100.0) / 2.0 * np.sqrt(upper), rel=0.02)
+    richardson = theory.richardson_products(1.0, upper, 1e-2)
+    assert richardson == pytest.approx(np.log(100.0) / 2.0 * upper, rel=0.02)

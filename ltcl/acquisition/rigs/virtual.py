@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import channels, checks
+from ltcl import checks, layout
 from ltcl.acquisition.rig import as_codes, as_seconds
 from ltcl.acquisition.rigs import curves
 from ltcl.acquisition.rigs.digests import digest
@@ -117,7 +117,7 @@ class VirtualRig:
         self._map = None if camera_map is None else _camera_map(camera_map, rows)
         self.camera_grid = _camera_grid(camera_grid, rows if self._map is None else self._map.shape[0], grid)
         mixing = getattr(T, "mixing", None) if mixing is None else mixing
-        self._mixing = None if mixing is None else channels.mixing(mixing, self.channels, None)
+        self._mixing = None if mixing is None else layout.mixing(mixing, self.channels, None)
         self._projector = curves.projector(projector_response, self.channels)
         self._sensor = Sensor(curves.camera(response, self.channels), bits, black, gain, read)
         self._projector_black = checks.number("projector_black", projector_black, least=0.0, below=1.0)
@@ -228,7 +228,7 @@ def _matrices(T: Any) -> tuple[Any, ...]:
     if getattr(T, "blocks", None) is not None:
         raise InputError("T has blocks between colours; it must have one matrix per channel, and a mixing")
     own = getattr(T, "matrices", None)
-    found = channels.own(T if own is None else own() if callable(own) else own, "T")
+    found = layout.matrices(T if own is None else own() if callable(own) else own, "T")
     return tuple(part.astype(np.float32) if part.dtype.kind in "iub" else part for part in found)
 
 
@@ -243,7 +243,7 @@ def _product(T: Any, q: np.ndarray) -> np.ndarray:
 
 
 def _camera_map(given: Any, rows: int) -> Any:
-    C, *others = channels.own(given, "camera_map")
+    C, *others = layout.matrices(given, "camera_map")
     if others or C.shape[1] != rows:
         kind = "three channels" if others else f"shape {C.shape}"
         raise InputError(f"camera_map has {kind}; it must be (H W, M) with M = {rows}, the rows of T")

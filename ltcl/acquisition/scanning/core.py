@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What an adaptive scan found as the arrays of a compressed transport (`ltcl.parts`): T = C W.
+"""What an adaptive scan found as the arrays of a compressed transport (`ltcl.transport`): T = C W.
 
 It is kept as S diag(1) with S = T = I + R: R = C W - I takes 1 from C at every pixel's own cell, and the
 first bounce stands beside it. Loaded, `Transport` divides the columns by F when it makes its own S = T F^-1.
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import first_bounces
+from ltcl import first_bounce
 from ltcl.acquisition.scanning.adaptive import Core
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.store import BlockStore
@@ -31,8 +31,8 @@ def arrays(core: Core, mixing: np.ndarray | None = None, sigmas: float = 0.0) ->
     >>> one = np.ones((1, 2))
     >>> core.add(0, Entries(np.array([0, 1]), np.array([0, 1]), 0.5 * one, 0.01 * one))
     >>> core.add(1, Entries(np.array([0, 0]), np.array([0, 1]), 0.2 * one, 0.01 * one))
-    >>> from ltcl.parts import assemble
-    >>> print(assemble(arrays(core)) @ np.array([[1.0, 0.0]]))
+    >>> from ltcl.transport import from_arrays
+    >>> print(from_arrays(arrays(core)) @ np.array([[1.0, 0.0]]))
     [[0.6 0.1]]
     """
     core.complete()
@@ -41,7 +41,7 @@ def arrays(core: Core, mixing: np.ndarray | None = None, sigmas: float = 0.0) ->
     own, noise = (
         np.stack([diagonal(cells, part) for part in parts]) for parts in (matrices, core.matrices("variance"))
     )
-    F = first_bounces.certain(own, noise, sigmas)
+    F = first_bounce.certain(own, noise, sigmas)
     found: dict[str, Any] = {"grid": np.array(cells.grid), "first_bounce": F}
     if mixing is not None:
         found["mixing"] = mixing

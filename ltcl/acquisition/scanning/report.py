@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ltcl import reciprocity
+from ltcl import diagnostics
 from ltcl.acquisition.scanning import balance, core
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.pictures import Seen
@@ -59,7 +59,7 @@ class Report:
         Root mean square of what a scan by columns had added up to beside white, relative to white: noise,
         thresholds, and all that is wrong with the response. NaN of an adaptive scan, which begins with white.
     defect : float
-        How far T is from reciprocal, of the worst channel (`ltcl.reciprocity`); NaN where it is not told.
+        How far T is from reciprocal, of the worst channel (`ltcl.diagnostics`); NaN where it is not told.
     levels : list of dict
         Of an adaptive scan: cells that were divided on each level, their entries, colours (cells of one
         colour do not conflict), patterns.
@@ -221,4 +221,4 @@ def _median(parts: list[np.ndarray]) -> float:
 
 
 def _defect(T: Any, F: np.ndarray) -> float:
-    return reciprocity.defect(T, np.maximum(F, 0.0), entries=reciprocity.QUICK)
+    return diagnostics.reciprocity_defect(T, np.maximum(F, 0.0), entries=diagnostics.QUICK)

@@ -28,7 +28,7 @@ from ltcl import checks
 from ltcl.device import Array, Device, open_device
 from ltcl.errors import InputError
 from ltcl.operators import CSR, Operator
-from ltcl.operators.base import widths
+from ltcl.operators.base import Epilogue, widths
 from ltcl.scenes.exchange import geometry, near
 from ltcl.scenes.exchange.geometry import Frame
 from ltcl.scenes.exchange.visibility import Rays
@@ -109,6 +109,7 @@ class FormFactor(Operator):
         self._defines = {"LANES": geometry.lanes(self.device), "BLOCKS": len(blocks)}
         self._albedo, self._area = self.device.upload(given), self.device.upload(placed.area)
         self._near = CSR(self.device, self._correction(patches, blocks, near, given, placed.area))
+        self._parts = (self._geometry, self._blocks, self._albedo, self._area, self._near)
 
     @classmethod
     def of(cls, scene: Scene, device: Device | str | None = None) -> tuple[FormFactor, ...]:
@@ -141,48 +142,29 @@ class FormFactor(Operator):
         chosen = device if isinstance(device, Device) else open_device(device)
         return tuple(cls(patches, albedo, blocks, chosen) for albedo in scene.albedo)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device: of the patches, and of the corrections of near pairs."""
-        stored = (self._geometry, self._blocks, self._albedo, self._area, self._near)
-        return sum(part.nbytes for part in stored)
-
     def diagonal(self) -> np.ndarray:
         """Zeros, (N,): a flat patch does not light itself."""
         return np.zeros(self.shape[0])
 
-    def _product(self, x: Array, out: Array, scale: float, add: Array | None, transpose: bool) -> None:
+    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         right, left = (self._albedo, self._area) if transpose else (self._area, self._albedo)
-        for offset, width in widths(x.columns):
-            self._columns(x, out, scale, add, (left, right), offset, width)
-        self._near._product(x, out, scale, out, transpose)
-
-    def _columns(
-        self,
-        x: Array,
-        out: Array,
-        scale: float,
-        add: Array | None,
-        diagonals: tuple[Array, Array],
-        offset: int,
-        width: int,
-    ) -> None:
-        """Columns offset .. offset + width - 1 of the product, without the correction of near pairs."""
-        (left, right), (count, pitch) = diagonals, (self.shape[0], self._geometry.shape[1])
-        packed = {"PACKED": 1} if width == x.columns else {}
-        weigh, matvec = (
-            self.device.kernel("form_factor", f"form_factor_{name}", K=width, **packed, **self._defines)
-            for name in ("weigh", "matvec")
-        )
-        z = self.device.empty((width, pitch))
-        weigh(pitch, 64, count, pitch, x.columns, offset, right, x, z)
-        adds, added = (0, out) if add is None else (1, add)
+        scale, b, y, c = epilogue
+        count, pitch = self.shape[0], self._geometry.shape[1]
         rows = max(1, _LAUNCH // (pitch * (1 + self._defines["BLOCKS"])))
-        group = 16 if self.device.is_cpu else 64
-        for first in range(0, count, rows):
-            size = min(rows, count - first)
-            place = (size, first, pitch, x.columns, offset, scale, adds)
-            matvec(size, group, *place, self._geometry, self._blocks, left, z, added, out)
+        for offset, width in widths(x.columns):
+            packed = {"PACKED": 1} if width == x.columns else {}
+            weigh, matvec = (
+                self.device.kernel("form_factor", f"form_factor_{name}", K=width, **packed, **self._defines)
+                for name in ("weigh", "matvec")
+            )
+            z = self.device.empty((width, pitch))
+            weigh(pitch, 64, count, pitch, x.columns, offset, right, x, z)
+            vectors = (x, out if y is None else y, out, pitch, self._geometry, self._blocks, left, z)
+            for first in range(0, count, rows):
+                size = min(rows, count - first)
+                place = (size, first, x.columns, offset, scale, b, c)
+                matvec(size, 16 if self.device.is_cpu else 64, *place, *vectors)
+        self._near._product(x, out, Epilogue(scale, 1.0, out), transpose)
 
     def _correction(
         self,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse
 
-from ltcl import first_bounces
+from ltcl import first_bounce
 from ltcl.errors import FileError
 from ltcl.store.blocks import aside, nodes, sealed, turning
 from ltcl.store.blocks.layout import Layout
@@ -75,7 +75,7 @@ def _find_first_bounce(store: BlockStore, sigmas: float) -> None:
             F[channel, start:stop] = T.diagonal(start)
             if variance is not None and sigmas > 0:
                 V = scipy.sparse.csr_array((variance, T.indices, T.indptr), shape=T.shape)
-                F[channel, start:stop] = first_bounces.certain(T.diagonal(start), V.diagonal(start), sigmas)
+                F[channel, start:stop] = first_bounce.certain(T.diagonal(start), V.diagonal(start), sigmas)
     if "masked" not in store.extras:  # of a run that was killed between the two
         store.extra("masked", np.asarray((F <= 0).any(axis=0)))
     store.extra("first_bounce", F)

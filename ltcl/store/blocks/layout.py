@@ -37,7 +37,7 @@ class Layout:
     orientation
         How blocks arrive.
     kind
-        "blocks" of T, or "compressed": all of it in extra arrays, as `ltcl.parts` names them.
+        "blocks" of T, or "compressed": all of it in extra arrays, as `ltcl.transport` names them.
     """
 
     shape: tuple[int, int]

@@ -14,7 +14,7 @@ from ltcl.acquisition.scanning import adaptive, core
 from ltcl.acquisition.scanning.cells import Cells
 from ltcl.acquisition.scanning.pictures import Picture
 from ltcl.errors import AcquisitionError
-from ltcl.parts import assemble
+from ltcl.transport import from_arrays
 
 GRIDS = [(1, 1), (1, 6), (7, 1), (4, 4), (5, 7), (8, 8)]
 
@@ -122,7 +122,7 @@ def test_the_core_as_a_transport(device: Any, channels: int) -> None:
     C, cells = dense(found), found.core.cells
     mixing = np.eye(3) + 0.1 if channels == 3 else None
     arrays = core.arrays(found.core, mixing)
-    made = assemble(arrays, device=device)
+    made = from_arrays(arrays, device=device)
     np.testing.assert_allclose(np.atleast_2d(made.first_bounce), np.diagonal(C, axis1=1, axis2=2), rtol=1e-6)
     x = np.random.default_rng(2).random((*grid, 3) if channels == 3 else grid)
     light = [x.ravel()] if channels == 1 else list((x.reshape(-1, 3) @ (np.eye(3) + 0.1).T).T)
@@ -137,7 +137,7 @@ def test_the_core_is_inverted_from_products_with_it(device: Any) -> None:
     grid = (5, 7)
     T = flat(grid, 1, 5) + 2.0 * np.eye(35)
     found = scan(Known(T, grid), threshold=0.03)
-    made = assemble(core.arrays(found.core), device=device)
+    made = from_arrays(core.arrays(found.core), device=device)
     S = dense(found)[0] / made.first_bounce
     C = ltcl.compress(made, 0.05)
     assert np.linalg.norm(np.linalg.inv(C.systems[0].to_dense()) @ S - np.eye(35), 2) <= C.error <= 0.05

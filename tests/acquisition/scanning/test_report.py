@@ -12,7 +12,7 @@ import pytest
 import scipy.sparse
 
 import ltcl
-from ltcl import reciprocity
+from ltcl import diagnostics
 from ltcl.acquisition import Calibration, Correspondence, Report, VirtualRig, acquire
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.scanning.cells import Cells
@@ -68,7 +68,7 @@ def test_a_reciprocal_scene_has_a_defect_that_noise_explains(tmp_path: Path, str
     V = np.concatenate([_variance(store.block(0, b, "rows")) for b in range(store.layout.blocks())])
     rng = np.random.default_rng(0)
     drawn = [corner(4) + np.sqrt(V) * rng.normal(size=V.shape) for _ in range(10)]
-    expected = np.median([reciprocity.defect(T, np.diag(T)) for T in drawn])
+    expected = np.median([diagnostics.reciprocity_defect(T, np.diag(T)) for T in drawn])
     assert 0.5 * expected < loud.defect < 1.5 * expected
 
 
@@ -88,7 +88,7 @@ def one_way() -> np.ndarray:
 def test_light_that_goes_one_way_is_seen_in_the_defect(tmp_path: Path, strategy: str) -> None:
     T = one_way()
     told = scanned(tmp_path / "T.zarr", T, strategy, gain=3e6, read=1e-5, sigmas=0.0, threshold=1e-5)
-    truth = reciprocity.defect(T, np.diag(T))
+    truth = diagnostics.reciprocity_defect(T, np.diag(T))
     assert truth > 0.5
     assert told.defect == pytest.approx(truth, rel=0.1)
 

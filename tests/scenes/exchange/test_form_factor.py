@@ -45,7 +45,14 @@ def tiles(count: int, seed: int) -> Patches:
     return Patches(3 * out, scale * right, scale * down)
 
 
+def astride() -> Patches:
+    """A patch on the floor, and one 20 sizes away that stands half below its plane: both see but a part."""
+    centre, right, down = [(0, 0, 0), (20, 0, 0.1)], [(1, 0, 0), (0, 1, 0)], [(0, -1, 0), (0, 0, 1)]
+    return Patches(*(np.array(edge, np.float64) for edge in (centre, right, down)))
+
+
 SCENES = {
+    "astride a plane": (astride, None),
     "1 patch": (lambda: cut(WALLS[:1], 1), None),
     "2 patches": (lambda: cut(WALLS[:2], 1), None),
     "7 tiles": (lambda: tiles(7, 1), None),
@@ -90,6 +97,17 @@ def test_products_meet_their_twin(device, monkeypatch, name, lanes):
         assert np.count_nonzero(off) <= 0.01 * off.size
         check(A.apply, dense, size)
         check(A.apply_transpose, dense.T, size.T)
+
+
+@pytest.mark.parametrize("transpose", [False, True])
+def test_products_take_the_whole_epilogue(device, transpose):
+    """out = a (A x) + b y + c x, y being out, of pieces of 4 and 1 right-hand sides."""
+    A = FormFactor(cut(WALLS, 2), np.linspace(0.2, 0.9, 24), None, device)
+    x, y = gallery.vectors(24, 5), gallery.vectors(24, 5, 2)
+    out = device.upload(y)
+    apply, matrix = (A.apply_transpose, A.to_dense().T) if transpose else (A.apply, A.to_dense())
+    apply(device.upload(x), out, scale=-0.75, add=out, add_scale=0.5, shift=2.0)
+    np.testing.assert_allclose(out.get(), -0.75 * (matrix @ x) + 0.5 * y + 2 * x, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("lanes", [1, 8])

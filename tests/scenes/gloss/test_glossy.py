@@ -14,8 +14,8 @@ import scipy.stats
 
 import ltcl
 from ltcl import checks
+from ltcl.diagnostics import reciprocity_defect
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.reciprocity import defect
 from ltcl.scenes import Block, GlossyScene, box, dihedral, glossy, trihedral
 from ltcl.scenes.box import WALLS
 from ltcl.scenes.gloss.brdf import lobe
@@ -167,8 +167,8 @@ def test_highlight_lies_where_the_mirror_image_of_the_projector_is_seen() -> Non
 
 def test_gloss_breaks_reciprocity_of_one_camera_and_one_projector_but_not_of_a_matte_room() -> None:
     matte, shiny = corner(4, 0), corner(4, 0.4)
-    assert defect(matte.matrices()[0], matte.first_bounce) < 1e-6
-    assert defect(shiny.matrices()[0], shiny.first_bounce) > 0.02
+    assert reciprocity_defect(matte.matrices()[0], matte.first_bounce) < 1e-6
+    assert reciprocity_defect(shiny.matrices()[0], shiny.first_bounce) > 0.02
 
 
 def test_compensation_is_exact_of_glossy_scenes(scene: GlossyScene) -> None:

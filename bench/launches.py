@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a step of each method asks of a device: kernels, waits, allocations and bytes over the bus.
+
+These counts are the same on every device, so they tell here what a GPU will feel: about 4 us a launch and
+10 us a wait. For every method and kind of operator a solve runs to a number of iterations that it cannot end
+before; steps are counted from product to product, medians, and what checks of the residual cost is in the
+totals. First solves are counted from an operator that nothing is known of: row sums, survey, tables included.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import scipy.sparse
+from rich.console import Console
+from rich.table import Table
+
+import ltcl
+from _harness import Options, options, record, write_json
+from ltcl.device import Device
+from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet
+from ltcl.solvers.bounded import minimise
+
+LAUNCH, WAIT = 4.5e-6, 10e-6  # seconds on a data-centre GPU, for the forecast
+STEPS = 16  # of a solve that is counted
+# Launches and waits of a step between two checks, at most, and its products.
+TARGETS = {
+    "jacobi": (1, 0, 1),
+    "neumann": (1, 0, 1),
+    "richardson": (1, 0, 1),
+    "chebyshev": (1, 0, 1),
+    "cg": (3, 0, 1),
+    "gmres": (5, 1, 1),
+    "bicgstab": (5, 1, 2),
+    "bounded": (6, 1, 2),
+}
+
+
+@dataclass
+class Traffic:
+    """What went to a device, in order: the name of each kernel, or None for a wait."""
+
+    device: Device
+    events: list[str | None] = field(default_factory=list)
+    bytes: int = 0
+    allocations: int = 0
+
+    @property
+    def launches(self) -> int:
+        """Kernels queued."""
+        return sum(event is not None for event in self.events)
+
+    @property
+    def waits(self) -> int:
+        """Calls that waited for the device."""
+        return sum(event is None for event in self.events)
+
+    def step(self, products: int) -> tuple[int, int]:
+        """Kernels and waits of a step of so many products: medians from one product to another.
+
+        Residuals are read every few steps only, and so are not counted where nothing else waits.
+        """
+        marks = [i for i, event in enumerate(self.events) if event is not None and "matvec" in event]
+        spans = [self.events[i:j] for i, j in zip(marks, marks[products:], strict=False)]
+        waits = [sum(event is None for event in span) for span in spans]
+        return round(np.median([len(span) for span in spans] - np.array(waits))), round(np.median(waits))
+
+
+@contextlib.contextmanager
+def counted(device: Device) -> Iterator[Traffic]:
+    """Count what goes to `device` inside the block."""
+    traffic, launch, copy, finish = Traffic(device), Device.launch, Device.copy, Device.finish
+    before = device.allocations
+
+    def launched(self: Device, name: str, *rest: Any) -> None:
+        traffic.events.append(name)
+        launch(self, name, *rest)
+
+    def copied(self: Device, to: Any, of: Any, **sizes: Any) -> None:
+        for host in (to, of):
+            if isinstance(host, np.ndarray):
+                traffic.events.append(None)
+                traffic.bytes += host.nbytes
+        copy(self, to, of, **sizes)
+
+    def finished(self: Device) -> None:
+        traffic.events.append(None)
+        finish(self)
+
+    with (
+        mock.patch.object(Device, "launch", launched),
+        mock.patch.object(Device, "copy", copied),
+        mock.patch.object(Device, "finish", finished),
+    ):
+        yield traffic
+    traffic.allocations = device.allocations - before
+
+
+def operators(given: Options) -> dict[str, Any]:
+    """R of one kind each, made anew at every call: the mean of two neighbours.
+
+    Its eigenvalues are all over [-0.9, 0.9], so that no method comes near rounding in those steps.
+    """
+    side = 16 if given.smoke else 64
+    n, device = side * side, given.device
+    ring = np.roll(np.eye(n, dtype=np.float32), 1, axis=0)
+    G = 0.45 * (ring + ring.T)
+    sparse = scipy.sparse.csr_array(G)
+    W = Wavelet(device, (side, side), "db2")
+    return {
+        "csr": lambda: CSR(device, sparse),
+        "dense": lambda: Dense(device, G),
+        "tiles": lambda: Tiles(device, sparse),
+        "two-sided wavelets": lambda: Compressed(CSR(device, sparse), W, W, error=0.0),
+    }
+
+
+def solver(method: str, b: np.ndarray, **rules: Any) -> Callable[[IdentityPlus], Any]:
+    """A solve of one system after another; `bounded` is least squares within bounds that bind."""
+    if method == "bounded":
+        columns = b.reshape(len(b), -1)
+        lower, upper, start = np.full(len(b), 0.2), np.full(len(b), 0.5), np.zeros(columns.shape)
+        return lambda S: minimise(S, columns, lower, upper, start, **rules)
+    return lambda S: ltcl.solve(S, b, method, throw=False, **rules)
+
+
+def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int) -> dict[str, Any]:
+    """What a step and a first solve ask for."""
+    target, waits_most, products = TARGETS[method]
+    S = IdentityPlus(make())
+    b = np.random.default_rng(1).random((S.shape[0],) if k == 1 else (S.shape[0], k), dtype=np.float32)
+    with counted(device) as first:
+        solver(method, b, rtol=1e-2)(S)
+    options = {"arnoldi": 0, "spectrum": (0.05, 2.0)} if method == "chebyshev" else {}
+    run = solver(method, b, rtol=1e-12 if method != "bounded" else 1e-9, maxiter=STEPS, **options)
+    run(S)  # builds, tunes, looks at S
+    with counted(device) as traffic:
+        made = run(S).iterations
+    launches, waits = traffic.step(products)
+    pixels = method == "bounded" and kind.endswith(
+        "wavelets"
+    )  # bounds are of pixels: transforms in every product
+    hit = launches <= target and waits <= waits_most and traffic.allocations == 0
+    return {
+        "operator": kind,
+        "method": method,
+        "k": k,
+        "launches a step": launches,
+        "waits a step": waits,
+        "targets": "none: in pixels" if pixels else f"{target}, {waits_most}",
+        "waits, with checks": round(traffic.waits / made, 2),
+        "allocations": traffic.allocations,
+        "bytes over the bus a step": round(traffic.bytes / made),
+        "forecast for a GPU, us a step": round(
+            1e6 * (traffic.launches * LAUNCH + traffic.waits * WAIT) / made, 1
+        ),
+        "first solve: launches": first.launches,
+        "waits": first.waits,
+        "KB over the bus": round(first.bytes / 1e3, 1),
+        "verdict": "" if pixels else "hit" if hit else "MISS",
+    }
+
+
+def main() -> None:
+    """Count and print."""
+    given = options(__doc__ or "")
+    rows = [
+        row(given.device, kind, make, method, k)
+        for kind, make in operators(given).items()
+        for method in TARGETS
+        for k in (1, 3)
+    ]
+    misses = sum(one["verdict"] == "MISS" for one in rows)
+    table = Table(*rows[0])
+    for one in rows:
+        table.add_row(*map(str, one.values()))
+    Console(width=190).print(table)
+    Console().print(f"{misses} of {len(rows)} targets missed")
+    if given.json is not None:
+        write_json(
+            given.json, record(given, "What a step asks of a device", {"missed": misses}) | {"rows": rows}
+        )
+
+
+if __name__ == "__main__":
+    main()

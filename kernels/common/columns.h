@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Sums over the rows of arrays (rows, k), column by column, and updates with coefficients of each column.
+//
+// An item has some rows of one column: neighbouring ones where ADJACENT is 1, as caches of CPUs like it; else every
+// so many, so that loads of neighbouring items lie side by side. A group has up to its size of the columns, and
+// get_group_id(2) says which. It leaves its partial sums at [slice][sum][column], and every group of the next kernel
+// adds up the slices itself, in one order. Launches that share partial sums have the same get_num_groups(0).
+
+#ifndef LTCL_COLUMNS_H
+#define LTCL_COLUMNS_H
+
+#include "common/reduce.h"
+
+#ifndef ADJACENT
+#error "columns.h needs -DADJACENT=<1: an item has neighbouring rows; 0: neighbouring items have>"
+#endif
+
+// Values first, first + step, ... below end, in the rows `row`, row + rows, ...; they are of column origin + column,
+// of the `width` columns from `origin` on that the group has.
+typedef struct {
+    int first, step, end, column, origin, width, row, rows;
+} share;
+
+#define EACH_COLUMN(j) for (int j = get_local_id(0); j < s.width; j += get_local_size(0))
+#define EACH_VALUE(i, row) for (int i = s.first, row = s.row; i < s.end; i += s.step, row += s.rows)
+
+static inline share columns_share(int rows, int k)
+{
+    const int me = get_local_id(0), items = get_local_size(0);
+    share s;
+    s.origin = get_group_id(2) * items;
+    s.width = min(items, k - s.origin);
+    s.column = me % s.width;
+    const int together = items / s.width, parts = together * get_num_groups(0);
+    const int part = get_group_id(0) * together + me / s.width, height = (rows + parts - 1) / parts;
+    s.row = ADJACENT ? min(part * height, rows) : part;
+    s.rows = ADJACENT ? 1 : parts;
+    s.end = (ADJACENT ? min(s.row + height, rows) : rows) * k;
+    s.first = me < together * s.width ? s.row * k + s.origin + s.column : s.end;
+    s.step = s.rows * k;
+    return s;
+}
+
+static inline real4 four(global const real *x, int i, int step)
+{
+    return step == 1 ? LOAD4(x + i) : (real4)(x[i], x[i + step], x[i + 2 * step], x[i + 3 * step]);
+}
+
+// The item's sum of x * y * weights, without weights where that is 0: four sums at a time, none waits for another.
+static inline real dot_share(global const real *x, global const real *y, global const real *weights, share s)
+{
+    real4 sums = 0;
+    int i = s.first;
+    for (; i + 3L * s.step < s.end; i += 4 * s.step)
+        sums += four(x, i, s.step) * four(y, i, s.step) * (weights ? four(weights, i, s.step) : 1);
+    for (; i < s.end; i += s.step)
+        sums.s0 += x[i] * y[i] * (weights ? weights[i] : 1);
+    return (sums.s0 + sums.s1) + (sums.s2 + sums.s3);
+}
+
+// Leave the sum of the items' values, or the largest, at sums[column]. `scratch` holds a real an item.
+static inline void columns_sum(real value, global real *sums, int largest, share s, local real *scratch)
+{
+    scratch[get_local_id(0)] = value;
+    fold(scratch, get_local_size(0), s.width, largest);
+    EACH_COLUMN(j) sums[s.origin + j] = scratch[j];
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+// totals[sum * width + j] = partial sums of the group's columns, added up over the slices, or the largest.
+static inline void columns_totals(
+    global const real *partials, int slices, int sums, int largest, int k, share s, local real *totals,
+    local real *scratch)
+{
+    const int me = get_local_id(0), items = get_local_size(0);
+    for (int start = 0; start < sums * s.width; start += items) {
+        const int width = min(items, sums * s.width - start), together = items / width;
+        const int entry = start + me % width;
+        real sum = 0;
+        for (int slice = me / width; slice < slices && me < together * width; slice += together) {
+            const real part = partials[(slice * sums + entry / s.width) * k + s.origin + entry % s.width];
+            sum = largest ? fmax(sum, part) : sum + part;
+        }
+        scratch[me] = sum;
+        fold(scratch, items, width, largest);
+        if (me < width)
+            totals[start + me] = scratch[me];
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+}
+
+#endif

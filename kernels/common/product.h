@@ -1,0 +1,106 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// What a product makes of the sum of a row: the epilogue that csr.cl, dense.cl and tile.cl share.
+//
+//   without STEP   out = a (A x) + b y + c x
+//   with STEP      one step of a stationary iteration on S = a A + c I along the direction x:
+//                  iterate += x;  r -= S x;  next = keep x + gain r;  and the squares of the new r, summed over a
+//                  work-group, to partials[group_at + group]: the norm of a residual costs no launch of its own
+//
+// A format defines SLAB_ARGUMENTS and calls, in its kernels, row_sum or row_add of its own between these macros:
+//   ITEM_ROW .. FINISH_ITEMS(sum)   one work-item a row; `inside` tells whether it has one
+//   GROUP_ROW .. FINISH_GROUP(sum)  one work-group a row, its items side by side along the row
+//
+// Layout: a slab of `rows` rows, the first of which is row `first` of the matrix. x, y, out, iterate, r and next
+// are row-major with `stride` reals a row, and a launch works on their columns offset .. offset + K - 1. partials has
+// a row of `stride` reals for each group. y is not read where b is 0, nor x[row] where c is 0; y may be out.
+// `scratch` holds K reals a work-item.
+
+#ifndef LTCL_PRODUCT_H
+#define LTCL_PRODUCT_H
+
+#include "common/lanes.h"
+#include "common/reduce.h"
+
+#ifdef STEP
+#define PRODUCT_ARGUMENTS \
+    int rows, int first, int stride, int offset, real a, real c, real keep, real gain, int group_at, \
+    global const real *x, global real *iterate, global real *r, global real *next, global real *partials
+#define PRODUCT_NAMES \
+    rows, first, stride, offset, a, c, keep, gain, group_at, x, iterate, r, next, partials
+#else
+#define PRODUCT_ARGUMENTS \
+    int rows, int first, int stride, int offset, real a, real b, real c, global const real *x, \
+    global const real *y, global real *out
+#define PRODUCT_NAMES rows, first, stride, offset, a, b, c, x, y, out
+#endif
+
+// The sum over a work-group of each of K values, in one tree; valid in every item.
+static inline void group_sums(real *value, local real *scratch)
+{
+    for (int k = 0; k < K; ++k)
+        scratch[get_local_id(0) * K + k] = value[k];
+    fold(scratch, K * (int)get_local_size(0), K, 0);
+    for (int k = 0; k < K; ++k)
+        value[k] = scratch[k];
+}
+
+#ifdef STEP
+// The step of one row; `sum` becomes the squares of its residual.
+static inline void finish_row(PRODUCT_ARGUMENTS, int row, real *sum)
+{
+    const int i = (first + row) * stride + offset;
+    for (int k = 0; k < K; ++k) {
+        const real d = x[i + k], left = r[i + k] - (a * sum[k] + c * d);
+        iterate[i + k] += d;
+        r[i + k] = left;
+        next[i + k] = keep * d + gain * left;
+        sum[k] = left * left;
+    }
+}
+
+static inline void keep_squares(PRODUCT_ARGUMENTS, const real *squares)
+{
+    for (int k = 0; k < K; ++k)
+        partials[(group_at + (int)get_group_id(0)) * stride + offset + k] = squares[k];
+}
+#define SUM_SQUARES(sum) group_sums((sum).item, scratch)
+#define KEEP_SQUARES(sum) keep_squares(PRODUCT_NAMES, (sum).item)
+#else
+static inline void finish_row(PRODUCT_ARGUMENTS, int row, const real *sum)
+{
+    for (int k = 0; k < K; ++k)
+        finish((first + row) * stride + offset + k, sum[k], a, b, c, x, y, out);
+}
+#define SUM_SQUARES(sum)
+#define KEEP_SQUARES(sum)
+#endif
+
+#define ITEM_ROW \
+    stride = STRIDE(stride); \
+    const int row = get_global_id(0); \
+    const bool inside = row < rows; \
+    sums sum = {0}
+#define FINISH_ITEMS(sum) \
+    do { \
+        if (inside) \
+            finish_row(PRODUCT_NAMES, row, (sum).item); \
+        SUM_SQUARES(sum); \
+        if (get_local_id(0) == 0) { \
+            KEEP_SQUARES(sum); \
+        } \
+    } while (0)
+
+#define GROUP_ROW \
+    stride = STRIDE(stride); \
+    const int row = get_group_id(0), me = get_local_id(0), items = get_local_size(0); \
+    sums sum = {0}
+#define FINISH_GROUP(sum) \
+    do { \
+        group_sums((sum).item, scratch); \
+        if (me == 0) { \
+            finish_row(PRODUCT_NAMES, row, (sum).item); \
+            KEEP_SQUARES(sum); \
+        } \
+    } while (0)
+
+#endif

@@ -1,0 +1,233 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Krylov methods between two products: inner products of columns, and steps whose coefficients stay on the device.
+//
+//   krylov_pairs      partial sums of inner products of up to three arrays (cg, bicgstab)
+//   krylov_dots       partial sums of the inner products of directions V with w, and of w with itself (arnoldi)
+//   krylov_subtract   w - V h, and its unit vector (arnoldi)
+//   krylov_cg         a step of conjugate gradients, or of those of the normal equations
+//   krylov_half       the first half of a step of BiCGStab
+//   krylov_bicgstab   the second half, and the next direction
+//
+// Required define: ADJACENT, 0 or 1. Items, groups, partial sums and `slices` are those of common/columns.h. `state`
+// holds numbers of k columns by rows, which the kernels name; from row STATE on the partial sums of squared
+// residuals, for each of SLOTS steps. The parity of `step` says which of two copies a step reads; it writes the
+// other one, since groups that start late still read. `scratch` holds a real an item and those that are named.
+
+#include "common/columns.h"
+
+#define ORTHOGONAL 9.5367431640625e-7f  // 2^-20, a cosine: below, a float32 inner product is rounding
+#define STATE 16
+#define SLOTS 8
+#define OWN(step, row) ((((step) & 1) * 4 + (row)) * k + s.origin + j)  // of column j in the copy to be read
+#define SQUARES (state + (STATE + step % SLOTS * (int)get_num_groups(0) + (int)get_group_id(0)) * k)
+
+// A denominator beyond float32 gives NaN, which the residual tells, not a step of 0.
+static inline real divided(real a, real b)
+{
+    return a / (isfinite(b) ? b : NAN);
+}
+
+// Sums of left * right * weight for pair get_group_id(1); 4 bits of `pairs` name two of a, b and c. `weights` are
+// like these and count where weighted == 1.
+kernel void krylov_pairs(
+    int rows, int k, int pairs, int weighted, global const real *weights, global const real *a,
+    global const real *b, global const real *c, global real *partials, local real *scratch)
+{
+    const share s = columns_share(rows, k);
+    const int codes = pairs >> (4 * get_group_id(1)), left = codes & 3, right = codes >> 2 & 3;
+    global const real *x = left == 0 ? a : left == 1 ? b : c, *y = right == 0 ? a : right == 1 ? b : c;
+    global real *sums = partials + (get_group_id(0) * get_num_groups(1) + get_group_id(1)) * k;
+    columns_sum(dot_share(x, y, weighted ? weights : 0, s), sums, 0, s, scratch);
+}
+
+// Sums of V_j * w for j = get_group_id(1), and of w * w for the last one. V_j starts at V[j * rows * k].
+kernel void krylov_dots(
+    int rows, int k, global const real *V, global const real *w, global real *partials, local real *scratch)
+{
+    const share s = columns_share(rows, k);
+    const size_t j = get_group_id(1), count = get_num_groups(1);
+    global const real *v = j + 1 < count ? V + j * rows * k : w;
+    columns_sum(dot_share(v, w, 0, s), partials + (get_group_id(0) * count + j) * k, 0, s, scratch);
+}
+
+// out = w - sum_j h_j V_j, j < count, with h of the partial sums, of which there is one more: w * w. The h are added
+// to those of `before`, where again == 1, and left in `h`, and with them the length of what is left of w, by
+// Pythagoras, or 0 where that is rounding. finish == 1 brings out to length 1, which is the next V. `out` may be w.
+// scratch: count + 2 more a column.
+kernel void krylov_subtract(
+    int rows, int k, int count, int slices, int again, int finish, global const real *partials,
+    global const real *before, global real *h, global real *V, global const real *w, global real *out,
+    local real *scratch)
+{
+    const share s = columns_share(rows, k);
+    local real *totals = scratch + get_local_size(0), *scale = totals + (count + 1) * s.width;
+    columns_totals(partials, slices, count + 1, 0, k, s, totals, scratch);
+    EACH_COLUMN(j) {
+        real squares = 0, all = 0;
+        for (int i = 0; i < count; ++i) {
+            const real now = totals[i * s.width + j], sum = again ? now + before[i * k + s.origin + j] : now;
+            squares += now * now;
+            all += sum * sum;
+            if (get_group_id(0) == 0)
+                h[i * k + s.origin + j] = sum;
+        }
+        const real square = totals[count * s.width + j];
+        const real left = sqrt(square - (squares > square ? square : squares));  // NaN stays NaN
+        const bool complete = left <= ORTHOGONAL * sqrt(all + left * left);
+        scale[j] = complete ? 0 : finish ? divided(1, left) : 1;
+        if (get_group_id(0) == 0)
+            h[count * k + s.origin + j] = complete ? 0 : left;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const real length = scale[s.column];
+    const size_t size = (size_t)rows * k;
+    EACH_VALUE(i, row) {
+        real value = w[i];
+        for (int j = 0; j < count; ++j) {
+            const real c = totals[j * s.width + s.column];
+            value = c == 0 ? value : value - c * V[j * size + i];  // a column without part in it, whatever it holds
+        }
+        if (finish)
+            V[count * size + i] = value = length == 0 ? 0 : length * value;
+        out[i] = value;
+    }
+}
+
+// p = z + beta p, q = w + beta q, x = x + alpha p, r = r - alpha q, with the sums <z, z>, <w, z> (cg, z = r) or
+// <z, z>, <w, w>, <r, r> (normal == 1: z = S^T r). state rows, twice: <z, z>, alpha, 1 where there was no positive
+// curvature or all that is left is rounding, largest <z, z> / <r, r>. Columns rest where rest[column]; anew == 1
+// forgets p and q. scratch: 3 more a column.
+kernel void krylov_cg(
+    int rows, int k, int slices, int normal, int step, int anew, global const int *rest,
+    global const real *partials, global real *state, global const real *z, global const real *w, global real *p,
+    global real *q, global real *x, global real *r, local real *scratch)
+{
+    const share s = columns_share(rows, k);
+    local real *totals = scratch + get_local_size(0), *alphas = totals, *betas = totals + s.width;
+    columns_totals(partials, slices, 2 + normal, 0, k, s, totals, scratch);
+    EACH_COLUMN(j) {
+        const real square = totals[j], product = totals[s.width + j];
+        const real previous = state[OWN(step, 0)], last = state[OWN(step, 1)];
+        real broken = state[OWN(step, 2)], largest = state[OWN(step, 3)];
+        bool moves = !rest[s.origin + j] && !(broken > 0);
+        real beta = !anew && previous > 0 ? square / previous : 0;
+        real curvature = beta == 0 ? product : product - beta * square / last;
+        if (!(curvature > 0) && product > 0) {  // the recursion has left S: start anew along z
+            beta = 0;
+            curvature = product;
+        }
+        if (moves && normal) {
+            const real residual = totals[2 * s.width + j];
+            largest = fmax(largest, square / residual);
+            broken = residual > 0 && square <= largest * ORTHOGONAL * ORTHOGONAL * residual;
+        }
+        if (moves && square > 0 && curvature <= 0)
+            broken = 1;
+        moves = moves && square != 0 && !(broken > 0);
+        const real alpha = divided(square, curvature);
+        if (get_group_id(0) == 0) {
+            state[OWN(step + 1, 0)] = moves ? square : previous;
+            state[OWN(step + 1, 1)] = moves ? alpha : last;
+            state[OWN(step + 1, 2)] = broken;
+            state[OWN(step + 1, 3)] = largest;
+        }
+        alphas[j] = moves ? alpha : 0;
+        betas[j] = beta;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const real alpha = alphas[s.column], beta = betas[s.column];
+    real sum = 0;
+    EACH_VALUE(i, row) {
+        real left = r[i];
+        if (alpha != 0) {  // else the column rests, whatever it holds
+            const real along = beta == 0 ? z[i] : z[i] + beta * p[i];
+            const real moved = beta == 0 ? w[i] : w[i] + beta * q[i];
+            p[i] = along;
+            q[i] = moved;
+            x[i] += alpha * along;
+            r[i] = left -= alpha * moved;
+        }
+        sum += left * left;
+    }
+    columns_sum(sum, SQUARES, 0, s, scratch);
+}
+
+// BiCGStab: state rows, twice: rho, what the column does; then, from row 8 on: alpha, |r*|^2, and the square that
+// <r*, v> is compared with, |S^T r*|^2 with |p|^2 or |r*|^2 with |v|^2.
+#define GOES 0.0f
+#define FRESH 1.0f  // started anew with r* = p = r, and made no step since
+#define WAITS 2.0f  // to be started anew by the host
+#define BROKEN 3.0f  // even a fresh start has no step
+#define ALPHA ((8 * k) + s.origin + j)
+#define SHADOW ((9 * k) + s.origin + j)
+#define AGAINST ((10 * k) + s.origin + j)
+
+// half = r - alpha v, alpha = rho / <r*, v>, with the sums <r*, v> and the square it is compared with.
+// scratch: 2 more a column.
+kernel void krylov_half(
+    int rows, int k, int slices, int step, global const real *partials, global real *state, global const real *r,
+    global const real *v, global real *half_way, local real *scratch)
+{
+    const share s = columns_share(rows, k);
+    local real *totals = scratch + get_local_size(0);
+    columns_totals(partials, slices, 2, 0, k, s, totals, scratch);
+    EACH_COLUMN(j) {
+        const real sigma = totals[j], square = totals[s.width + j];
+        const bool lost = fabs(sigma) <= ORTHOGONAL * sqrt(square) * sqrt(state[AGAINST]);
+        const bool moves = state[OWN(step, 1)] <= FRESH && !(lost && isfinite(square) && isfinite(sigma));
+        totals[j] = moves ? divided(state[OWN(step, 0)], sigma) : 0;
+        if (get_group_id(0) == 0)
+            state[ALPHA] = totals[j];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const real alpha = totals[s.column];
+    EACH_VALUE(i, row)
+        half_way[i] = alpha == 0 ? r[i] : r[i] - alpha * v[i];
+}
+
+// x = x + alpha p + omega s, r = s - omega t, p = r + beta (p - omega v), with the sums <t, s>, <t, t>, <r*, s>,
+// <r*, t> and <s, s>; and the partial sums <g, p> and <p, p> of the next step, two a slice. scratch: 5 more a column.
+kernel void krylov_bicgstab(
+    int rows, int k, int slices, int step, global const real *partials, global real *state,
+    global real *next_partials, global const real *g, global const real *half_way, global const real *t,
+    global const real *v, global real *p, global real *x, global real *r, local real *scratch)
+{
+    const share s = columns_share(rows, k);
+    local real *totals = scratch + get_local_size(0);
+    local real *alphas = totals, *omegas = totals + s.width, *betas = totals + 2 * s.width;
+    columns_totals(partials, slices, 5, 0, k, s, totals, scratch);
+    EACH_COLUMN(j) {
+        const real ts = totals[j], tt = totals[s.width + j], ss = totals[4 * s.width + j];
+        const real alpha = state[ALPHA], does = state[OWN(step, 1)];
+        const real omega = alpha == 0 || tt == 0 ? 0 : divided(ts, tt);
+        const real rho = totals[2 * s.width + j] - omega * totals[3 * s.width + j];
+        const real square = ss - omega * (2 * ts - omega * tt);  // |r|^2, or about that
+        const bool lost = omega == 0 || fabs(rho) <= ORTHOGONAL * sqrt(fmax(square, 0)) * sqrt(state[SHADOW]);
+        const real goes = alpha == 0 ? (does == FRESH ? BROKEN : WAITS) : lost ? WAITS : GOES;
+        const real then = does <= FRESH ? goes : does;
+        if (get_group_id(0) == 0) {
+            state[OWN(step + 1, 0)] = rho;
+            state[OWN(step + 1, 1)] = then;
+        }
+        alphas[j] = alpha;
+        omegas[j] = omega;
+        betas[j] = then == GOES ? rho / state[OWN(step, 0)] * (alpha / omega) : 0;
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const real alpha = alphas[s.column], omega = omegas[s.column], beta = betas[s.column];
+    real sum = 0, along = 0, square = 0;
+    EACH_VALUE(i, row) {
+        const real left = omega == 0 ? half_way[i] : half_way[i] - omega * t[i];
+        const real next = beta == 0 ? left : left + beta * (p[i] - omega * v[i]);
+        sum += left * left;
+        along += g[i] * next;
+        square += next * next;
+        x[i] += (alpha == 0 ? 0 : alpha * p[i]) + (omega == 0 ? 0 : omega * half_way[i]);
+        r[i] = left;
+        p[i] = next;
+    }
+    global real *sums = next_partials + (int)get_group_id(0) * 2 * k;
+    columns_sum(along, sums, 0, s, scratch);
+    columns_sum(square, sums + k, 0, s, scratch);
+    columns_sum(sum, SQUARES, 0, s, scratch);
+}

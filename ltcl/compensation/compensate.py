@@ -1,0 +1,367 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`compensate`: the projector pattern that makes the scene look as desired (section 8.2).
+
+    l_in = F^-1 S^-1 (gain * desired - background)
+
+by products with S only. Where that asks for light beyond the projector's bounds, clamping it is not the best:
+min ||W (T l_in + background - gain * desired)|| over the patterns within the bounds is solved from there on.
+Where T has no S, it is solved from no light on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ltcl import layout
+from ltcl.compensation import gain as gains
+from ltcl.compensation import problem as problems
+from ltcl.compensation.problem import Columns, Limits, Problem, systems
+from ltcl.errors import ConvergenceError
+from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
+from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
+
+RTOL = 1e-2
+_COARSE = 1e-5  # rtol from which on the rounding of a pattern does not count beside the residual
+_EXPLAINED = 3.0  # times the root mean square of an error: few of a solve's are larger
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Compensation:
+    """Result of `ltcl.compensate`. Pictures are linear, float32, of the frames and colours of `desired`.
+
+    Attributes
+    ----------
+    pattern : array
+        Linear projector light within the bounds, on the projector's grid; 0 at masked pixels.
+    appearance : array
+        T pattern + background: what the camera will see, on its grid.
+    gain : float
+        The target was gain * desired.
+    clipped : float
+        Fraction of pattern values that are at a bound and would lower the error beyond it; masked pixels do
+        not count.
+    target : array
+        gain * desired.
+    out_of_reach : array
+        target - appearance where the projector's limits keep the scene too dark (positive) or too bright
+        (negative). 0 where nothing is clipped; else 0 where a solve's tolerance explains it: where weight *
+        abs(target - appearance) is at most 3 times what ``max(rtol ||W target||, atol)`` of this frame and
+        colour makes in the root mean square. So it is 0 where the weight is.
+    error : float
+        ``||W (appearance - target)|| / ||W target||`` of all frames and colours together, with the T that was
+        given, or `exact` where that was: what `transport_error` tells of that T is not in it.
+    gap : float
+        What the error is above the least that the bounds allow, at most: no pattern within them has an error
+        below error - gap. A bound that was computed for this result.
+    frame_errors, frame_clipped : (frames,) float64
+        `error` and `clipped` of each frame by itself; of a single picture, one value.
+    solution : Solution or tuple of 3
+        What the light would be without bounds, one per channel of the transport; of a T without S, `limited`.
+    limited : tuple of Bounded
+        The solves within the bounds; empty where the bounds cost nothing. Their products are those of the
+        search for a gain, too.
+    transport_error : float
+        ``.error`` of that T: what a compressed one may be off by itself, 0 of others. The scene may look that
+        much farther from the target, in relation to T pattern.
+    rtol : float
+        Tolerance of the solves: as given, or what was chosen.
+    """
+
+    pattern: np.ndarray
+    appearance: np.ndarray
+    gain: float
+    clipped: float
+    target: np.ndarray
+    out_of_reach: np.ndarray
+    error: float
+    gap: float
+    frame_errors: np.ndarray
+    frame_clipped: np.ndarray
+    solution: Solution | tuple[Solution, ...]
+    limited: tuple[Bounded, ...]
+    transport_error: float = 0.0
+    rtol: float = 1e-2
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.pattern.shape))
+        off = f"off by {self.error:.2%}{error_note(self.transport_error)}"
+        return f"<ltcl Compensation {shape}, {off}, {self.clipped:.2%} clipped>"
+
+
+def compensate(
+    T: Transport,
+    desired: Any,
+    *,
+    bounds: tuple[float, float] = (0.0, 1.0),
+    background: Any = None,
+    gain: float | str = 1.0,
+    loss: float | None = None,
+    weights: Any = None,
+    method: str = "auto",
+    rtol: float | None = None,
+    exact: Transport | None = None,
+    inverse: Inverse | None = None,
+    clamp: bool = False,
+    **options: Any,
+) -> Compensation:
+    """Find the projector pattern under which the scene looks most like `desired`.
+
+    Parameters
+    ----------
+    T : Transport
+        With more or fewer camera than projector pixels, or blocks between colours, it works too, in the
+        least-squares sense and without `method`.
+    desired : (h, w), (h, w, 3), or frames of these
+        Wanted radiance at each camera pixel, in the units of T.
+    bounds : (low, high)
+        What the projector can emit per pixel, in linear light.
+    background : number, like `desired` or one frame of it, optional
+        Light the projector cannot take away: ambient and its own black. T pattern + background is matched.
+    gain : float or "auto"
+        Scale of the target; "auto" finds the largest one, for all frames and colours, that the bounds reach;
+        at a loss at most 1 % below the largest there is.
+    loss : float, optional
+        Of gain="auto": relative error, weights included, that the gain may cost, from 1e-6 to 1. When not
+        given, none where some gain is within reach exactly and there are no `weights`; else `rtol` or 1.1
+        times the least error of all gains (found to 1 %), whichever is more.
+    weights : like `desired` or one frame of it, optional
+        How much the error at each camera pixel counts, at least 0. When not given 1, and 0 where T.masked.
+    method, rtol, **options
+        Of `ltcl.solve`; rtol is 1e-2 when not given, or the error of a compressed T or an inverse where that
+        is more, as the result's `rtol` says. Within the bounds the error is the least there is up to `rtol`,
+        relative to gain * desired - background. Where no bound holds, noise of a method that samples stays;
+        it is part of `error` and `gap`, and makes the gain that gain="auto" finds smaller.
+    exact : Transport, optional
+        The uncompressed transport that a compressed T stands for: T then solves, to an `rtol` as
+        `ltcl.solve` says, and everything else is of `exact`; the pattern itself is rounded to float32, 6e-8.
+    inverse : Inverse, optional
+        Of T, as `ltcl.invert` makes it: the light without bounds is then one product, whatever the method.
+    clamp : bool
+        Clamp the light to the bounds where it exceeds them, and leave it at that: quick, for videos. What is
+        lost is the light by which other pixels would make up for it; `error` tells how far off that is, and
+        `gap` is the whole error, since nothing is proved.
+
+    Returns
+    -------
+    Compensation
+        Never worse than the light without bounds, clamped, at a given gain; within the loss of gain="auto".
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, bounds in the wrong order, a gain that is not positive, weights below 0, no
+        gain that keeps the picture within `loss`, or an `rtol` below the error of a compressed T without
+        `exact`, or below that of `inverse`, or an inverse of another transport.
+    ConvergenceError
+        A solve did not reach `rtol` in `maxiter` steps, or not at all. Within the bounds, where float32 is
+        too coarse to prove it, the best that was found comes back, and `gap` tells what is proved.
+
+    Notes
+    -----
+    F = diag(T) is a valid choice here for any opaque scene: compensation does not depend on it.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
+    >>> ltcl.compensate(T, numpy.array([[0.3, 0.3]])).pattern.round(2).tolist()
+    [[0.5, 0.5]]
+    >>> c = ltcl.compensate(T, numpy.array([[1.0, 1.0]]), gain="auto")
+    >>> round(c.gain, 2), c.pattern.round(2).tolist()
+    (0.6, [[1.0, 1.0]])
+    """
+    require(T, square=False)
+    low_high, requested = problems.bounds(bounds), problems.gain(gain, loss)
+    limits = Limits.in_float32(low_high, T.join([T.masked] * T.channels)[0])
+    wanted, shape = problems.desired(desired, T)
+    dark = problems.background(background, T, shape, wanted)
+    counts, unit = problems.weights(weights, T, shape, wanted)
+    if inverse is not None:
+        require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
+    rtol = default_rtol(RTOL, T, exact, inverse) if rtol is None else rtol
+    rules = problems.rules(T, method, rtol, options)
+    problems.clamp(clamp, T)
+    true, judges = resolve_reference(T, exact)
+
+    def undo(parts: Columns) -> tuple[Solution, ...]:
+        """S^-1 of one target a system: one solution a channel."""
+        parts = T.split(parts)
+        if inverse is not None:
+            return tuple(inverse.solve(b, channel) for channel, b in enumerate(parts))
+        return solve_each(
+            T.systems, parts, method, exact=judges, rtol=rtol, with_residual=rtol >= _COARSE, **options
+        )
+
+    problem = Problem(
+        systems(true),
+        T.join(wanted),
+        T.join(dark),
+        None if counts is None else T.join(counts),
+        limits,
+        {**rules, "atol": rules["atol"] / unit},
+        unit,
+    )
+    start = _start(T, problem, undo, requested, loss, exactly=weights is None)
+    light, limited = _within(problem, start, options.get("throw", True), clamp)
+    c = _result(true, problem, shape, start, light, limited)
+    if requested is not None and c.clipped > 0.0:
+        problems.warn_of_units(desired, float(c.target.max()), float(c.appearance.max()))
+    return c
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """A gain, and the light (N, k) of each system to be brought within the limits.
+
+    `solutions` are those without bounds, one a channel, where T has an S. Light that `meets` the target
+    is the best there is if clipping does not change it.
+    """
+
+    gain: float
+    light: Columns
+    solutions: tuple[Solution, ...] = ()
+    meets: bool = False
+
+
+def _start(
+    T: Transport,
+    problem: Problem,
+    undo: Callable[[Columns], tuple[Solution, ...]],
+    gain: float | None,
+    loss: float | None,
+    exactly: bool,
+) -> _Start:
+    """At `gain`, or at the largest within `loss`; where both are None, `exactly` within reach if any is."""
+    k = problem.desired[0].shape[1]
+    if not T.is_square:
+        if gain is None:
+            return _Start(*gains.within_loss(problem, loss))
+        return _Start(gain, [np.zeros((len(system.scale), k)) for system in problem.systems])
+    if gain is not None:
+        solutions = undo(problem.target(gain))
+        # S^-1 meets every pixel but those of masked ones, which count only where weights say so.
+        masked = problem.limits.masked
+        counted = problem.weights is not None and any(part[masked].any() for part in problem.weights)
+        return _Start(gain, _light(T, [s.x for s in solutions]), solutions, meets=not counted)
+    # Light is affine in the gain: desired and background are solved side by side, once.
+    both = undo([np.hstack(sides) for sides in zip(problem.desired, problem.dark, strict=True)])
+    u, v = (_light(T, [s.x[:, part] for s in both]) for part in (slice(k), slice(k, None)))
+    gain = gains.exact(u, v, problem.limits) if exactly and loss is None else None
+    if gain is not None:
+        solutions = tuple(_combined(s, gain, k) for s in both)
+        return _Start(gain, _light(T, [s.x for s in solutions]), solutions, meets=True)
+    gain, light = gains.within_loss(problem, loss)
+    return _Start(gain, light, tuple(_combined(s, gain, k) for s in both))
+
+
+def _light(T: Transport, parts: Columns) -> Columns:
+    """Projector light, one array a system, of one direct component a channel."""
+    return T.join(T.to_light(parts))
+
+
+def _combined(both: Solution, gain: float, k: int) -> Solution:
+    """gain * the first k columns - the others; both share their samples, so that errors add at worst."""
+    error = both.standard_error
+    if error is not None:
+        error = gain * error[:, :k] + error[:, k:]
+    return dataclasses.replace(both, x=gain * both.x[:, :k] - both.x[:, k:], standard_error=error, rest=None)
+
+
+def _within(
+    problem: Problem, start: _Start, throw: bool, clamp: bool
+) -> tuple[Columns, list[Bounded | None]]:
+    """Light within the limits, and the solve that it took of each system, None where it took none."""
+    light: Columns = []
+    limited: list[Bounded | None] = []
+    for which, free in enumerate(start.light):
+        nearest, solution = problem.limits.clip(free), None
+        if not clamp and (not start.meets or problem.limits.exceeded(free) is not None):
+            nearest, solution = problem.nearest(which, start.gain, nearest)
+            if throw and solution.status is Status.MAXITER:
+                raise ConvergenceError(str(solution), solution)
+        light.append(nearest)
+        limited.append(solution)
+    return light, limited
+
+
+def _result(
+    T: Transport,
+    problem: Problem,
+    shape: layout.Layout,
+    start: _Start,
+    light: Columns,
+    limited: list[Bounded | None],
+) -> Compensation:
+    target = problem.scaled(start.gain)
+    solved = tuple(found for found in limited if found is not None)
+    solutions, frames = start.solutions or solved, shape.frames or 1
+    frame_clipped = _clipped(light, start.light, limited, problem.limits, frames)
+    clipped = float(np.mean(frame_clipped))
+    missing = [one.rest for one in start.solutions if one.rest is not None]
+    if clipped or solved or len(missing) < T.channels or problem.limits.masked.any():
+        queued = [A.apply(A.device.upload(p)) for A, p in zip(T.operators, light, strict=True)]
+        seen = [T_p.get() for T_p in queued]
+        if not problem.is_dark:
+            seen = [T_p + dark for T_p, dark in zip(seen, problem.dark, strict=True)]
+        missing = [wanted - found for wanted, found in zip(target, seen, strict=True)]
+    else:  # the light of the solve as it is, whose residual is what is missing
+        missing = T.join(missing)
+        seen = [wanted - left for wanted, left in zip(target, missing, strict=True)]
+    sizes, errors = (problem.norms(parts, frames) for parts in (target, missing))
+    size, error = (float(np.linalg.norm(norms)) for norms in (sizes, errors))
+    size = size or 1.0
+    least = np.sqrt(sum(float(np.sum(np.square(found.least / problem.unit))) for found in solved))
+
+    def picture(columns: Columns, grid: tuple[int, int]) -> np.ndarray:
+        return shape.pack(T.split(columns), grid).astype(np.float32, copy=False)
+
+    shown = picture(target, T.camera_grid)
+    beyond = picture(_beyond(problem, missing, target), T.camera_grid) if clipped else np.zeros_like(shown)
+    return Compensation(
+        pattern=picture(light, T.grid),
+        appearance=picture(seen, T.camera_grid),
+        gain=start.gain,
+        clipped=clipped,
+        target=shown,
+        out_of_reach=beyond,
+        error=error / size,
+        gap=max(error - float(least), 0.0) / size,
+        frame_errors=errors / np.where(sizes > 0, sizes, 1.0),
+        frame_clipped=frame_clipped,
+        solution=solutions[0] if len(solutions) == 1 else solutions,
+        limited=solved,
+        transport_error=T.error,
+        rtol=problem.rules["rtol"],
+    )
+
+
+def _clipped(
+    light: Columns, free: Columns, limited: list[Bounded | None], limits: Limits, frames: int
+) -> np.ndarray:
+    """Share of values at a bound that want to go beyond it, (frames,), of pixels that are lit."""
+    shares = []
+    for p, without, solution in zip(light, free, limited, strict=True):
+        held = limits.exceeded(without) if solution is None else solution.held & limits.touched(p)
+        if held is None:
+            shares.append(np.zeros(frames))
+            continue
+        lit = held[~limits.masked]
+        shares.append(lit.reshape(len(lit), frames, -1).mean(axis=(0, 2)))
+    return np.mean(shares, axis=0)
+
+
+def _beyond(problem: Problem, missing: Columns, target: Columns) -> Columns:
+    """What is missing, without what the tolerance of a solve explains."""
+    counted = zip(missing, problem.weighted(missing), problem.weighted(target), strict=True)
+    rtol, atol = problem.rules["rtol"], problem.rules["atol"]
+    beyond = []
+    for part, wrong, wanted in counted:
+        norms = np.sqrt(np.einsum("mk,mk->k", wanted, wanted, dtype=np.float64))
+        allowed = np.maximum(rtol * norms, atol) / np.sqrt(len(part))
+        beyond.append(np.where(np.abs(wrong) > _EXPLAINED * allowed, part, 0.0))
+    return beyond

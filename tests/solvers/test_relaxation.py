@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Relaxation is that of the textbook, row by row and block by block, and converges where Jacobi does not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse
+
+import ltcl
+from ltcl.errors import ConvergenceError, InputError
+from ltcl.operators import CSR, Dense, IdentityPlus
+from ltcl.solvers import Status
+from tests import reference
+from tests.problems import enclosure, lambertian, residual
+
+FORMATS = {"csr": lambda device, M: CSR(device, scipy.sparse.csr_array(M)), "dense": Dense}
+SCENE = lambertian(53, rho=0.8, seed=2, density=0.6)
+DUALS = {"inverse": (SCENE.R, 1), "forward": (SCENE.A, -1)}
+OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {  # method and its options
+    "gauss_seidel": ("gauss_seidel", {}),
+    "rows of 7": ("gauss_seidel", {"block": 7}),
+    "sor": ("sor", {"omega": 1.2}),
+    "sor, rows of 1": ("sor", {"omega": 0.8, "block": 1}),
+    "blocks of 1": ("block_gauss_seidel", {"block": 1}),
+    "blocks of 7": ("block_gauss_seidel", {"block": 7}),
+    "blocks of 32": ("block_gauss_seidel", {"block": 32}),
+}
+random = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize("sweeps", [1, 2, 5])
+@pytest.mark.parametrize("dual", DUALS)
+@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize("form", FORMATS)
+def test_k_iterations_are_k_sweeps(device, form, name, dual, sweeps):
+    (method, options), (matrix, sign) = OPTIONS[name], DUALS[dual]
+    b = random.uniform(0.0, 1.0, (SCENE.n, 5))
+    x0, S = random.normal(size=b.shape), np.eye(SCENE.n) + sign * matrix
+    A = IdentityPlus(FORMATS[form](device, matrix), sign)
+    s = ltcl.solve(A, b, method, **options, x0=x0, rtol=1e-7, atol=1e-30, maxiter=sweeps, throw=False)
+    if method == "block_gauss_seidel":
+        wanted = reference.block_gauss_seidel(S, x0, b, options["block"], s.iterations)
+    else:
+        wanted = reference.sor(S, x0, b, options.get("omega", 1.0), s.iterations)
+    assert s.iterations == sweeps or s.residual < 1e-6
+    # Each sweep rounds a sum of n float32 products; inverses of blocks are no larger than S^-1 here.
+    np.testing.assert_allclose(s.x, wanted, rtol=0, atol=sweeps * SCENE.n * 2**-24 * np.abs(wanted).max())
+    assert s.residuals[-1] == pytest.approx(residual(S, wanted, b), rel=1e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("rho", [1.5, 4.0, 9.0])
+@pytest.mark.parametrize(
+    "make", [lambda rho: enclosure(40, rho / (1 + rho)), lambda rho: lambertian(40, rho)]
+)
+def test_they_converge_where_jacobi_diverges(device, make, rho):
+    scene = make(rho)
+    S, b = IdentityPlus(Dense(device, scene.R)), scene.S @ random.uniform(0.0, 1.0, scene.n)
+    assert ltcl.solve(S, b, "jacobi", throw=False).status is Status.DIVERGED
+    table: list[tuple[str, dict[str, Any]]] = [*OPTIONS.values(), ("southwell", {"rows": 1})]
+    for method, options in table:
+        s = ltcl.solve(S, b, method, rtol=1e-3, **options)
+        assert residual(scene.S, s.x, b) <= 1e-3 * (1 + 1e-3)
+        # k sweeps, one that tells the residual of the last, and a product that confirms it.
+        assert s.products == s.iterations + (1 if method == "southwell" else 2)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_what_one_sweep_solves(device, form):
+    """Rows that need none below them, one block, and blocks that do not see each other."""
+    lower = np.eye(30) + np.tril(random.uniform(0.0, 1.0, (30, 30)), -1) / 30
+    apart = scipy.linalg.block_diag(*(lambertian(8, 4.0, seed).S for seed in range(4)))
+    table = [
+        (lower, "gauss_seidel", 4),
+        (SCENE.S, "block_gauss_seidel", 53),
+        (SCENE.S, "block_gauss_seidel", 1000),
+        (apart, "block_gauss_seidel", 8),
+    ]
+    for S, method, block in table:
+        b = random.uniform(0.0, 1.0, (len(S), 3))
+        s = ltcl.solve(FORMATS[form](device, S), b, method, block=block, rtol=1e-5)
+        assert s.iterations == 1
+        np.testing.assert_allclose(s.x, np.linalg.solve(S, b), rtol=0, atol=1e-5 * float(np.linalg.norm(b)))
+    b = random.uniform(0.0, 1.0, (4 * 8, 3))
+    assert ltcl.solve(FORMATS[form](device, apart), b, "gauss_seidel", rtol=1e-5).iterations > 5
+
+
+def test_growth_is_noticed(device):
+    """S of spectral radius far beyond what any splitting takes, and not self-adjoint."""
+    S = np.eye(6) + np.triu(np.full((6, 6), 9.0), 1) + np.tril(np.full((6, 6), 9.0), -1)
+    S[0] *= (1, -1, -1, -1, -1, -1)
+    with pytest.raises(ConvergenceError) as caught:
+        ltcl.solve(S, np.ones(6), "gauss_seidel")
+    assert caught.value.solution.status is Status.DIVERGED
+    assert np.isfinite(caught.value.solution.x).all()
+
+
+@pytest.mark.parametrize("dual", DUALS)
+def test_one_row_a_step_is_the_textbook_of_southwell(device, dual):
+    matrix, sign = DUALS[dual]
+    S, b = np.eye(SCENE.n) + sign * matrix, random.uniform(0.0, 1.0, (SCENE.n, 2))
+    s = ltcl.solve(S, b, "southwell", rows=1, maxiter=2, rtol=1e-6, throw=False)
+    x, r = np.zeros_like(b), b
+    for _ in range(2 * SCENE.n):
+        x, r = reference.southwell_step(S, 1, x, r)
+    np.testing.assert_allclose(s.x, x, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(s.residuals[-1], residual(S, x, b), rtol=1e-2)
+
+
+def test_sets_of_rows_converge(device):
+    scene = lambertian(400, 4.0, seed=7, density=0.3)
+    b = scene.S @ random.uniform(0.0, 1.0, scene.n)
+    for make in FORMATS.values():
+        s = ltcl.solve(IdentityPlus(make(device, scene.R)), b, "southwell", rtol=1e-3)
+        assert residual(scene.S, s.x, b) <= 1e-3 * (1 + 1e-3)
+
+
+def test_all_rows_at_once_is_jacobi(device):
+    scene = enclosure(30, 0.8)
+    S, b = IdentityPlus(Dense(device, scene.R - np.diag(scene.R.diagonal()))), random.uniform(size=30)
+    one = ltcl.solve(S, b, "southwell", rows=30, maxiter=3, rtol=1e-6, throw=False)
+    other = ltcl.solve(S, b, "jacobi", maxiter=3, rtol=1e-6, throw=False)
+    np.testing.assert_allclose(one.residuals, other.residuals, rtol=1e-4)
+    assert ltcl.solve(S, b, "southwell", rows=30, throw=False).status is Status.DIVERGED
+
+
+BAD_COUNTS = [0, -1, 2.5, "all", np.nan]
+BAD_OPTIONS = [
+    *((method, "block", value) for method in ("gauss_seidel", "sor") for value in BAD_COUNTS),
+    *(("block_gauss_seidel", "block", value) for value in (*BAD_COUNTS, None)),
+    *(("southwell", "rows", value) for value in BAD_COUNTS),
+    *(("sor", "omega", value) for value in (0.0, -1.0, 2.0, np.inf, np.nan, "fast", [1.0])),
+]
+
+
+@pytest.mark.parametrize(("method", "option", "value"), BAD_OPTIONS)
+def test_an_unusable_option_is_refused(method, option, value):
+    with pytest.raises(InputError, match=rf"{option} is "):
+        ltcl.solve(np.eye(3), np.ones(3), method, **{option: value})
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_singular_block_is_refused_by_rows(device, form):
+    """S has an inverse, its second block has none."""
+    S = np.eye(5)
+    S[2:4, 2:4] = [[1.0, 2.0], [2.0, 4.0]]
+    S[2, 4] = S[4, 2] = 1.0
+    assert np.linalg.matrix_rank(S) == 5
+    with pytest.raises(InputError, match=r"'block_gauss_seidel'.* 2 to 3 .*block") as caught:
+        ltcl.solve(FORMATS[form](device, S), np.ones(5), "block_gauss_seidel", block=2)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_zero_on_the_diagonal_is_refused(device):
+    with pytest.raises(InputError, match=r"'southwell'.*diagonal.* row 1"):
+        ltcl.solve(np.diag([1.0, 0.0]), np.ones(2), "southwell")

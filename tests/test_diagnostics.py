@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Reciprocity, light that a bounce takes away, energy: against matrices in float64 and known scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.sparse.linalg import aslinearoperator
+
+import ltcl
+from ltcl import diagnostics
+from ltcl.scenes import box, glossy
+from tests.problems import enclosure, lambertian
+
+FORMS = pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
+
+
+def check(device, T, F, form=np.asarray):
+    transport = ltcl.Transport(form(T), (1, len(F)), first_bounce=F, device=device)
+    return diagnostics.check_energy(transport.matrices[0], F, transport.systems[0])
+
+
+@FORMS
+@pytest.mark.parametrize("rho", [0.2, 0.9, 4.0])
+def test_row_sums_are_those_of_A(device, form, rho):
+    scene = lambertian(50, rho)
+    found = check(device, scene.T, scene.F, form)
+    sums = scene.A.sum(axis=1)
+    assert found.bounce_highest == pytest.approx(sums.max(), abs=1e-3 * (1 + rho))
+    assert found.bounce_lowest == pytest.approx(sums.min(), abs=1e-3 * (1 + rho))
+    column = scene.R.sum(axis=0).max()
+    assert found.albedo_from_columns == pytest.approx(column / (1 + column), rel=1e-5)
+    assert (found.negative_entries, found.negative_light) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.62, 0.9])
+def test_a_closed_room_tells_its_albedo(device, albedo):
+    box = enclosure(40, albedo)
+    found = check(device, box.T, box.F)
+    assert found.bounce_highest == pytest.approx(albedo, abs=2e-3)
+    assert found.albedo_from_columns == pytest.approx(albedo, abs=1e-5)
+    assert found.conserved
+
+
+def test_a_surface_that_returns_more_than_it_gets_is_found(device):
+    box = enclosure(40, 0.6)
+    A = box.A.copy()
+    A[3] *= 2.0  # albedo 1.2
+    scene = dataclasses.replace(box, A=A)
+    found = check(device, scene.T, scene.F)
+    assert found.bounce_highest == pytest.approx(1.2, abs=0.01)
+    assert not found.conserved
+
+
+@FORMS
+def test_negative_entries_are_counted_and_weighed(device, form):
+    T = np.eye(10)
+    T[0, 1], T[2, 3], T[4, 5] = -0.5, -1.5, 2.0
+    found = check(device, T, np.ones(10), form)
+    assert found.negative_entries == pytest.approx(0.02)
+    assert found.negative_light == pytest.approx(2.0 / 14.0)
+
+
+def test_hidden_entries_leave_what_products_tell(device):
+    scene = lambertian(30, 0.5)
+    found = check(device, scene.T, scene.F, aslinearoperator)
+    assert found.bounce_highest == pytest.approx(scene.A.sum(axis=1).max(), abs=2e-3)
+    assert all(
+        math.isnan(x) for x in (found.albedo_from_columns, found.negative_entries, found.negative_light)
+    )
+
+
+def test_where_the_solve_fails_nothing_is_claimed(device):
+    found = check(device, [[1.0, -1.0], [-1.0, 1.0]], np.ones(2))  # singular
+    assert math.isnan(found.bounce_highest)
+    assert not found.conserved
+
+
+def gain(n: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.3, 3.0, n)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.05, 10.0), st.floats(0.05, 1.0), st.integers(1, 40))
+@example(seed=1712, rho=2.0, density=0.5, n=7)  # a pixel that hardly shares light with the others
+def test_diffuse_scenes_are_reciprocal_whatever_gains_the_pixels_have(seed, rho, density, n):
+    """Albedo, area, first bounce, camera and projector pixels are all taken away by the fit."""
+    scene = lambertian(n, rho, seed, density)
+    T = gain(n, 1)[:, None] * scene.T * gain(n, 2)
+    for matrix in (T, scipy.sparse.csr_array(T)):
+        assert diagnostics.reciprocity_defect(matrix, np.diag(T)) < 1e-5
+
+
+@FORMS
+@pytest.mark.parametrize("noise", [0.01, 0.1])
+def test_independent_noise_shows_at_its_size(form, noise):
+    scene = lambertian(150, 0.8)
+    T = scene.T * (1 + noise * np.random.default_rng(0).normal(size=(150, 150)))
+    assert diagnostics.reciprocity_defect(form(T), scene.F) == pytest.approx(noise, rel=0.1)
+
+
+@FORMS
+def test_light_that_goes_one_way_only_has_defect_one(form):
+    T = np.eye(20) + np.triu(np.random.default_rng(0).random((20, 20)), 1)
+    assert diagnostics.reciprocity_defect(form(T), np.ones(20)) == pytest.approx(1.0)
+
+
+@FORMS
+def test_no_indirect_light_is_reciprocal(form):
+    assert diagnostics.reciprocity_defect(form(np.diag(gain(9))), np.ones(9)) == 0.0
+
+
+@FORMS
+def test_dense_and_sparse_agree_and_a_sample_is_like_the_whole(form):
+    rng = np.random.default_rng(5)
+    T = lambertian(300, 0.8).T * rng.uniform(0.5, 1.5, (300, 300))
+    whole = diagnostics.reciprocity_defect(T, np.diag(T))
+    assert diagnostics.reciprocity_defect(form(T), np.diag(T)) == pytest.approx(whole, rel=1e-4)
+    assert diagnostics.reciprocity_defect(form(T), np.diag(T), entries=100**2) == pytest.approx(
+        whole, rel=0.1
+    )
+
+
+@FORMS
+def test_masked_pixels_and_negative_entries_are_no_obstacle(form):
+    scene = lambertian(60, 0.8)
+    T, F = scene.T, scene.F.copy()
+    T[:, 7], F[7] = 5.0, 0.0
+    T[3, 4] = T[4, 3] = -1e-3
+    assert diagnostics.reciprocity_defect(form(T), F) < 0.05
+
+
+def test_hidden_entries_are_unknown():
+    assert np.isnan(diagnostics.reciprocity_defect(aslinearoperator(np.eye(4)), np.ones(4)))
+
+
+def test_a_path_traced_diffuse_corner_is_reciprocal_up_to_its_noise(shared_data: Path):
+    with np.load(shared_data / "transport-dihedral" / "transport.npz") as file:
+        T = file["T"]
+    assert 0.01 < diagnostics.reciprocity_defect(T, np.diag(T)) < 0.1
+
+
+@pytest.mark.parametrize("first_bounce", ["diagonal", "exact"])
+@pytest.mark.parametrize(("sides", "albedo"), [(2, 0.9), (3, 0.7), (6, 0.45), (6, 0.8)])
+def test_diffuse_boxes_take_nothing(device, sides, albedo, first_bounce):
+    T = box(6, sides, albedo).transport(first_bounce=first_bounce, device=device)
+    assert max(T.negative_bounces) < 1e-3
+
+
+def test_it_is_that_of_the_dense_inverse(device):
+    """Between the 16 rectangles of an 8 x 8 picture, of a matrix that takes light away."""
+    random = np.random.default_rng(3)
+    matrix = np.eye(64) + 0.02 * random.normal(size=(64, 64))
+    T = ltcl.Transport(matrix, (8, 8), first_bounce=np.ones(64), device=device)
+    A = np.eye(64) - np.linalg.inv(matrix)
+    parts = A.reshape(4, 2, 4, 2, 4, 2, 4, 2).sum(axis=(1, 3, 5, 7)).reshape(16, 16)
+    np.fill_diagonal(parts, 0.0)
+    wanted = -parts[parts < 0].sum() / np.abs(parts).sum()
+    assert T.negative_bounces[0] == pytest.approx(wanted, rel=2e-2)
+
+
+def test_noise_averages_out_over_the_parts(device):
+    """5 % of noise in every entry of a diffuse corner; each part has 18 pixels."""
+    scene = box(12, 2, 0.7)
+    (clean,) = scene.matrices()
+    noisy = clean * np.random.default_rng(1).normal(1.0, 0.05, clean.shape)
+    T = ltcl.Transport(noisy, scene.grid, device=device)
+    assert max(T.negative_bounces) < 2e-3
+
+
+def test_gloss_takes_more_the_more_there_is(device, caplog):
+    found = []
+    for gloss in (0.1, 0.3, 0.8):
+        scene = glossy(
+            box(1, sides=3),
+            6,
+            gloss=gloss,
+            projector=(2.0, 1.4, 1.2),
+            camera=(1.5, 1.2, 1.9),
+            directions=16,
+        )
+        T = scene.transport(device=device)
+        b = ltcl.separate(T, T @ np.ones(T.grid), bounces=1)
+        assert "section 8.4" in b.warning
+        assert b.warning in caplog.text
+        found.append(b.negative_bounce)
+    assert found == sorted(found)
+
+
+def test_it_is_computed_once(device):
+    T = box(3, 3, 0.5).transport(device=device)
+    assert T.negative_bounces is T.negative_bounces
