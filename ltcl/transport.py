@@ -379,8 +379,7 @@ def to_arrays(T: Transport) -> dict[str, np.ndarray]:
     if not T.is_square or len(known) < len(systems):
         kinds = ", ".join(sorted({type(matrix).__name__ for matrix in T.matrices}))
         raise InputTypeError(
-            f"T is made of {kinds}; only arrays, sparse matrices and operators S diag(F) can be saved"
-            " or copied"
+            f"T is made of {kinds}; only arrays, sparse matrices and operators S diag(F) can be stored"
         )
     F = np.atleast_2d(T.first_bounce)
     arrays = {"grid": np.array(T.grid), "first_bounce": F}

@@ -7,10 +7,10 @@ import contextlib
 import math
 import os
 import threading
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,9 +31,8 @@ _POOLED = 256  # arrays up to this part of the memory are pooled: vectors are, m
 class Profile:
     """Launches and seconds per kernel, as the device's own clock saw them."""
 
-    launches: dict[str, int] = field(default_factory=Counter)
-    # A Counter, whose values are int to the type checker alone.
-    seconds: dict[str, float] = field(default_factory=cast("type[dict[str, float]]", Counter))
+    launches: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
 
 
 class _Recording(threading.local):
