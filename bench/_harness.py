@@ -25,6 +25,9 @@ from rich.table import Table
 import ltcl
 from ltcl.device import Device
 
+_REST = 0.3  # seconds
+_rest = _REST
+
 
 @dataclass(frozen=True)
 class Options:
@@ -65,19 +68,27 @@ def options(description: str) -> Options:
     parser.add_argument("--plot", type=Path, help="draw what was found into this PNG")
     parser.add_argument("--device", help="as ltcl.open_device takes it")
     given = parser.parse_args()
+    global _rest
+    _rest = 0.0 if given.smoke else _REST
     return Options(given.smoke, given.json, given.plot, ltcl.open_device(given.device))
 
 
 def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> dict[str, float]:
     """Median seconds of each action, run in turn A B C A B C.
 
-    Each is run twice in its turn and the second run counts: in a solve, a product follows a product, and
-    not a competitor that has just emptied the caches.
+    In its turn each is run at least twice and the last run counts: in a solve, a product follows a product,
+    and not a competitor that has just emptied the caches. Before its turn comes a rest, as threads of BLAS
+    and OpenMP spin for a while after their work and would take the cores from whoever is next; so many runs
+    of warming up follow as wake the processor again.
     """
     times: dict[str, list[float]] = {name: [] for name in actions}
     for _ in range(repeats):
         for name, action in actions.items():
+            time.sleep(_rest)
+            warm = time.perf_counter() + _rest / 3
             action()
+            while time.perf_counter() < warm:
+                action()
             start = time.perf_counter()
             action()
             times[name].append(time.perf_counter() - start)

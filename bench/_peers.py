@@ -45,6 +45,7 @@ def _scipy(A: Any, x: np.ndarray) -> Product:
 def _mkl(A: Any, x: np.ndarray) -> Product:
     import scipy.sparse
 
+    os.environ.setdefault("KMP_BLOCKTIME", "0")  # its threads must not spin while others are timed
     # It looks for the library beside Python itself, where an environment of `venv` has it not.
     found = [file for file in metadata.files("mkl") or () if file.name.startswith("libmkl_rt")]
     if found:
