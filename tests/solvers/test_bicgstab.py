@@ -31,7 +31,7 @@ def textbook(S: np.ndarray, b: np.ndarray, steps: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("steps", [1, 2, 4])
-@pytest.mark.parametrize("skew", [0.0, 0.02])  # more of it may leave S nearly singular
+@pytest.mark.parametrize("skew", [0.0, 0.1])
 def test_its_iterates_are_the_textbooks(device, skew, steps):
     random = np.random.default_rng(1)  # the residual falls at every step: the best iterate is the last one
     S = lambertian(40, 4.0, 29).S + skew * random.normal(size=(40, 40))
