@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse
+import scipy.sparse.linalg
 
 import ltcl
 from ltcl.errors import InputError, InputTypeError, ToleranceError
@@ -137,6 +138,17 @@ def test_a_transport_of_any_form_is_inverted(form, basis):
     assert off(inverse, scene.S) <= inverse.error <= 0.1
     assert inverse.error > C.error
     assert inverse.confidence > 0.999
+
+
+def test_another_first_bounce_or_somebodys_operator(device):
+    """S of neither has numbers at hand: F / F' stands between, or products are all there are."""
+    scene = lambertian(48, 0.8, seed=7)
+    F = scene.F * np.random.default_rng(11).uniform(0.9, 1.1, 48)
+    stored = ScaledColumns(IdentityPlus(Dense(device, scene.R)), scene.F)
+    for matrix in (stored, scipy.sparse.linalg.aslinearoperator(scene.T)):
+        for basis in ("db2", "pixels"):
+            inverse = ltcl.invert(ltcl.Transport(matrix, GRID, first_bounce=F), 1e-2, basis=basis)
+            assert off(inverse, scene.T / F) <= inverse.error <= 1e-2
 
 
 def test_colours_of_several_forms(device):
