@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import ltcl
@@ -16,6 +18,13 @@ from ltcl.device.device import SPARE_BYTES
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SMALL = 4096  # bytes: a 53 x 53 matrix takes several slabs, its vectors still fit
 ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Each test draws its own numbers from its module's `random`, whatever ran before it."""
+    module = getattr(item, "module", None)
+    if isinstance(getattr(module, "random", None), np.random.Generator):
+        module.random = np.random.default_rng(zlib.crc32(item.name.encode()))
 
 
 @pytest.fixture(scope="session", autouse=True)
