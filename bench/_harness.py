@@ -2,7 +2,7 @@
 """What every bench shares: options, paired timing, the roofline, and the report.
 
 Ratios count: competitors are timed in turn with us, in one process, so that a machine whose speed drifts
-slows all of them alike. Figures are medians. A missed target is printed as plainly as one that is hit.
+slows all of them alike. Figures are medians.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 import ltcl
-from ltcl.device import Device
+from ltcl.device import Device, vectors
 
 _REST = 0.3  # seconds
 _rest = _REST
@@ -51,6 +51,13 @@ class Row:
     ratio: float
     target: float | None = None
 
+    @classmethod
+    def of_times(
+        cls, question: str, who: str, theirs: float, ours: float, unit: str, target: float | None = None
+    ) -> Row:
+        """The less, the better."""
+        return cls(question, who, theirs, ours, unit, theirs / ours, target)
+
     @property
     def verdict(self) -> str:
         """Hit, miss by how much, or nothing where there is no target."""
@@ -67,19 +74,17 @@ def options(description: str) -> Options:
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--plot", type=Path, help="draw what was found into this PNG")
     parser.add_argument("--device", help="as ltcl.open_device takes it")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     global _rest
-    _rest = 0.0 if given.smoke else _REST
-    return Options(given.smoke, given.json, given.plot, ltcl.open_device(given.device))
+    _rest = 0.0 if arguments.smoke else _REST
+    return Options(arguments.smoke, arguments.json, arguments.plot, ltcl.open_device(arguments.device))
 
 
 def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> dict[str, float]:
     """Median seconds of each action, run in turn A B C A B C.
 
-    In its turn each is run at least twice and the last run counts: in a solve, a product follows a product,
-    and not a competitor that has just emptied the caches. Before its turn comes a rest, as threads of BLAS
-    and OpenMP spin for a while after their work and would take the cores from whoever is next; so many runs
-    of warming up follow as wake the processor again.
+    Before its turn comes a rest, as threads of BLAS and OpenMP spin after their work; then it runs until the
+    processor is awake, and once more, which counts: in a solve a product follows a product.
     """
     times: dict[str, list[float]] = {name: [] for name in actions}
     for _ in range(repeats):
@@ -101,13 +106,12 @@ class Triad:
     def __init__(self, device: Device, smoke: bool) -> None:
         self.device = device
         self.count = 1 << (16 if smoke else 25)
-        self._arrays = [device.upload(np.ones(self.count, np.float32)) for _ in range(3)]
-        self._kernel = device.kernel("vector", "vector_triad")
+        self._arrays = [vectors.fill(device.empty(self.count), 1.0) for _ in range(3)]
 
     def __call__(self) -> None:
         """Run once and wait."""
         b, c, out = self._arrays
-        self._kernel(self.count // 8, 64, self.count // 8, 2.0, b, c, out)
+        vectors.axpby(2.0, b, 1.0, c, out)
         self.device.finish()
 
     @property
@@ -131,7 +135,8 @@ def report(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -
         table.add_row(row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict)
     console.print(table)
     if given.json is not None:
-        write_json(given.json, record(given, title, facts) | {"rows": [_row(row) for row in rows]})
+        content = [{**asdict(row), "verdict": row.verdict} for row in rows]
+        write_json(given.json, record(given, title, facts) | {"rows": content})
     if given.plot is not None:
         _draw(given.plot, title, rows)
 
@@ -157,10 +162,6 @@ def record(given: Options, title: str, facts: dict[str, Any]) -> dict[str, Any]:
         },
         "facts": facts,
     }
-
-
-def _row(row: Row) -> dict[str, Any]:
-    return {**asdict(row), "verdict": row.verdict}
 
 
 def _draw(path: Path, title: str, rows: list[Row]) -> None:

@@ -13,11 +13,21 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
+from rich.console import Console
 
 from ltcl.compression.coefficients import drop_below
+from ltcl.operators import Wavelet
 
 ROWS = 64  # more, and the system hands out and takes back memory at every step
 SHIFT, LOWEST, BINS = 16, 95 << 7, 4096  # 128 bins an octave of float32, by its bits, from 2^-32 up to 1
+
+
+note = Console(stderr=True).print
+
+
+def analysis(W: Wavelet) -> Callable[[np.ndarray], np.ndarray]:
+    """W of arrays on the host, in float32."""
+    return lambda x: W.apply(W.device.upload(x)).get()
 
 
 def errors(matrix: Any, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Sparse products of others, in float32 with 32-bit indices: what the extra `bench` brings, PyTorch and CuPy.
+"""Sparse products of others, in float32 with 32-bit indices: what the extra `bench` brings, and CuPy.
 
 A peer that is not installed is named and left out; SciPy and NumPy are always there.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import warnings
 from collections.abc import Callable
 from importlib import metadata
 from typing import Any
@@ -17,29 +16,20 @@ from typing import Any
 import numpy as np
 
 Product = Callable[[], np.ndarray]
-PEERS = {
-    "scipy": "scipy",
-    "numba": "numba",
-    "sparse_dot_mkl": "sparse_dot_mkl",
-    "torch": "torch",
-    "cupy": "cupy",
-}
+PEERS = ("scipy", "numba", "sparse_dot_mkl", "cupy")
 
 
 def missing() -> list[str]:
     """Peers that are not installed."""
-    return [name for name, module in PEERS.items() if importlib.util.find_spec(module) is None]
+    return [name for name in PEERS if importlib.util.find_spec(name) is None]
 
 
 def sparse_products(A: Any, x: np.ndarray) -> dict[str, Product]:
     """A @ x by every peer that is there, for a csr_array A of float32 and x (N,) or (N, k)."""
-    makers = {"scipy": _scipy, "numba": _numba, "sparse_dot_mkl": _mkl, "torch": _torch, "cupy": _cupy}
+    makers = {"numba": _numba, "sparse_dot_mkl": _mkl, "cupy": _cupy}
     absent = missing()
-    return {name: make(A, x) for name, make in makers.items() if name not in absent}
-
-
-def _scipy(A: Any, x: np.ndarray) -> Product:
-    return lambda: A @ x
+    products = {name: make(A, x) for name, make in makers.items() if name not in absent}
+    return {"scipy": lambda: A @ x, **products}
 
 
 def _mkl(A: Any, x: np.ndarray) -> Product:
@@ -54,19 +44,6 @@ def _mkl(A: Any, x: np.ndarray) -> Product:
 
     matrix = scipy.sparse.csr_matrix(A)  # it takes no csr_array
     return lambda: mkl.dot_product_mkl(matrix, x)
-
-
-def _torch(A: Any, x: np.ndarray) -> Product:
-    torch: Any = importlib.import_module("torch")  # in no extra: it brings gigabytes
-
-    pointers, columns = (
-        torch.from_numpy(part.astype(np.int32, copy=False)) for part in (A.indptr, A.indices)
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # that its sparse rows are in beta state
-        matrix = torch.sparse_csr_tensor(pointers, columns, torch.from_numpy(A.data), size=A.shape)
-    operand = torch.from_numpy(x if x.ndim == 2 else x[:, None])
-    return lambda: (matrix @ operand).numpy().reshape(A.shape[0], *x.shape[1:])
 
 
 def _cupy(A: Any, x: np.ndarray) -> Product:

@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
-from rich.console import Console
 
 import ltcl
 from _corner import interreflection
 from _harness import Options
-from _kept import bisect
+from _kept import analysis, bisect, note
 from ltcl.compression import invert_coefficients
 from ltcl.compression.coefficients import coefficients, drop_below
 from ltcl.compression.sources import source
@@ -43,8 +42,7 @@ DROPPED = 0.7e-2  # of the error, what compression may take; the iteration has t
 TOLERANCES = 0.5 ** np.arange(1, 12, 0.5)
 THRESHOLD, FINE = 1e-4, 5e-4  # of numbers of A; of R before it is thresholded
 MOST = 128  # wavelets a row from which the largest are chosen
-MEMORY, OFTEN = 1 << 28, 20.0  # bytes for a block; seconds from one word about progress to the next
-note = Console(stderr=True).print
+MEMORY = 1 << 28  # bytes of a block
 
 
 @dataclass(frozen=True)
@@ -130,36 +128,12 @@ def _series(inverse: Callable[[], np.ndarray], at: Problem, like: Way) -> Way:
     return Way(run, at.error(l_d), spent, like.products - 1, like.nbytes, like.kept)
 
 
-def telling(what: str) -> Callable[[float], None]:
-    """Says how far it is, now and then."""
-    last = time.perf_counter()
-
-    def tell(share: float) -> None:
-        nonlocal last
-        if time.perf_counter() >= last + OFTEN:
-            last = time.perf_counter()
-            note(f"  {what}, {share:.0%}")
-
-    return tell
-
-
 def of_both(given: Options, at: Problem) -> Any:
     """C of R = W^T C W in db2, far finer than needed."""
-    W = Wavelet(given.device, at.rows.grid, "db2")
-
-    def transform(x: np.ndarray) -> np.ndarray:
-        return W.apply(given.device.upload(x)).get()
-
-    A = coefficients(
-        at.rows,
-        transform,
-        transform,
-        THRESHOLD,
-        first=THRESHOLD / 4,
-        memory=MEMORY,
-        progress=telling(f"N = {len(at.l_out)}: compressing A"),
-    )
-    return invert_coefficients(A.core, -1, rtol=FINE).D
+    transform = analysis(Wavelet(given.device, at.rows.grid, "db2"))
+    rows = source("A", at.rows, MEMORY)
+    A = coefficients(rows, transform, transform, THRESHOLD, first=THRESHOLD / 4)
+    return -invert_coefficients(-A.core, rtol=FINE).D
 
 
 def of_rows(given: Options, at: Problem, C: Any) -> Any:
@@ -169,10 +143,9 @@ def of_rows(given: Options, at: Problem, C: Any) -> Any:
     def synthesis(a: np.ndarray) -> np.ndarray:
         return W.apply_transpose(given.device.upload(a)).get()
 
-    columns = source("C", scipy.sparse.csr_array(C.T))
+    columns = source("C", scipy.sparse.csr_array(C.T), MEMORY)
     drop, most = FINE * float(np.linalg.norm(C.data)), MOST * C.shape[0]
-    say = telling(f"N = {len(at.l_out)}: rows of R")
-    found = coefficients(columns, None, synthesis, drop=drop, most=most, memory=MEMORY, progress=say)
+    found = coefficients(columns, None, synthesis, drop=drop, most=most)
     return scipy.sparse.csr_array(found.core.T)
 
 

@@ -29,10 +29,9 @@ TRIAD_TARGET = 0.9  # part of the triad's bytes a second, where a row is made of
 def matrix(n: int, per_row: int, run: int, seed: int = 0) -> Any:
     """(n, n) with `per_row` nonzeros in runs of `run` neighbouring columns at distinct random places."""
     rng = np.random.default_rng(seed)
-    stretches = n // run
-    # One draw from each of per_row / run equal parts: sorted and distinct without rejection.
     parts = per_row // run
-    edges = np.linspace(0, stretches, parts + 1).astype(int)
+    # One draw from each of these equal parts: sorted and distinct without rejection.
+    edges = np.linspace(0, n // run, parts + 1).astype(int)
     starts = rng.integers(edges[:-1], edges[1:], size=(n, parts)) * run
     columns = (starts[:, :, None] + np.arange(run)).reshape(-1).astype(np.int32)
     values = rng.random(n * per_row, dtype=np.float32) / per_row
@@ -72,15 +71,13 @@ def compare(given: Options, name: str, A: Any, triad: Triad) -> list[Row]:
         for peer, who in PEERS.items():
             theirs = ms.get(f"{peer} {k}")
             if theirs is not None:
-                rows.append(Row(question, who, theirs, ours, "ms", theirs / ours, targets.get(peer)))
+                rows.append(Row.of_times(question, who, theirs, ours, "ms", targets.get(peer)))
         if k == 1:
             roof, rate = triad.nbytes / ms["triad"] / 1e6, 8 * A.nnz / ours / 1e6
             target = TRIAD_TARGET if "runs" in name else None
             rows.append(Row(question, "our triad", roof, rate, "GB/s", rate / roof, target))
         elif k in SIDE_TARGET:
-            rows.append(
-                Row(question, "k = 1", alone, ours / k, "ms a side", alone * k / ours, SIDE_TARGET[k])
-            )
+            rows.append(Row.of_times(question, "k = 1", alone, ours / k, "ms a side", SIDE_TARGET[k]))
     return rows
 
 

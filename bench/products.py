@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 
 import _figures as figures
 from _corner import interreflection
 from _harness import Options, Row, Triad, options, report, seconds
-from _kept import ROWS, errors, kept
+from _kept import ROWS, analysis, errors, kept, note
 from _peers import missing, sparse_products
 from ltcl import plots
 from ltcl.compression.coefficients import coefficients
@@ -43,7 +42,6 @@ FORMATS = {"pixels": "sparse rows of R", "rows": "its rows in db2", "both": "bot
 COLOURS = {"pixels": "#ffb347", "rows": "#7fd77f", "both": "#5cc8ff"}
 OTHERS = "#ff7f9f"
 OURS_TARGET, SCIPY_TARGET = 15.0, 30.0
-note = Console(stderr=True).print
 
 
 @dataclass(frozen=True)
@@ -70,14 +68,14 @@ class Form:
     into: Wavelet | None
     errors: np.ndarray
 
-    def operators(self, given: Options, numbers: Any) -> list[tuple[Operator, Operator]]:
-        """(core, operator on pictures) of some of the numbers: sparse rows, and tiles of 16 bits."""
+    def operators(self, given: Options, numbers: Any) -> tuple[Operator, Operator]:
+        """(core, operator on pictures) of some numbers: sparse rows, or tiles of 16 bits in a basis."""
         if self.into is None:
             core = CSR(given.device, numbers)
-            return [(core, core)]
+            return core, core
         numbers, basis = (numbers, self.into) if self.out is None else restrict_to_support(numbers, self.into)
-        cores = CSR(given.device, numbers), Tiles(given.device, numbers, 8, "float16")
-        return [(core, Compressed(core, basis if self.out else None, basis)) for core in cores]
+        core = Tiles(given.device, numbers, 8, "float16")
+        return core, Compressed(core, basis if self.out else None, basis)
 
 
 @dataclass(frozen=True)
@@ -85,18 +83,12 @@ class Point:
     """One format at one error: numbers kept a row, bytes, milliseconds of a product and of its core alone."""
 
     form: str
-    narrow: bool
     wanted: float
     error: float
     kept: float
     nbytes: int
     pixels: float
     core: float
-
-    @property
-    def name(self) -> str:
-        """What the facts call it."""
-        return f"{FORMATS[self.form]}{', 16 bits' if self.narrow else ''}"
 
 
 def problem(smoke: bool) -> Problem:
@@ -112,10 +104,8 @@ def problem(smoke: bool) -> Problem:
 def forms(given: Options, at: Problem) -> list[Form]:
     """R in pixels, with its rows in wavelets, and in wavelets on both sides."""
     W = Wavelet(given.device, at.grid, "db2")
+    transform = analysis(W)
     drop = DROP * float(np.linalg.norm(at.R.ravel()))
-
-    def transform(x: np.ndarray) -> np.ndarray:
-        return W.apply(given.device.upload(x)).get()
 
     found = []
     for name, out, into in (("pixels", None, None), ("rows", None, W), ("both", W, W)):
@@ -123,7 +113,7 @@ def forms(given: Options, at: Problem) -> list[Form]:
         matrix: Any = at.R
         if into is not None:
             rows = source("R", at.R)
-            matrix = coefficients(rows, None if out is None else transform, transform, drop=drop).core
+            matrix = coefficients(rows, out and transform, transform, drop=drop).core
         x, y = (v if V is None else V.matvec(v) for V, v in ((into, at.x), (out, at.y)))
         found.append(Form(name, matrix, out, into, errors(matrix, x, y)))
     return found
@@ -146,39 +136,36 @@ def measure(
 ) -> tuple[list[Point], dict[str, float]]:
     """All formats at one error; where it is that of the targets, milliseconds of everything else too."""
     numbers = {form.name: kept(form.matrix, form.errors, AIM * wanted) for form in found}
-    ways = [(form.name, *pair) for form in found for pair in form.operators(given, numbers[form.name])]
+    ways = [(form.name, *form.operators(given, numbers[form.name])) for form in found]
     actions: dict[str, Callable[[], object]] = {}
     if wanted == ERROR:
         actions = {"triad": triad, "dense numpy": lambda: at.R @ at.x}
         actions |= sparse_products(numbers["pixels"], at.x)
     others = list(actions)
-    for n, (_, core, A) in enumerate(ways):
-        actions[f"{n} pixels"] = action(given, A, at.x)
-        if core is not A:
-            actions[f"{n} core"] = action(given, core, at.x)
+    for form, core, A in ways:
+        actions[f"ours, {form}"] = action(given, A, at.x)
+        actions[f"core, {form}"] = action(given, core, at.x)
     note(f"timing {', '.join([*others, f'{len(ways)} of ours'])}")
     ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
     points = [
         Point(
             form=form,
-            narrow=isinstance(core, Tiles),
             wanted=wanted,
             error=at.error(A.matvec(at.x)),
             kept=numbers[form].nnz / len(at.x),
             nbytes=A.nbytes,
-            pixels=ms[f"{n} pixels"],
-            core=ms.get(f"{n} core", ms[f"{n} pixels"]),
+            pixels=ms[f"ours, {form}"],
+            core=ms[f"core, {form}"],
         )
-        for n, (form, core, A) in enumerate(ways)
+        for form, _, A in ways
     ]
     return points, {name: ms[name] for name in others}
 
 
 def at_one_percent(points: list[Point]) -> tuple[Point, Point]:
-    """Sparse rows of R, and the fastest of ours that a solve runs on."""
-    sparse, *mine = (point for point in points if point.wanted == ERROR)
-    both = (point for point in mine if point.form == "both" and point.error <= ERROR)
-    return sparse, min(both, key=lambda point: point.core)
+    """Sparse rows of R, and ours that a solve runs on."""
+    found = {point.form: point for point in points if point.wanted == ERROR}
+    return found["pixels"], found["both"]
 
 
 def compare(at: Problem, points: list[Point], ms: dict[str, float]) -> list[Row]:
@@ -187,15 +174,13 @@ def compare(at: Problem, points: list[Point], ms: dict[str, float]) -> list[Row]
     targets = {"our own sparse rows": OURS_TARGET, "scipy": SCIPY_TARGET}
     others = {"our own sparse rows": sparse.pixels} | ms
     rows = [
-        Row(f"1 % of R l, {how}", name, theirs, ours, "ms", theirs / ours, targets.get(name))
+        Row.of_times(f"1 % of R l, {how}", name, theirs, ours, "ms", targets.get(name))
         for how, ours in (("with transforms", best.pixels), ("in a solve", best.core))
         for name, theirs in others.items()
     ]
     sizes = {"thresholded rows of any peer": sparse.nbytes, "dense numpy": at.R.nbytes}
-    return rows + [
-        Row("bytes at 1 %", name, theirs, best.nbytes, "B", theirs / best.nbytes, 1.0)
-        for name, theirs in sizes.items()
-    ]
+    size = [Row.of_times("bytes at 1 %", name, B, best.nbytes, "B", 1.0) for name, B in sizes.items()]
+    return rows + size
 
 
 def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
@@ -204,21 +189,20 @@ def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
         470,
         "What a product with a smooth R takes",
         "Thresholding drops the far field, which is weak at every place and strong together; wavelets on",
-        "both sides keep it in a few numbers. Bold: 16 bits, or as others have it; fine: 32 bits.",
+        "both sides keep it in a few numbers.",
         "Dashed: with a transform at each end, which solves do without.",
     )
     lefts, width = figures.columns(2, gap=50)
     boxes = [(left + 50, 168, width - 50, 210) for left in lefts]
     memory = figures.graph(figure, boxes[0], "Memory", "megabytes", "relative error of R l")
     time = figures.graph(figure, boxes[1], "Time", "milliseconds", "")
-    for name in dict.fromkeys(point.name for point in points):
-        mine = [point for point in points if point.name == name]
+    for form in FORMATS:
+        mine = [point for point in points if point.form == form]
         curve(memory, mine, [point.nbytes / 1e6 for point in mine])
-        if mine[0].form == "both":
+        if form == "both":
             curve(time, mine, [point.core for point in mine])
-        curve(time, mine, [point.pixels for point in mine], "--" if mine[0].form == "both" else "-")
-        if mine[0].narrow or mine[0].form == "pixels":
-            entitle(memory, mine[0])
+        curve(time, mine, [point.pixels for point in mine], "--" if form == "both" else "-")
+        entitle(memory, mine[0])
     peers = [(name, spent) for name, spent in ms.items() if name != "dense numpy"]
     for (name, spent), marker in zip(peers, "v^<>", strict=False):
         time.plot(spent, ERROR, marker, color=OTHERS, label=name, ms=7, zorder=4, ls="none")
@@ -234,9 +218,8 @@ def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
 
 def curve(axes: Axes, points: list[Point], x: list[float], ls: str = "-") -> None:
     """One format at every error."""
-    bold = points[0].narrow or points[0].form == "pixels"
-    style: dict[str, Any] = {"marker": "o", "ms": 4, "lw": 2} if bold else {"alpha": 0.5, "lw": 1}
-    axes.loglog(x, [point.error for point in points], ls=ls, color=COLOURS[points[0].form], **style)
+    errors, colour = [point.error for point in points], COLOURS[points[0].form]
+    axes.loglog(x, errors, ls=ls, color=colour, marker="o", ms=4, lw=2)
 
 
 def entitle(axes: Axes, first: Point) -> None:
@@ -276,8 +259,8 @@ def main() -> None:
         "pixels": len(at.x),
         "triad, GB/s": triad.nbytes / ms.pop("triad") / 1e6,
         **{
-            f"{point.name}, error {point.error:.2%}": f"{point.kept:.4g} a row, {point.nbytes / 1e6:.4g} MB, "
-            f"{point.pixels:.4g} ms, core {point.core:.4g} ms"
+            f"{FORMATS[point.form]}, error {point.error:.2%}": f"{point.kept:.4g} a row, "
+            f"{point.nbytes / 1e6:.4g} MB, {point.pixels:.4g} ms, core {point.core:.4g} ms"
             for point in points
         },
         "not installed": ", ".join(missing()) or "none",

@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Steps of random walks over the rows of R, beside walkers in NumPy and in Numba, and beside random loads.
+"""Steps of random walks over the rows of R, beside a walker in Numba.
 
 R has 131072 pixels and 100 nonzeros a row at random places. Walks start at every pixel, go on with chance
-1/2 (m = 1/3), and score at every step. All walkers draw by |R_ij|: NumPy by `searchsorted` in cumulative
-sums, all walks at once; Numba by alias tables of float32 and int32 in a `prange` over pixels. A step of ours
-loads the record of a row, an entry of its table and b; a random load is one of 8 bytes in a table of the same
-size.
+1/2 (m = 1/3), and score at every step. Both draw by |R_ij|, Numba by alias tables of float32 and int32 in a
+`prange` over pixels.
 One walk for three colours is measured beside three walks, of R whose rows have albedos of their own in each
 colour and whose entries differ by a tenth; its steps count for all three.
-The walks of all walkers are checked against the same float64 solution. Error against time is that of
-`_pays.py`.
+All walks are checked against the same float64 solution.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 from collections.abc import Callable
 from typing import Any
@@ -22,13 +18,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-import _pays as pays
 from _harness import Options, Row, options, report, seconds
-from ltcl import plots
+from _peers import missing
 from ltcl.operators import CSR
 from ltcl.operators.walks import Lengths, Tables, Walker, linked, tables
 
-NUMPY_TARGET, NUMBA_TARGET, LOADS_TARGET = 10.0, 1.5, 0.6
+TARGET = 1.5  # times faster
 GO_ON = 0.5
 STEPS = 1.0 / (1.0 - GO_ON)  # of a walk, in the mean
 
@@ -43,38 +38,11 @@ def matrix(n: int, per_row: int) -> scipy.sparse.csr_array:
     return R
 
 
-class NumpyWalker:
-    """All walks side by side; those that have ended are dropped after each step."""
-
-    def __init__(self, R: scipy.sparse.csr_array, b: np.ndarray) -> None:
-        self.R, self.b, self.random = R, b, np.random.default_rng(1)
-        self.cumulative = np.append(0.0, np.cumsum(np.abs(R.data), dtype=np.float64))
-        self.sums = np.diff(self.cumulative[R.indptr])
-        self.sign = -np.sign(R.data)
-
-    def __call__(self, samples: int) -> np.ndarray:
-        """Means of the terms k >= 1, (N,)."""
-        n = len(self.b)
-        pixel = np.repeat(np.arange(n), samples)
-        row, weight, score = pixel.copy(), np.ones(pixel.size), np.zeros(n)
-        while row.size:
-            target = self.cumulative[self.R.indptr[row]] + self.random.random(row.size) * self.sums[row]
-            entry = np.searchsorted(self.cumulative, target, side="right") - 1
-            weight = weight * self.sums[row] * self.sign[entry]
-            row = self.R.indices[entry]
-            score += np.bincount(pixel, weight * self.b[row], n)
-            alive = self.random.random(row.size) < GO_ON
-            row, pixel, weight = row[alive], pixel[alive], weight[alive] / GO_ON
-        return score / samples
-
-
 def numba_walker(R: scipy.sparse.csr_array, b: np.ndarray, made: Tables) -> Callable[[int], Any] | None:
-    """The same by alias tables, or None where Numba is not installed."""
-    try:
-        numba: Any = importlib.import_module("numba")
-    except ImportError:
-        print("numba is not installed (pip install numba, or the extra `bench`): its rows are left out")
+    """The same by alias tables, or None where Numba is not installed (the extra `bench` brings it)."""
+    if "numba" in missing():
         return None
+    numba: Any = importlib.import_module("numba")
     entry = made.entries.get()
     threshold = ((entry >> np.uint64(46)) / 2**18).astype(np.float32)
     own = (entry >> np.uint64(23) & np.uint64(0x7FFFFF)).astype(np.int32)
@@ -118,9 +86,9 @@ def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
         host = scipy.sparse.csr_array((data.astype(np.float32), R.indices, R.indptr), shape=R.shape)
         Rs.append(CSR(given.device, host, Rs[0].pattern if Rs else None))
     b, lengths = random.random((n, 3), dtype=np.float32), Lengths.geometric(GO_ON, -1.0)
-    together = Walker(linked(Rs, (1.0, 1.0, 1.0)), lengths, "collision", 0), given.device.upload(b)
+    together = Walker(linked(Rs, (1.0, 1.0, 1.0)), lengths, 0), given.device.upload(b)
     apart = [
-        (Walker(tables(M), lengths, "collision", 0), given.device.upload(column))
+        (Walker(tables(M), lengths, 0), given.device.upload(column))
         for M, column in zip(Rs, b.T, strict=True)
     ]
     actions = {
@@ -144,51 +112,21 @@ def rows(given: Options, n: int, per_row: int, samples: int) -> tuple[list[Row],
     R, b = matrix(n, per_row), np.random.default_rng(2).random(n, dtype=np.float32)
     M, device = CSR(given.device, R), given.device
     made, b_there, pixels = Tables(M), device.upload(b), np.arange(n)
-    walker = Walker(made, Lengths.geometric(GO_ON, -1.0), "collision", 0)
-    numpy_walker, theirs = NumpyWalker(R, b), numba_walker(R, b, made)
-    few, loads, out = max(1, samples // 16), 512, device.empty((4096,), np.uint64)
-    kernel = device.kernel("random", "random_loads")
-
-    def random_loads() -> None:
-        kernel(out.size, 1 if device.is_cpu else 64, out.size, loads, made.entries.size, made.entries, out)
-        device.finish()
-
-    actions: dict[str, Callable[[], Any]] = {
-        "ours": lambda: walker.rows(b_there, pixels, samples).mean,
-        "NumPy searchsorted": lambda: numpy_walker(few),
-        "random loads": random_loads,
-        "tables": lambda: (Tables(M), device.finish()),
-        "NumPy cumulative sums": lambda: NumpyWalker(R, b),
-    }
-    if theirs is not None:
+    walker = Walker(made, Lengths.geometric(GO_ON, -1.0), 0)
+    actions: dict[str, Callable[[], Any]] = {"ours": lambda: walker.rows(b_there, pixels, samples).mean}
+    if (theirs := numba_walker(R, b, made)) is not None:
         actions["Numba alias"] = lambda: theirs(samples)
     exact = scipy.sparse.linalg.bicgstab(scipy.sparse.eye_array(n) + R.astype(float), b, rtol=1e-8)[0] - b
-    for name, count in (("ours", samples), ("NumPy searchsorted", few), ("Numba alias", samples)):
-        if name in actions:
-            check(name, actions[name](), exact, count)
-    times = seconds(actions)
-    rate = {name: samples * n * STEPS / time / 1e6 for name, time in times.items()}
-    rate["NumPy searchsorted"] *= few / samples
-    rate["random loads"] = out.size * 8 * loads / times["random loads"] / 1e6
-    targets = {
-        "NumPy searchsorted": NUMPY_TARGET,
-        "Numba alias": NUMBA_TARGET,
-        "random loads": LOADS_TARGET,
-    }
-    found = [
-        Row("steps of walks", name, rate[name], rate["ours"], "M/s", rate["ours"] / rate[name], target)
-        for name, target in targets.items()
-        if name in rate
-    ]
-    ours, other = times["tables"] * 1e3, times["NumPy cumulative sums"] * 1e3
-    found.append(Row("tables", "NumPy cumulative sums", other, ours, "ms", other / ours))
-    found.append(colours(given, R, samples))
-    return found, {
-        "pixels": n,
-        "nonzeros": R.nnz,
-        "samples a pixel": samples,
-        "MB of tables": made.nbytes / 1e6,
-    }
+    for name, action in actions.items():
+        check(name, action(), exact, samples)
+    rate = {name: samples * n * STEPS / time / 1e6 for name, time in seconds(actions).items()}
+    ours, numba = rate["ours"], rate.get("Numba alias")
+    found = [colours(given, R, samples)]
+    if numba is not None:
+        found.insert(0, Row("steps of walks", "Numba alias", numba, ours, "M/s", ours / numba, TARGET))
+    megabytes = (made.records.nbytes + made.entries.nbytes) / 1e6
+    facts = {"pixels": n, "nonzeros": R.nnz, "samples a pixel": samples, "MB of tables": megabytes}
+    return found, facts | {"steps, M/s": ours, "not installed": ", ".join(missing()) or "none"}
 
 
 def main() -> None:
@@ -196,15 +134,7 @@ def main() -> None:
     given = options(__doc__ or "")
     n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
     found, facts = rows(given, n, per_row, samples)
-    side, repeats = (128, 1) if given.smoke else (8192, 3)
-    curves = [
-        pays.curves(given.device, matrix(n, per_row), f"{n} pixels, {per_row} entries a row", repeats),
-        pays.curves(given.device, pays.dense(side), f"{side} pixels, all entries", repeats),
-    ]
-    report(dataclasses.replace(given, plot=None), "Random walks", found, facts | pays.facts(curves))
-    if given.plot is not None:
-        given.plot.parent.mkdir(parents=True, exist_ok=True)
-        plots.save(pays.draw(curves), given.plot)
+    report(given, "Random walks", found, facts)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,18 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Alias tables for drawing the entries of a row in proportion to |R_ij| (eq. 25), built once after acquisition.
+// Alias tables for drawing the entries of a row in proportion to |R_ij| (eq. 25): Walker's (1974), by one sweep with a
+// pointer to the next light entry, one to the next heavy entry and the mass that the heavy one has left
+// (L. Huebschle-Schneider and P. Sanders, Parallel Weighted Random Sampling, ESA 2019).
 //
-//   alias_rows   one work-item a row
+//   alias_rows   one work-item a row; of dense rows `pointers` and `columns` are 0
 //
-// Walker's tables (1974) by one sweep with a pointer to the next light entry, one to the next heavy entry and
-// the mass that the heavy one has left: no stacks and no memory beside the table. L. Huebschle-Schneider and
-// P. Sanders, Parallel Weighted Random Sampling, ESA 2019.
-//
-// All arithmetic is in integers, so that tables are the same to the bit on every device. A row is scaled by
-// the power of two that makes its sum C as large as its length n allows; each of n bins has room for C, and
-// entry t has the mass n |R_it|. What rounding moves is below 2^-18 of a row's probability, in total variation,
-// in rows of up to 2^20 entries: half a unit of 2^-18 a bin by the threshold, the rest by scaling.
-//
-// No defines. Layout: see common/table.h; row `row` of a slab has its record at first + row.
+// Arithmetic is in integers: the same to the bit on every device. A row is scaled by the power of two that makes its
+// sum C as large as its length n allows; each of n bins has room for C, and entry t has the mass n |R_it|. Rounding
+// moves less than 2^-18 of a row's probability, in total variation, in rows of up to 2^20 entries.
+// Layout: common/table.h; row `row` of a slab has its record at first + row.
 
 #include "common/table.h"
+
+#define BIT_LENGTH(x) (64 - (int)clz((ulong)(x)))
 
 // |value| 2^(150 + shift) of the bits of a real, rounded to the nearest integer.
 static inline ulong scaled(uint value, int shift)
@@ -33,17 +31,6 @@ static inline ulong row_sum(global const uint *values, uint n, int shift)
     for (uint t = 0; t < n; ++t)
         sum += scaled(values[t], shift);
     return sum;
-}
-
-#define BIT_LENGTH(x) (64 - (int)clz((ulong)(x)))
-
-// The shift that gives the sum of a row, not all of which is 0, as many bits as fit: n C must be below 2^63,
-// C 2^18 as well.
-static inline int best_shift(global const uint *values, uint n, uint largest)
-{
-    const int budget = min(45, 63 - BIT_LENGTH(n));
-    const int rough = 7 - (int)max(largest >> 23, 1u);  // the largest entry becomes a number of 31 bits
-    return rough + budget - 1 - BIT_LENGTH(row_sum(values, n, rough) + n);
 }
 
 // sum 2^-(150 + shift) as the bits of a real; infinite beyond its range, 0 below 2^-126.
@@ -99,7 +86,6 @@ static inline void fill(
     }
 }
 
-// Of dense rows `pointers` and `columns` are 0.
 kernel void alias_rows(
     int rows, int first, ulong base, int width, global const int *pointers, global const int *columns,
     global const uint *values, global uint4 *records, global ulong *entries)
@@ -114,11 +100,12 @@ kernel void alias_rows(
     uint largest = 0, sum = 0;
     for (uint t = 0; t < n; ++t)
         largest = max(largest, values[t] & 0x7fffffffu);
-    if (largest) {
-        const int shift = best_shift(values, n, largest);
-        const ulong capacity = row_sum(values, n, shift);
-        fill(values, columns, n, shift, capacity, entries + start);
-        sum = real_bits(capacity, shift);
+    if (largest) {  // the sum gets as many bits as fit: n C must be below 2^63, C 2^18 as well
+        const int rough = 7 - (int)max(largest >> 23, 1u);  // the largest entry becomes a number of 31 bits
+        const int spare = min(45, 63 - BIT_LENGTH(n)) - 1 - BIT_LENGTH(row_sum(values, n, rough) + n);
+        const ulong capacity = row_sum(values, n, rough + spare);
+        fill(values, columns, n, rough + spare, capacity, entries + start);
+        sum = real_bits(capacity, rough + spare);
     }
     records[first + row] = (uint4)((uint)start, (uint)(start >> 32), sum ? n : 0, sum);
 }

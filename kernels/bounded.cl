@@ -1,20 +1,16 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Least squares within bounds between two products (`ltcl/solvers/bounded.py`): x is (rows, k), r is (height, k).
 //
-//   bounded_direction  d = clip(x + alpha (z + beta d)) - x, with its sums and how far x may go along it
-//   bounded_weigh      v = w v and u = w v, with the sums of v v
-//   bounded_move       x = clip(x + lambda d), r = r - lambda A d
-//   bounded_look       the gradient g, and sums that certify x and choose the next direction
-//
-// z is the part of -g that may be followed: 0 where x is at a bound and -g points out. lower and upper hold one
-// value a row. w counts where weighted == 1. Items, groups and partial sums are those of common/columns.h.
-// Required define: ADJACENT, 0 or 1. `numbers` holds k columns by rows: alpha, the curvature <A d, A d> of the last d, or 0
-// where it tells nothing of the next, lambda; from row 4 on the 2 sums of bounded_look by slices; then those of r r.
-// `scratch` holds a real an item and those that are named.
+// z is the part of -g that may be followed: 0 where x is at a bound and -g points out. lower and upper hold one value a
+// row; w counts where weighted == 1. `numbers` holds k columns by rows: alpha, the curvature <A d, A d> of the last d,
+// or 0 where it tells nothing of the next, lambda; from row 4 on the 2 sums of bounded_look by slices; then those of r
+// r. Required define, items, groups, partial sums and `scratch`: common/columns.h.
 
 #include "common/columns.h"
 
-#define STRAIGHT 0.5f  // of d: a shorter step tells that clipping has bent d far from p, and conjugacy is lost
+// Of d: a shorter step tells that clipping has bent d far from p, and conjugacy is lost. With 1/2 in place of 1/4
+// lengths and steps may take turns around it for ever, and only every second direction is conjugate.
+#define STRAIGHT 0.25f
 #define NUMBER(row) numbers[(row) * k + s.origin + j]
 
 static inline real bounded_free(real x, real g, real lower, real upper)
@@ -62,9 +58,7 @@ kernel void bounded_weigh(
     const share s = columns_share(rows, k);
     real sum = 0;
     EACH_VALUE(i, row) {
-        const real value = weighted ? w[i] * v[i] : v[i];
-        if (weighted)
-            v[i] = value;
+        const real value = weighted ? v[i] *= w[i] : v[i];
         if (weighted == 2)
             u[i] = w[i] * value;
         sum += value * value;
@@ -87,8 +81,7 @@ kernel void bounded_move(
     EACH_COLUMN(j) {
         const real gd = totals[j], dd = totals[s.width + j], curvature = totals[3 * s.width + j];
         const bool moves = gd < 0 && curvature > 0 && isfinite(curvature);
-        const real exact = fmin(-gd / curvature, fmax(1 / totals[2 * s.width + j], 1));
-        lambdas[j] = moves ? exact : 0;
+        lambdas[j] = moves ? fmin(-gd / curvature, fmax(1 / totals[2 * s.width + j], 1)) : 0;
         if (get_group_id(0) == 0) {
             NUMBER(0) = moves ? dd / curvature : NUMBER(0);  // Barzilai and Borwein
             NUMBER(1) = lambdas[j] >= STRAIGHT ? curvature : 0;

@@ -1,17 +1,11 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Product of a dense row-major matrix with K right-hand sides, steps of an iteration along one (see
-// common/product.h), and products with its transpose.
+// Product of a dense row-major matrix with K right-hand sides, steps of an iteration along one (see common/product.h
+// for these three kernels, their arguments and defines), and products with its transpose. These read rows, too:
 //
-// Three kernels do the same; the device layer times them and takes the fastest:
-//   dense_matvec         one work-item a row, as it reads in a textbook
-//   dense_matvec_stream  one work-item a row, in wide loads (common/row_sums.h); for CPUs
-//   dense_matvec_group   one work-group a row, its items side by side along the row; for GPUs
-// The transpose reads rows, too, and is cut in both directions:
-//   dense_rmatvec        one work-item a strip of columns, down the rows of chunk get_global_id(1)
-//   dense_rmatvec_sum    adds up the chunks, where there are several
+//   dense_rmatvec      one work-item a strip of columns, down the rows of chunk get_global_id(1)
+//   dense_rmatvec_sum  adds up the chunks, where there are several
 //
-// Required defines: K, the right-hand sides of one launch: 1, 2, 3, 4 or 8; LANES: 8 on CPUs, 1 on GPUs, where
-// neighbouring columns are those of neighbouring items. Optional: STEP, PACKED.
+// Required define besides K: LANES: 8 on CPUs, 1 on GPUs, where neighbouring columns are those of neighbouring items.
 // Layout: a slab of `rows` rows of `width` reals.
 
 #include "common/row_sums.h"
@@ -22,25 +16,17 @@
 
 kernel void dense_matvec(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    ITEM_ROW;
-    if (inside)
-        dense_add(sum.item, matrix + (size_t)row * width, x + offset, stride, 0, width, 1);
-    FINISH_ITEMS(sum);
+    BY_ITEM(dense_add(sum.item, matrix + (size_t)row * width, x + offset, stride, 0, width, 1));
 }
 
 kernel void dense_matvec_stream(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    ITEM_ROW;
-    if (inside)
-        sum = dense_sum(matrix + (size_t)row * width, x + offset, stride, 0, width);
-    FINISH_ITEMS(sum);
+    BY_ITEM(sum = dense_sum(matrix + (size_t)row * width, x + offset, stride, 0, width));
 }
 
 kernel void dense_matvec_group(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    GROUP_ROW;
-    dense_add(sum.item, matrix + (size_t)row * width, x + offset, stride, me, width, items);
-    FINISH_GROUP(sum);
+    BY_GROUP(dense_add(sum.item, matrix + (size_t)row * width, x + offset, stride, me, width, items));
 }
 
 #ifndef STEP

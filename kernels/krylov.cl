@@ -1,17 +1,9 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Krylov methods between two products: inner products of columns, and steps whose coefficients stay on the device.
 //
-//   krylov_pairs      partial sums of inner products of up to three arrays (cg, bicgstab)
-//   krylov_dots       partial sums of the inner products of directions V with w, and of w with itself (arnoldi)
-//   krylov_subtract   w - V h, and its unit vector (arnoldi)
-//   krylov_cg         a step of conjugate gradients, or of those of the normal equations
-//   krylov_half       the first half of a step of BiCGStab
-//   krylov_bicgstab   the second half, and the next direction
-//
-// Required define: ADJACENT, 0 or 1. Items, groups, partial sums and `slices` are those of common/columns.h. `state`
-// holds numbers of k columns by rows, which the kernels name; from row STATE on the partial sums of squared
-// residuals, for each of SLOTS steps. The parity of `step` says which of two copies a step reads; it writes the
-// other one, since groups that start late still read. `scratch` holds a real an item and those that are named.
+// Required define, items, groups, partial sums, `slices` and `scratch`: common/columns.h. `state` holds numbers of k
+// columns by rows; from row STATE on the partial sums of squared residuals of SLOTS steps. The parity of `step` says
+// which of two copies a step reads; it writes the other one, since groups that start late still read.
 
 #include "common/columns.h"
 
@@ -27,27 +19,22 @@ static inline real divided(real a, real b)
     return a / (isfinite(b) ? b : NAN);
 }
 
-// Sums of left * right * weight for pair get_group_id(1); 4 bits of `pairs` name two of a, b and c. `weights` are
-// like these and count where weighted == 1.
+// Sums of left * right * weight for pair j = get_group_id(1): 4 bits of `pairs` name two of a, b and c. Where it is 0,
+// left is a[j * rows * k] on, b for the last j, and right is b. `weights` are like b and count where weighted == 1.
 kernel void krylov_pairs(
     int rows, int k, int pairs, int weighted, global const real *weights, global const real *a,
     global const real *b, global const real *c, global real *partials, local real *scratch)
 {
     const share s = columns_share(rows, k);
-    const int codes = pairs >> (4 * get_group_id(1)), left = codes & 3, right = codes >> 2 & 3;
-    global const real *x = left == 0 ? a : left == 1 ? b : c, *y = right == 0 ? a : right == 1 ? b : c;
-    global real *sums = partials + (get_group_id(0) * get_num_groups(1) + get_group_id(1)) * k;
-    columns_sum(dot_share(x, y, weighted ? weights : 0, s), sums, 0, s, scratch);
-}
-
-// Sums of V_j * w for j = get_group_id(1), and of w * w for the last one. V_j starts at V[j * rows * k].
-kernel void krylov_dots(
-    int rows, int k, global const real *V, global const real *w, global real *partials, local real *scratch)
-{
-    const share s = columns_share(rows, k);
     const size_t j = get_group_id(1), count = get_num_groups(1);
-    global const real *v = j + 1 < count ? V + j * rows * k : w;
-    columns_sum(dot_share(v, w, 0, s), partials + (get_group_id(0) * count + j) * k, 0, s, scratch);
+    const int codes = j < 8 ? pairs >> (4 * j) : 0, left = codes & 3, right = codes >> 2 & 3;
+    global const real *x = left == 0 ? a : left == 1 ? b : c, *y = right == 0 ? a : right == 1 ? b : c;
+    if (!pairs) {
+        x = j + 1 < count ? a + j * rows * k : b;
+        y = b;
+    }
+    global real *sums = partials + (get_group_id(0) * count + j) * k;
+    columns_sum(dot_share(x, y, weighted ? weights : 0, s), sums, 0, s, scratch);
 }
 
 // out = w - sum_j h_j V_j, j < count, with h of the partial sums, of which there is one more: w * w. The h are added
@@ -93,33 +80,27 @@ kernel void krylov_subtract(
     }
 }
 
-// p = z + beta p, q = w + beta q, x = x + alpha p, r = r - alpha q, with the sums <z, z>, <w, z> (cg, z = r) or
-// <z, z>, <w, w>, <r, r> (normal == 1: z = S^T r). state rows, twice: <z, z>, alpha, 1 where there was no positive
-// curvature or all that is left is rounding, largest <z, z> / <r, r>. Columns rest where rest[column]; anew == 1
-// forgets p and q. scratch: 3 more a column.
+// p = r + beta p, q = w + beta q, x = x + alpha p, r = r - alpha q, with the sums <r, r> and <w, r>. state rows,
+// twice: <r, r>, alpha, 1 where there was no positive curvature. Columns rest where rest[column]; anew == 1 forgets p
+// and q. scratch: 2 more a column.
 kernel void krylov_cg(
-    int rows, int k, int slices, int normal, int step, int anew, global const int *rest,
-    global const real *partials, global real *state, global const real *z, global const real *w, global real *p,
-    global real *q, global real *x, global real *r, local real *scratch)
+    int rows, int k, int slices, int step, int anew, global const int *rest, global const real *partials,
+    global real *state, global const real *w, global real *p, global real *q, global real *x, global real *r,
+    local real *scratch)
 {
     const share s = columns_share(rows, k);
     local real *totals = scratch + get_local_size(0), *alphas = totals, *betas = totals + s.width;
-    columns_totals(partials, slices, 2 + normal, 0, k, s, totals, scratch);
+    columns_totals(partials, slices, 2, 0, k, s, totals, scratch);
     EACH_COLUMN(j) {
         const real square = totals[j], product = totals[s.width + j];
         const real previous = state[OWN(step, 0)], last = state[OWN(step, 1)];
-        real broken = state[OWN(step, 2)], largest = state[OWN(step, 3)];
+        real broken = state[OWN(step, 2)];
         bool moves = !rest[s.origin + j] && !(broken > 0);
         real beta = !anew && previous > 0 ? square / previous : 0;
         real curvature = beta == 0 ? product : product - beta * square / last;
-        if (!(curvature > 0) && product > 0) {  // the recursion has left S: start anew along z
+        if (!(curvature > 0) && product > 0) {  // the recursion has left S: start anew along r
             beta = 0;
             curvature = product;
-        }
-        if (moves && normal) {
-            const real residual = totals[2 * s.width + j];
-            largest = fmax(largest, square / residual);
-            broken = residual > 0 && square <= largest * ORTHOGONAL * ORTHOGONAL * residual;
         }
         if (moves && square > 0 && curvature <= 0)
             broken = 1;
@@ -129,7 +110,6 @@ kernel void krylov_cg(
             state[OWN(step + 1, 0)] = moves ? square : previous;
             state[OWN(step + 1, 1)] = moves ? alpha : last;
             state[OWN(step + 1, 2)] = broken;
-            state[OWN(step + 1, 3)] = largest;
         }
         alphas[j] = moves ? alpha : 0;
         betas[j] = beta;
@@ -140,7 +120,7 @@ kernel void krylov_cg(
     EACH_VALUE(i, row) {
         real left = r[i];
         if (alpha != 0) {  // else the column rests, whatever it holds
-            const real along = beta == 0 ? z[i] : z[i] + beta * p[i];
+            const real along = beta == 0 ? left : left + beta * p[i];
             const real moved = beta == 0 ? w[i] : w[i] + beta * q[i];
             p[i] = along;
             q[i] = moved;

@@ -3,97 +3,60 @@
 //
 //     P_BB delta_B = s_B,   s_B = b_B - (S x)_B with the x of the moment,   x_B += delta_B,   block B after block
 //
-// P_BB is what the method makes of S_BB: its lower triangle with D / omega, or all of it.
+// P_BB is the lower triangle of S_BB with D / omega, or all of it.
 //
 //   relax_strips   CPUs: a panel of many blocks; a work-item takes a block of rows, which is a strip of the panel
 //   relax_rows     GPUs: s_B; a work-group a row. A launch for each block, and one of
 //   relax_correct  GPUs: delta_B = P_BB^-1 s_B; a work-group a row
 //   relax_windows  where relax_strips and relax_rows split the sparse rows; one work-item a row
 //
-// A strip first sums what is outside its panel before it and from itself on, which no other strip changes before its
-// turn. The rest, a narrow window of columns, is added strip by strip in their order: by the work-item that ends the
-// sums of a strip, or by the one that ends the strip before it, whichever is later. So no work-item ever waits.
-// Assumed beyond OpenCL 1.2, true of CPU drivers: mem_fence and atomics order what work-groups of one launch hand on.
+// A strip first sums what no other strip changes before its turn: what is outside its panel, and from itself on. The
+// rest, a narrow window of columns, is added strip by strip by the work-item that ends the sums of a strip or by the
+// one that ends the strip before it, whichever is later: none waits. Assumed beyond OpenCL 1.2, true of CPU drivers:
+// mem_fence and atomics order what work-groups of one launch hand on.
 //
-// A row is split at column i where its correction is omega s_i / S_ii at once (`inverses` 0), else at the first
-// column of its block. Sums below and above the split are kept apart, so that a sweep also tells the residual r of
-// the x it began with: what this sweep takes from x above, the one before took below, and left in carry = b - that.
+// A row is split at column i where its correction is omega s_i / S_ii at once (`inverses` 0), else at the first column
+// of its block. Sums below and above are apart, so that a sweep also tells the residual r of the x it began with: what
+// it takes from x above, the one before took below, and left in carry = b - that.
 //
-// Required define: K, see common/lanes.h. Optional: PACKED, and DENSE where M is dense.
-// Layout: a slab has rows of M from row `first` on. Of a dense one, values has `width` numbers a row, and
-// pointers, columns and windows are not read; of a sparse one windows[2 row] is the first entry of the window,
-// windows[2 row + 1] the first from the split on. weights are rows of P_BB^-1, `block` numbers each, or 1 / S_ii.
-// x, before (the x it began with), b, s, r and carry are row-major with `stride` reals a row; a launch works on
-// their columns offset .. offset + K - 1, and on rows begin .. end of the panel or block that begins in row `start`.
-// scratch holds K reals a work-item, 2 K in relax_rows.
-// arrivals[0] counts the strips begun, arrivals[i] what strip i waited for; all are 0 between launches.
+// Required define: K, see common/lanes.h. Optional: PACKED, and DENSE where M is dense: rows of `width` numbers,
+// without pointers, columns and windows. windows[2 row] is the first entry of the window, windows[2 row + 1] that from
+// the split on. A slab has rows of M from `first` on; weights are rows of P_BB^-1, `block` numbers each, or 1 / S_ii.
+// Vectors have `stride` reals a row, of which a launch takes offset .. offset + K - 1, in rows begin .. end of the
+// panel or block from row `start` on. scratch: 2 K reals a work-item. arrivals[0] counts the strips begun, arrivals[i]
+// what strip i waited for; all are 0 between launches.
 
 #include "common/product.h"
 #include "common/row_sums.h"
 #include "common/search.h"
 
-#define PLACE int begin, int end, int first, int start, int stride, int offset, real shift, real scale, int width
-#define MATRIX \
-    global const int *pointers, global const int *columns, global const real *values, global const int *windows
-#define VECTORS global real *x, global const real *b, global real *s, global real *r, global real *carry
+#define ARGUMENTS \
+    int begin, int end, int first, int start, int stride, int offset, real shift, real scale, int width, \
+    global const int *pointers, global const int *columns, global const real *values, global const int *windows, \
+    global real *x, global const real *b, global real *s, global real *r, global real *carry
 #define OFFSET (stride = STRIDE(stride), x += offset, b += offset, s += offset, r += offset, carry += offset)
 
-// The entries from .. to of a row, by one work-item in wide loads, and by a work-group side by side (ADD); and by one
-// work-item those on both sides of a window.
+// The entries from .. to of a row, by one work-item in wide loads, and by a work-group side by side (ADD).
+#define ITEM(from) (from) + (int)get_local_id(0)
 #ifdef DENSE
 #define ROW_SUM(row, from, to) dense_sum(values + (size_t)(row) * width, x, stride, from, to)
 #define ROW_ADD(sum, row, from, to) \
-    dense_add(sum, values + (size_t)(row) * width, x, stride, (from) + (int)get_local_id(0), to, get_local_size(0))
-#define AROUND(lower, upper, row, from, to) (lower = ROW_SUM(row, 0, from), upper = ROW_SUM(row, to, width))
+    dense_add(sum, values + (size_t)(row) * width, x, stride, ITEM(from), to, get_local_size(0))
 #define ROW_BEGIN(row) 0
 #define ROW_END(row) width
 #define WINDOW_BEGIN(row, column) (column)
 #define WINDOW_END(row, column) (column)
 #else
 #define ROW_SUM(row, from, to) csr_sum(columns, values, x, stride, from, to)
-#define ROW_ADD(sum, row, from, to) \
-    csr_add(sum, columns, values, x, stride, (from) + (int)get_local_id(0), to, get_local_size(0))
-#if K == 1
-#define AROUND(lower, upper, row, from, to) \
-    const float2 both = csr_around(columns, values, x, stride, pointers[row], from, to, pointers[(row) + 1]); \
-    (lower.vector = both.x, upper.vector = both.y)
-#else
-#define AROUND(lower, upper, row, from, to) \
-    (lower = ROW_SUM(row, pointers[row], from), upper = ROW_SUM(row, to, pointers[(row) + 1]))
-#endif
+#define ROW_ADD(sum, row, from, to) csr_add(sum, columns, values, x, stride, ITEM(from), to, get_local_size(0))
 #define ROW_BEGIN(row) pointers[row]
 #define ROW_END(row) pointers[(row) + 1]
 #define WINDOW_BEGIN(row, column) windows[2 * (row)]
 #define WINDOW_END(row, column) windows[2 * (row) + 1]
 #endif
 
-// The sums of a sparse row j .. end before entry `from` and from entry `to` on. Of one right-hand side, where splits
-// would leave odd ends everywhere, the stretches around them are taken in wide loads, too, and masked.
-#if K == 1
-static inline float2 csr_around(
-    global const int *columns, global const real *values, global const real *x, int stride, int j, int from, int to,
-    int end)
-{
-    const int whole = j + (from - j) / 16 * 16;
-    const int8 lane = (int8)(0, 1, 2, 3, 4, 5, 6, 7);
-    real8 low = 0, high = 0;
-    real lower = csr_sum(columns, values, x, stride, j, whole).vector;
-    j = whole < from ? whole : whole + (to - whole) / 16 * 16;
-    for (; j < to && j + 16 <= end; j += max(16, (to - j) / 16 * 16))
-        for (int i = j; i < j + 16; i += 8) {
-            const real8 products = LOAD8(values + i) * gather8(x, stride, columns + i);
-            low += select((real8)(0), products, lane < from - i);
-            high += select((real8)(0), products, lane >= to - i);
-        }
-    for (; j < from; ++j)
-        lower += values[j] * x[columns[j] * stride];
-    const real upper = csr_sum(columns, values, x, stride, max(j, to), end).vector;
-    return (float2)(lower + sum8(low), upper + sum8(high));
-}
-#endif
-
 kernel void relax_strips(
-    PLACE, MATRIX, VECTORS, int strips, int all, int block, int inverses, real omega, global const real *weights,
+    ARGUMENTS, int strips, int all, int block, int inverses, real omega, global const real *weights,
     volatile global int *arrivals, global real *before)
 {
     OFFSET;
@@ -102,11 +65,11 @@ kernel void relax_strips(
     int top = (begin / block + strip) * block;  // first row of the block
     for (int i = max(begin, top); i < min(end, top + block); ++i) {
         const int row = i - first;
-        sums lower, upper;
-        AROUND(lower, upper, row, WINDOW_BEGIN(row, start), WINDOW_END(row, inverses ? top : i));
+        const sums lower = ROW_SUM(row, ROW_BEGIN(row), WINDOW_BEGIN(row, start));
+        const sums upper = ROW_SUM(row, WINDOW_END(row, inverses ? top : i), ROW_END(row));
         for (int c = 0, j = i * stride; c < K; ++c, ++j) {
-            s[j] = shift * x[j] + scale * upper.item[c];
             before[j] = x[j];
+            s[j] = shift * x[j] + scale * upper.item[c];
             r[j] = carry[j] - s[j];
             carry[j] = b[j] - scale * lower.item[c];
         }
@@ -138,7 +101,7 @@ kernel void relax_strips(
     arrivals[0] = 0;
 }
 
-kernel void relax_rows(PLACE, MATRIX, VECTORS, local real *scratch)
+kernel void relax_rows(ARGUMENTS, local real *scratch)
 {
     OFFSET;
     const int row = begin - first + get_group_id(0);  // one group a row exactly: no row is beyond the last

@@ -1,16 +1,11 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// One step of Southwell's relaxation on S = shift I + scale M: in each part of the picture the largest residual is
-// made zero, and the next step tells all residuals of it through the columns of S.
+// One step of Southwell's relaxation on S = shift I + scale M, in each part of the picture:
 //
 //     r -= scale M[:, i] delta for the rows i picked before;   i = argmax |r_i|, delta_i = r_i / S_ii, x_i += delta_i
 //
-// southwell_step  a work-group has a range of rows, in which it brings r up to date and then picks a row in each of
-//                 its parts, the rows of `pending` picks before; with `picks` 0 that is all it does.
-//
-// Optional define: DENSE; else the slab is one of M^T in sparse rows, the columns of M, and items look up where their
-// stretch of r begins in each: no two write one value, so no atomics.
-// Layout: x, r, picked and delta are row-major with k columns; parts are equal to one row, and those of a group follow
-// each other. largest and places hold a number for each item of a group.
+// A work-group has a range of rows, in which it brings r up to date with the `pending` picks before, and then, unless
+// `picks` is 0, picks a row in each of its parts. Optional define: DENSE; else the slab is one of M^T in sparse rows,
+// and items look up where their stretch of r begins in each: no two write one value. `places`: a number an item.
 
 #include "common/real.h"
 #include "common/search.h"
@@ -21,7 +16,7 @@ kernel void southwell_step(
     int n, int parts, int pending, int picks, int k, real shift, real scale, int rows, int first, int width,
     global const int *pointers, global const int *columns, global const real *values, global const real *inverse,
     global real *x, global real *r, global const int *picked, global const real *delta, global int *next_picked,
-    global real *next_delta, local real *largest, local int *places)
+    global real *next_delta, local int *places)
 {
     const int me = get_local_id(0), items = get_local_size(0), c = get_global_id(1), group = get_group_id(0);
     const int part_begin = ROW_OF(group, get_num_groups(0), parts);
@@ -55,15 +50,13 @@ kernel void southwell_step(
         for (int i = place + me; i < part_stop; i += items)
             if (fabs(r[i * k + c]) > fabs(r[place * k + c]))
                 place = i;
-        largest[me] = fabs(r[place * k + c]);
         places[me] = place;
         for (int left = items; left > 1; left = (left + 1) / 2) {  // a tree; of equal ones the first row
-            const int other = me + (left + 1) / 2;
             barrier(CLK_LOCAL_MEM_FENCE);
-            if (other < left
-                && (largest[other] > largest[me] || (largest[other] == largest[me] && places[other] < places[me]))) {
-                largest[me] = largest[other];
-                places[me] = places[other];
+            if (me < left / 2) {
+                const int other = places[me + (left + 1) / 2];
+                const real gain = fabs(r[other * k + c]) - fabs(r[places[me] * k + c]);
+                places[me] = gain > 0 || (gain == 0 && other < places[me]) ? other : places[me];
             }
         }
         if (me == 0) {

@@ -1,10 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Vectors: what a solver does between two products.
-//
-// Layout: `count` reals; k right-hand sides of n pixels are stored row-major, so that count = n * k and
-// column c is every k-th value from c on. Elementwise kernels do not care: one work-item an element.
-//
-// ADJACENT: 1 on CPUs, where it may be left out, and 0 on GPUs.
+// Vectors: what a solver does between two products, one work-item an element where nothing is added up.
+// Layout: k right-hand sides are row-major, count reals in all. ADJACENT: see common/columns.h; 1 if left out.
 
 #ifndef ADJACENT
 #define ADJACENT 1
@@ -24,18 +20,6 @@ kernel void vector_axpby(int count, real a, global const real *x, real b, global
     const int i = get_global_id(0);
     if (i < count)
         out[i] = a * x[i] + b * y[i];
-}
-
-// out = a_c x + b_c y in each column c, with coefficients (a, b) (2, k). An operand whose coefficient is 0 does not
-// count, whatever it holds. `out` may be x or y.
-kernel void vector_axpby_columns(
-    int count, int k, global const real *coefficients, global const real *x, global const real *y, global real *out)
-{
-    const int i = get_global_id(0);
-    if (i < count) {
-        const real a = coefficients[i % k], b = coefficients[k + i % k];
-        out[i] = (a == 0 ? 0 : a * x[i]) + (b == 0 ? 0 : b * y[i]);
-    }
 }
 
 // out = diag(d) x for k right-hand sides. `out` may be x.
@@ -64,9 +48,8 @@ kernel void vector_dot(
         STORE(keep * direction + gain * residual, d + i);                                           \
     }
 
-// One step of an iteration with p = S d: x += d, r -= p, d = keep d + gain r. The squares of r, added up for each
-// column, go to squares (groups, k) from `first` on. Items with the same neighbouring rows share their values, which
-// are neighbours, eight at a time.
+// One step with p = S d: x += d, r -= p, d = keep d + gain r, and the squares of r, summed by columns, to squares
+// (groups, k) from `first` on. Items with the same neighbouring rows take turns, eight values at a time.
 kernel void vector_step(
     int rows, int k, real keep, real gain, int first, global const real *p, global real *x, global real *r,
     global real *d, global real *squares, local real *scratch)
@@ -92,12 +75,4 @@ kernel void vector_sums(
     real sum = 0;
     EACH_VALUE(i, row) sum += sums[slot * groups * k + i];
     columns_sum(sum, out + first + slot * k, 0, s, scratch);
-}
-
-// out = a b + c: the STREAM triad, the yardstick of bench/.
-kernel void vector_triad(int count, real a, global const real8 *b, global const real8 *c, global real8 *out)
-{
-    const int i = get_global_id(0);
-    if (i < count)
-        out[i] = a * b[i] + c[i];
 }

@@ -1,39 +1,27 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Random walks over the rows of R, which estimate x_i = sum over k >= 1 of c_k (R^k b)_i (eq. 22 to 26).
 //
-//   walk_rows      sums over the samples of a pixel: the walk starts there and reads b where it comes
-//   walk_columns   the adjoint: the walk ends at a pixel and writes what it brings there, one record a sample;
-//                  rows are those of R^T, and one more row, from which all walks start, is that of b
+//   walk_rows      a walk starts at a pixel and scores b at every step; sums over the samples of the pixel
+//   walk_columns   over the rows of R^T and one more, that of b, from which all walks start: a walk scores its weight
+//                  at the pixel where it ends; one record a sample
 //
-// A step goes from i to j with probability |R_ij| / |R_i| and multiplies the weight by sign(R_ij) |R_i|, so that
-// the products of eq. 26 cancel. After step k the walk goes on with probability steps[k].y / 2^22; what it then
-// is worth is weight * b_j * steps[k].x, where steps[k].x holds c_k over the probability to be scored there: at
-// every step (COLLISION) or where the walk ends, the paper's eq. 26. Rows without entries end a walk.
+// A step goes from i to j with probability |R_ij| / |R_i| and multiplies the weight by sign(R_ij) |R_i|; a row without
+// entries ends the walk. After step k it goes on with probability steps[k].y / 2^22; steps[k].x is c_k over the
+// probability to score. LINKED walks draw from a table of other probabilities, whose entry t leads to links[t], a
+// column and the factors that the weights of channels take.
 //
-// LINKED walks step by a table of other probabilities: entry t of its row leads to links[t], a column and what
-// the weight of each channel is multiplied by there. So colour channels share a walk.
+// A work-item takes WALKS chunks of CHUNK samples of one pixel, one walk of each at a time, so that their loads do not
+// wait for each other. Random numbers are a function of pixel, sample, step, stream and seed, samples are summed in
+// order, and arithmetic is + and * without contraction: no bit depends on WALKS, launches or devices above 2^-126.
 //
-// A work-item takes WALKS chunks of CHUNK samples of one pixel, one walk of each at a time: their loads do not
-// wait for each other. Samples of a chunk are summed in order, with the rounding errors of the sums kept
-// (Knuth's two-sum). So no bit depends on WALKS, nor on how chunks are spread over work-items. Arithmetic is + and *
-// in this order, without contraction: the same bits on every device, as long as nothing falls below 2^-126.
-//
-// Random numbers have no state: a block of Philox is a function of its counter, here pixel, sample, step / 2 and
-// stream, and of the seed; a step takes half a block.
-// Layout: tables as in common/table.h. Chunk c of a pixel holds samples first + c CHUNK up to `end`; `chunks`
-// chunks a pixel. b is row-major with `stride` columns, of which offset .. offset + K - 1 are taken, the first
-// of channel 0, the next of channel 1 and so on. Out of walk_rows: (units, K) of (sum, its rounding, sum of
-// squares, its rounding).
+// Layout: common/table.h. Chunk c of a pixel holds samples first + c CHUNK up to `end`. b is row-major with `stride`
+// columns, of which offset .. offset + K - 1 are taken, of one channel after the other. Out: (units, K) sums, squares.
 
 #pragma OPENCL FP_CONTRACT OFF
 
-#if !defined(CHUNK) || !defined(WALKS) || !defined(COLLISION) || !defined(LINKED) || !defined(PREFETCH) \
-    || !defined(CHANNELS) || K % CHANNELS
-#error "walk.cl needs -DCHUNK, -DWALKS, -DK=<columns of b>, -DCHANNELS=<1 or 3>; 0 or 1: -DCOLLISION -DLINKED -DPREFETCH"
+#if !defined(CHUNK) || !defined(WALKS) || !defined(LINKED) || !defined(CHANNELS) || K % CHANNELS
+#error "walk.cl needs -DCHUNK, -DWALKS, -DK=<columns of b>, -DCHANNELS=<1 or 3>, -DLINKED=<0 or 1>"
 #endif
-
-#define GO_ON_BITS 22
-#define SLOT_BITS 42  // the rest of 64
 
 #if WALKS % 4 == 0  // random numbers of four walks are made side by side
 typedef ulong4 words;
@@ -50,25 +38,38 @@ typedef ulong words;
 #include "common/real.h"
 #include "common/table.h"
 
-// Where an item has several walks, what one will load is asked for while the others are at work: a third
-// less time a step. The language's own prefetch() does nothing in PoCL; Oclgrind does not know this one.
-#if PREFETCH && defined(__clang__)
+#define GO_ON_BITS 22
+#define SLOT_BITS 42  // the rest of 64
+
+// What a walk will load is asked for while others are at work: a third less time a step. The prefetch() of OpenCL
+// does nothing in PoCL.
+#if WALKS > 1 && defined(__clang__)
 #define FETCH(p) __builtin_prefetch((const void *)(size_t)(p))
 #else
 #define FETCH(p)
 #endif
 
-// Philox4x32-10 of Salmon, Moraes, Dror and Shaw, Parallel Random Numbers: As Easy as 1, 2, 3 (SC 2011): the block
-// of counter (x, y, z, w) in its place, each word in the lower half of a lane.
-static inline void philox(words *x, words *y, words *z, words *w, uint key, uint other_key)
+// The walks of a work-item, side by side; sample `next` comes next, up to `stop`.
+typedef struct {
+    uint pixel[WALKS], next[WALKS], stop[WALKS], row[WALKS], step[WALKS], target[WALKS];
+    int alive[WALKS];
+    real weight[CHANNELS][WALKS], factor[CHANNELS][WALKS];  // `factor`, `target`: what the step to come leads to
+    ulong word[WALKS];  // its random number
+    uint4 record[WALKS];
+} walks;
+
+// The first half of a block of Philox4x32-10 (Salmon, Moraes, Dror and Shaw, Parallel Random Numbers: As Easy as 1, 2,
+// 3, SC 2011) of the counter (x, y, z, w).
+static inline words philox(words x, words y, words z, words w, ulong seed)
 {
     for (uint round = 0; round < 10; ++round) {
-        const words a = 0xD2511F53ul * *x, b = 0xCD9E8D57ul * *z;
-        *x = (b >> 32) ^ *y ^ (ulong)(key + round * 0x9E3779B9u);
-        *z = (a >> 32) ^ *w ^ (ulong)(other_key + round * 0xBB67AE85u);
-        *y = b & 0xfffffffful;
-        *w = a & 0xfffffffful;
+        const words a = 0xD2511F53ul * x, b = 0xCD9E8D57ul * z;
+        x = (b >> 32) ^ y ^ (ulong)((uint)seed + round * 0x9E3779B9u);
+        z = (a >> 32) ^ w ^ (ulong)((uint)(seed >> 32) + round * 0xBB67AE85u);
+        y = b & 0xfffffffful;
+        w = a & 0xfffffffful;
     }
+    return y << 32 | x;
 }
 
 static inline ulong first_entry(uint4 record)
@@ -90,45 +91,22 @@ static inline uint draw(uint4 record, global const ulong *entries, ulong word)
     return (uint)(fraction < (uint)(entry >> (2 * TARGET_BITS)) ? entry >> TARGET_BITS : entry) & TARGET_MASK;
 }
 
-// sum + its rounding += value, both kept side by side
-static inline void two_sum(real value, real *sum)
-{
-    const real total = sum[0] + value, added = total - sum[0];
-    sum[1] += (sum[0] - (total - added)) + (value - added);
-    sum[0] = total;
-}
-
-// The walks of a work-item, side by side.
-typedef struct {
-    uint pixel[WALKS], next[WALKS], stop[WALKS];  // sample `next` comes next, up to `stop`
-    uint row[WALKS], step[WALKS];
-    int alive[WALKS];
-    real weight[CHANNELS][WALKS];
-    ulong word[WALKS];  // of the step to come, with the record of its row, where it leads and by what factor
-    uint4 record[WALKS];
-    uint target[WALKS];
-    real factor[CHANNELS][WALKS];
-} walks;
-
 static inline void set_out(walks *walk, int units, int chunks, uint first, uint end, global const uint *pixels)
 {
     for (int w = 0; w < WALKS; ++w) {
-        const int unit = get_global_id(0) * WALKS + w;
-        const int known = unit < units;
-        walk->row[w] = walk->pixel[w] = known ? pixels[unit / chunks] : 0;
-        walk->next[w] = first + (uint)(known ? unit % chunks : 0) * CHUNK;
-        walk->stop[w] = known ? walk->next[w] + min(end - walk->next[w], (uint)CHUNK) : walk->next[w];
-        walk->step[w] = walk->alive[w] = 0;
-        for (int c = 0; c < CHANNELS; ++c)
-            walk->weight[c][w] = 0;
+        const int unit = min((int)get_global_id(0) * WALKS + w, units);  // the last one has nothing to do
+        walk->row[w] = walk->pixel[w] = unit < units ? pixels[unit / chunks] : 0;
+        walk->next[w] = first + (uint)(unit % chunks) * CHUNK;
+        walk->stop[w] = unit < units ? walk->next[w] + min(end - walk->next[w], (uint)CHUNK) : walk->next[w];
     }
 }
 
-// Prepare one step of all walks: start the next samples where walks have ended, draw the words of the step and
-// ask for the table entries that it will take. Returns whether any walk is under way. Walks that have ended
-// take the step too, from their start, and nobody looks.
-static inline int set_off(
-    walks *walk, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries)
+// Prepare one step of all walks: start the next samples where walks have ended, and draw. Returns whether any walk
+// is under way. Walks that have ended take the step too, from their start, and nobody looks. `links` are read
+// where LINKED only; `b` may be 0.
+static inline int draw_steps(
+    walks *walk, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries,
+    global const uint4 *links, global const real *b, int stride)
 {
     int busy = 0;
     for (int w = 0; w < WALKS; ++w) {
@@ -141,24 +119,13 @@ static inline int set_off(
         busy |= walk->alive[w];
     }
     for (int w = 0; w < WALKS; w += LANES) {
-        const words step = LOAD_WORDS(walk->step + w);
-        words x = LOAD_WORDS(walk->pixel + w), y = LOAD_WORDS(walk->next + w) - 1, z = step / 2, other = stream;
-        philox(&x, &y, &z, &other, (uint)seed, (uint)(seed >> 32));
-        STORE_WORDS(select(y << 32 | x, other << 32 | z, step << 63), walk->word + w);
+        const words x = LOAD_WORDS(walk->pixel + w), sample = LOAD_WORDS(walk->next + w) - 1;
+        STORE_WORDS(philox(x, sample, LOAD_WORDS(walk->step + w), stream, seed), walk->word + w);
     }
     for (int w = 0; w < WALKS; ++w) {
         walk->record[w] = rows[walk->row[w]];
         FETCH(entries + slot(walk->record[w], walk->word[w]));
     }
-    return busy;
-}
-
-// The columns and signs that the walks step to, and what weights are multiplied by, 0 where the row is empty.
-// `links` are read where LINKED only; `b` may be 0.
-static inline void draw_targets(
-    walks *walk, global const uint4 *rows, global const ulong *entries, global const uint4 *links,
-    global const real *b, int stride)
-{
     for (int w = 0; w < WALKS; ++w) {
         walk->target[w] = draw(walk->record[w], entries, walk->word[w]);
         walk->factor[0][w] = walk->record[w].z ? as_float(walk->record[w].w) : 0;
@@ -180,10 +147,11 @@ static inline void draw_targets(
         if (b)
             FETCH(b + (int)(walk->target[w] >> 1) * stride);
     }
+    return busy;
 }
 
-// Move walk w; returns whether it goes on after its score, and in `worth` what a score of each channel is
-// multiplied by: left as it is, 0, where the row is empty.
+// Move walk w. Returns whether it goes on after its score; `worth`, what a score of each channel is multiplied by,
+// is left as it is, 0, where the row is empty.
 static inline int move(walks *walk, int w, global const uint2 *steps, real *worth)
 {
     int seen = 0;
@@ -203,37 +171,32 @@ static inline int move(walks *walk, int w, global const uint2 *steps, real *wort
 kernel void walk_rows(
     int units, int chunks, uint first, uint end, ulong seed, uint stream, int stride, int offset,
     global const uint *pixels, global const uint4 *rows, global const ulong *entries, global const uint4 *links,
-    global const uint2 *steps, global const real *b, global real4 *out)
+    global const uint2 *steps, global const real *b, global float2 *out)
 {
-    walks walk;
-    real score[WALKS][K] = {{0}}, sums[WALKS][K][4] = {{{0}}};
+    walks walk = {{0}};
+    real score[WALKS][K] = {{0}};
+    float2 sums[WALKS][K] = {{0}};
     set_out(&walk, units, chunks, first, end, pixels);
-    while (set_off(&walk, seed, stream, rows, entries)) {
-        draw_targets(&walk, rows, entries, links, b, stride);
+    while (draw_steps(&walk, seed, stream, rows, entries, links, b, stride)) {
         for (int w = 0; w < WALKS; ++w) {
             if (!walk.alive[w])
                 continue;
             real worth[CHANNELS] = {0};
             walk.alive[w] = move(&walk, w, steps, worth);
-            if (COLLISION || !walk.alive[w])
-                for (int c = 0; c < K; ++c)
-                    score[w][c] += worth[c % CHANNELS] * b[(int)walk.row[w] * stride + offset + c];
+            for (int c = 0; c < K; ++c)
+                score[w][c] += worth[c % CHANNELS] * b[(int)walk.row[w] * stride + offset + c];
             if (walk.alive[w])
                 continue;
             walk.row[w] = walk.pixel[w];
             for (int c = 0; c < K; ++c) {
-                two_sum(score[w][c], sums[w][c]);
-                two_sum(score[w][c] * score[w][c], sums[w][c] + 2);
+                sums[w][c] += (float2)(score[w][c], score[w][c] * score[w][c]);
                 score[w][c] = 0;
             }
         }
     }
-    for (int w = 0; w < WALKS; ++w) {
-        const int unit = get_global_id(0) * WALKS + w;
-        if (unit < units)
-            for (int c = 0; c < K; ++c)
-                out[unit * K + c] = vload4(0, sums[w][c]);
-    }
+    for (int unit = get_global_id(0) * WALKS, w = 0; w < WALKS && unit < units; ++w, ++unit)
+        for (int c = 0; c < K; ++c)
+            out[unit * K + c] = sums[w][c];
 }
 
 // Sample s writes ends[s - first] and scores[s - first]; `pixel` is the row of b behind those of R^T.
@@ -241,10 +204,9 @@ kernel void walk_columns(
     int units, uint first, uint end, ulong seed, uint stream, global const uint *pixel, global const uint4 *rows,
     global const ulong *entries, global const uint2 *steps, global uint *ends, global real *scores)
 {
-    walks walk;
+    walks walk = {{0}};
     set_out(&walk, units, units, first, end, pixel);
-    while (set_off(&walk, seed, stream, rows, entries)) {
-        draw_targets(&walk, rows, entries, 0, 0, 0);
+    while (draw_steps(&walk, seed, stream, rows, entries, 0, 0, 0)) {
         for (int w = 0; w < WALKS; ++w) {
             real worth[CHANNELS] = {0};
             if (!walk.alive[w] || move(&walk, w, steps, worth))

@@ -1,24 +1,23 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Orthonormal wavelet transforms of pictures, periodized: from pixels to coefficients (wavelet_split) and back
-// (wavelet_join), out = a (W x) + b y.
+// (wavelet_join), out = scale (W x) + add_scale add.
 //
-// A level halves both sides at once: from the values that the filters reach, two by two are made, or two by
-// 2 PAIRS. Items stride through pieces of K right-hand sides (dimension 0), pairs of columns (1) and of rows (2).
-// A launch of one level takes any number of groups; one of several, first .. last - 1, takes one group a piece,
-// which waits for itself between levels: for small pictures.
+// A level halves both sides at once: from the values that the filters reach, two by two are made, or two by 2 PAIRS.
+// Items stride through pieces of K right-hand sides (dimension 0), pairs of columns (1) and of rows (2). A launch of
+// one level takes any number of groups; one of several, first .. last - 1, takes one group a piece, which waits for
+// itself between levels: for small pictures.
 //
-// Required defines: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8;
-// TAPS, the length of the filters, even; PAIRS, of columns together: 1, or 8 where K is 1 and one item takes all of
-// a row.
+// Required defines: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8; TAPS, the length of the
+// filters, even; PAIRS, of columns together: 1, or 8 where K is 1 and one item takes all of a row.
 // Layout: a picture is row-major, its k right-hand sides side by side. Coefficients stand as PyWavelets'
 // coeffs_to_array puts them: of each side the approximation first, ceil(n / 2) of n. taps[2 * TAPS] is the
 // low-pass filter, then the high-pass one, in the order of the samples. near holds the approximations of the levels
 // 1 .. levels - 1 as pictures of their own, that of level i + 1 from pixel starts[i] on.
 //
-// A side of any length: `level` times halved it has n = ceil(pixels / 2^level) samples, the last of which may
-// stand for fewer pixels than the others. It stays out of the filters; where an odd number of whole ones is
-// left, the last two turn into one of the approximation and a detail, by a rotation that takes a constant to
-// the approximation alone. Orthonormal, and a constant has one coefficient on any grid.
+// A side that is `level` times halved has n = ceil(pixels / 2^level) samples, the last of which may stand for fewer
+// pixels than the others. It stays out of the filters; where an odd number of whole ones is left, the last two turn
+// into one of the approximation and a detail, by a rotation that takes a constant to the approximation alone.
+// Orthonormal, and a constant has one coefficient on any grid.
 
 #include "common/pieces.h"
 
@@ -29,8 +28,8 @@
 #define HALF (TAPS / 2)
 #define FIRST ((HALF + 1) % 2)  // where the samples of pair 0 begin that need the same coefficients
 
-// Quantities of PAIRS neighbours, of which every second one is among SAMPLES. At the edges all lanes hold the same,
-// and the first one counts. SHUFFLE takes the first samples of pairs and the second ones to the order of pixels.
+// PAIRS neighbours, of samples every second one. At the edges all lanes hold the same, and the first one counts.
+// SHUFFLE takes the first samples of pairs and the second ones to the order of pixels.
 #if PAIRS == 8
 typedef real8 wide;
 #define SAMPLES(p) ((real8)(LOAD8(p).even, LOAD8((p) + 8).even))
@@ -187,10 +186,12 @@ INLINE void store(global real *out, int i, wide v, bool inside, int skip, real a
         put(out, i, ONE(v), skip, a, b, y);
 }
 
-kernel void wavelet_split(
-    int height, int width, int first, int last, int levels, int k, real scale, real add_scale,
-    constant int *starts, constant real *taps, global const real *x, global real *near, global const real *add,
-    global real *out)
+#define TRANSFORM \
+    int height, int width, int first, int last, int levels, int k, real scale, real add_scale, \
+    constant int *starts, constant real *taps, global const real *x, global real *near, global const real *add, \
+    global real *out
+
+kernel void wavelet_split(TRANSFORM)
 {
     const piece p = piece_of(get_global_id(0), k);
     for (int level = first; level < last; ++level) {
@@ -222,10 +223,7 @@ kernel void wavelet_split(
 }
 
 // Levels last - 1 .. first; `out` gets the picture where the first is level 0.
-kernel void wavelet_join(
-    int height, int width, int first, int last, int levels, int k, real scale, real add_scale,
-    constant int *starts, constant real *taps, global const real *x, global real *near, global const real *add,
-    global real *out)
+kernel void wavelet_join(TRANSFORM)
 {
     const piece p = piece_of(get_global_id(0), k);
     x += p.at;

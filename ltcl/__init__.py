@@ -10,19 +10,6 @@ ltcl undoes the bounces with matrix-vector products only.
     c = ltcl.compensate(T, desired)            # c.pattern makes the wall look like `desired`
     b = ltcl.separate(T, image)                # b.direct, b.bounces: each bounce as its own picture
 
-The house, from the ground up; imports point down only:
-
-    errors, checks, files           one-line refusals; outputs that appear whole or not at all
-    device, operators               OpenCL: devices, kernels, arrays; matrices there, S = I + R
-    layout                          pictures and matrices by colour channel, as arrays of a linear system
-    theory, solvers, diagnostics    forecasts; one algorithm per file; what T tells of its scene
-    first_bounce, transport         F; T = S F
-    compensation, separation, relighting, analysis, scenes, store       the tasks, test scenes, files of T
-    acquisition                     from photographs to T: rigs, radiometry, geometry, scanning
-    compression                     T in few numbers, with a bound on what solutions lose
-    images, report                  pictures, JSON
-    plots, batch, demo, cli         what people look at; many frames
-
 After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse Light Transport, IEEE PAMI
 2011; equation numbers in this package are that paper's. Importing ltcl touches no OpenCL driver.
 """
@@ -30,13 +17,7 @@ After Chandraker, Bai, Ng and Ramamoorthi, On the Duality of Forward and Inverse
 from __future__ import annotations
 
 import importlib
-import sys
 from typing import TYPE_CHECKING, Any
-
-from ltcl import interrupts
-
-if interrupts.is_program(sys.orig_argv):  # before what takes a while
-    interrupts.end_in_one_line()
 
 from ltcl import errors
 from ltcl.analysis import Analysis, analyze

@@ -14,6 +14,7 @@ from ltcl.diagnostics import Energy
 from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
 from ltcl.solvers.auto import survey
+from ltcl.theory.forecast import LEAST_RTOL
 from ltcl.transport import Transport, require
 
 
@@ -25,14 +26,8 @@ class ChannelAnalysis:
     ----------
     norm_one, norm_inf, norm_frobenius : float
         Of R; NaN where the operator cannot see its entries. ||R||_inf < 1 makes the series converge.
-    spectral_radius : float
-        rho(R) by power iteration; the paper's iteration converges below 1.
-    spectral_radius_change : float
-        Relative change of it in the last step.
-    spectral_radius_bounds : (lower, upper)
-        Between which rho(R) lies, as far as the certificate goes.
-    spectral_radius_certificate : str
-        "collatz-wielandt", for certain; "power iteration", an estimate; see `theory.SpectralRadius`.
+    spectral_radius, spectral_radius_change, spectral_radius_bounds, spectral_radius_certificate
+        rho(R) and what is known of it: see `theory.SpectralRadius`. The paper's iteration converges below 1.
     albedo : float
         rho / (1 + rho): the uniform albedo of a closed scene with this radius (eq. 14).
     bounds : (lower, upper)
@@ -46,10 +41,8 @@ class ChannelAnalysis:
         What 1, 2, 4, 8 and 16 terms of the series leave undone (eq. 13, 15, 16), with m from the upper bound
         on rho(R), in the norm in which a reciprocal T makes A self-adjoint.
     first_bounce : (smallest, median, largest)
-    reciprocity_defect : float
-        0 of a Lambertian scene without noise; see `ltcl.diagnostics`.
-    negative_bounce : float
-        Light that one bounce takes away: 0 of a Lambertian scene, above 0.005 of glossy ones.
+    reciprocity_defect, negative_bounce : float
+        Both 0 of a Lambertian scene without noise, the second above 0.005 of glossy ones: `ltcl.diagnostics`.
     energy : Energy
     """
 
@@ -71,7 +64,7 @@ class ChannelAnalysis:
     energy: Energy
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Analysis:
     """Result of `ltcl.analyze`: one entry of `channels` per colour channel."""
 
@@ -82,6 +75,10 @@ class Analysis:
     masked: int
     channels: tuple[ChannelAnalysis, ...]
 
+    def __repr__(self) -> str:
+        (h, w), radii = self.grid, ", ".join(f"{one.spectral_radius:.3g}" for one in self.channels)
+        return f"<ltcl Analysis grid {h} x {w}, rho(R) {radii}>"
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON; what is infinite or unknown is None."""
         return report.plain(self)
@@ -90,21 +87,8 @@ class Analysis:
 def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     """Norms and spectral radius of R, the products each method would need, and checks of the measurement.
 
-    Parameters
-    ----------
-    T : Transport
-        Square.
-    rtol : float
-        Tolerance the forecast is for.
-
-    Returns
-    -------
-    Analysis
-
-    Raises
-    ------
-    InputError
-        A rectangular T.
+    T is a square Transport; a rectangular one raises InputError. The forecast is for the tolerance `rtol`,
+    from what float32 products can confirm, 1.2e-7, to 1.
 
     Examples
     --------
@@ -114,7 +98,7 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     True
     """
     require(T)
-    rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
+    rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     F = np.atleast_2d(T.first_bounce)
     return Analysis(
         shape=T.shape,
@@ -136,9 +120,9 @@ def _channel(T: Any, F: np.ndarray, S: IdentityPlus, negative: float, rtol: floa
         norms = None
     rho = theory.spectral_radius(S.R, norms=norms)
     bounds = theory.free_bounds(S)
-    found = survey(S)
-    spectrum = found.spectrum if found.in_an_interval else None
-    forecasts = theory.forecasts(S, rho, bounds, rtol, spectrum, found.self_adjoint)
+    surveyed = survey(S)
+    spectrum = surveyed.spectrum if surveyed.in_an_interval else None
+    forecasts = theory.forecasts(S, rho, bounds, rtol, spectrum, surveyed.self_adjoint)
     upper = rho.upper if math.isfinite(rho.upper) else rho.value
     lit = F[F > 0]
     return ChannelAnalysis(

@@ -12,14 +12,14 @@ R = T F^-1 - I is compared with its transpose
 which is 0 of a reciprocal T, about e where every entry has independent relative noise e, and 1 where light
 goes one way only. A view-dependent (glossy) surface breaks it, as does a camera off the projector's pixels.
 The fit minimises the same norm to first order: sum N_ij^2 (log d_i - log d_j - log R_ij / R_ji)^2 with
-N_ij^2 = R_ij R_ji, a graph Laplacian solved by conjugate gradients. O(nnz) a step.
+N_ij^2 = R_ij R_ji, a graph Laplacian solved by conjugate gradients.
 
 **One bounce**: of a Lambertian scene I - S^-1 = A (eq. 4), and A takes no light away from anywhere. One view
 of glossy surfaces is T = P S F Q (eq. 28, section 8.4); what stands in the place of A then has negative
 entries. They are summed between parts of the picture, 4 x 4 rectangles, over whose pixels the noise of a
 measurement averages out; within a part, a biased first bounce makes negative entries, too. Measured: 0 of
-diffuse boxes whatever their first bounce, 0.0004 of a path-traced diffuse corner; of a glossy corner 0.005,
-0.013, 0.034 and 0.13 with shares of 0.05, 0.1, 0.2 and 0.4 of glossy reflection.
+diffuse boxes, 0.0004 of a path-traced diffuse corner; of a glossy corner 0.005, 0.013, 0.034 and 0.13 with
+shares of 0.05, 0.1, 0.2 and 0.4 of glossy reflection.
 
 **Energy**: A 1 = 1 - S^-1 1 costs one solve. Row i of one bounce sums to the albedo of pixel i times the
 share of its view that the projector lights, in [0, 1) whatever the areas. Columns of R sum to what comes back
@@ -36,7 +36,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from ltcl.errors import ConvergenceError, InputError
-from ltcl.operators import IdentityPlus, Operator
+from ltcl.operators import IdentityPlus
 from ltcl.solvers import solve
 
 ALL, QUICK = 1 << 22, 1 << 18  # entries to compare at most, in `analyze` and in passing
@@ -70,23 +70,21 @@ def reciprocity_defect(T: Any, F: np.ndarray, *, entries: int = ALL, seed: int =
     >>> round(reciprocity_defect(np.array([[1.0, 0.2], [0.0, 1.0]]), np.ones(2)), 3)
     1.0
     """
-    lit = np.flatnonzero(F > 0)
-    if hasattr(T, "between"):
-        pixels = _sample(lit, len(F) ** 2, len(F), entries // _PRODUCT_COST, seed)
-        R = _indirect(T.between(pixels, pixels), F[pixels], np.arange(len(pixels)))
+    lit, n = np.flatnonzero(F > 0), len(F)
+    if hasattr(T, "between"):  # an Operator, or the rows of a store
+        pixels = _sample(lit, n**2, n, entries // _PRODUCT_COST, seed)
+        R = _indirect(T.between(pixels, pixels), F[pixels])
     elif isinstance(T, (np.ndarray, scipy.sparse.csr_array)):
         count = T.size if isinstance(T, np.ndarray) else T.nnz
-        R = _indirect(T, F, _sample(lit, count, len(F), entries, seed))
+        pixels = _sample(lit, count, n, entries, seed)
+        dense = isinstance(T, np.ndarray)
+        R = _indirect(T[np.ix_(pixels, pixels)] if dense else T[pixels][:, pixels], F[pixels])
     else:
         return float("nan")
     root = np.exp(_log_scale(R) / 2)
-    if isinstance(R, np.ndarray):
-        N = R * root / root[:, None]
-        difference, whole = np.linalg.norm(N - N.T), np.linalg.norm(N)
-    else:
-        N = scipy.sparse.diags_array(1 / root) @ R @ scipy.sparse.diags_array(root)
-        difference, whole = scipy.sparse.linalg.norm(N - N.T), scipy.sparse.linalg.norm(N)
-    return float(difference / (np.sqrt(2) * whole)) if whole > 0 else 0.0
+    N = scipy.sparse.diags_array(1 / root) @ R @ scipy.sparse.diags_array(root)
+    whole = scipy.sparse.linalg.norm(N)
+    return float(scipy.sparse.linalg.norm(N - N.T) / (np.sqrt(2) * whole)) if whole > 0 else 0.0
 
 
 def _sample(pixels: np.ndarray, count: int, n: int, entries: int, seed: int) -> np.ndarray:
@@ -97,45 +95,25 @@ def _sample(pixels: np.ndarray, count: int, n: int, entries: int, seed: int) -> 
     return np.sort(np.random.default_rng(seed).choice(pixels, some, replace=False))
 
 
-def _indirect(T: Any, F: np.ndarray, pixels: np.ndarray) -> Any:
-    """R between the pixels without its diagonal, float64, largest entry 1."""
-    if isinstance(T, np.ndarray):
-        R = T[np.ix_(pixels, pixels)] / F[pixels]
-        np.fill_diagonal(R, 0.0)
-        return R / (np.abs(R).max(initial=0.0) or 1.0)
-    R = T[pixels][:, pixels] @ scipy.sparse.diags_array(1.0 / F[pixels])
+def _indirect(T: Any, F: np.ndarray) -> Any:
+    """R without its diagonal, csr_array float64, largest entry 1."""
+    R = scipy.sparse.csr_array(T) @ scipy.sparse.diags_array(1.0 / F)
     R = scipy.sparse.csr_array(R - scipy.sparse.diags_array(R.diagonal()))
     return R / (np.abs(R.data).max(initial=0.0) or 1.0)
 
 
 def _log_scale(R: Any) -> np.ndarray:
     """log d of the fit; 0 where a pixel shares no light with others in both directions."""
-    if isinstance(R, np.ndarray):
-        light = np.maximum(R, 0.0)
-        weight = light * light.T
-        logs = np.log(light, out=np.zeros_like(light), where=light > 0)
-        pull = (weight * (logs - logs.T)).sum(axis=1)
-    else:
-        light = R.maximum(0.0).tocsr()
-        light.eliminate_zeros()
-        weight, logs = light.multiply(light.T).tocsr(), light.copy()
-        logs.data = np.log(logs.data)
-        pull = (weight.multiply(logs) - weight.multiply(logs.T)).sum(axis=1)
+    light = R.maximum(0.0).tocsr()
+    light.eliminate_zeros()
+    weight, logs = light.multiply(light.T).tocsr(), light.copy()
+    logs.data = np.log(logs.data)
+    pull = (weight.multiply(logs) - weight.multiply(logs.T)).sum(axis=1)
     degree = weight.sum(axis=1)
-    return np.clip(_laplacian_solve(weight, degree, np.asarray(pull)), -_LARGEST, _LARGEST)
-
-
-def _laplacian_solve(weight: Any, degree: np.ndarray, pull: np.ndarray) -> np.ndarray:
-    """x of (diag(degree) - weight) x = pull, singular but consistent."""
     diagonal = np.where(degree > 0, degree, 1.0)
-    jacobi = scipy.sparse.diags_array(1.0 / diagonal)
-    if isinstance(weight, np.ndarray):
-        laplacian = -weight
-        laplacian[np.diag_indices_from(laplacian)] = diagonal
-    else:
-        laplacian = scipy.sparse.diags_array(diagonal) - weight
-    x, _ = scipy.sparse.linalg.cg(laplacian, pull, rtol=_RTOL, maxiter=_STEPS, M=jacobi)
-    return x
+    laplacian, jacobi = (scipy.sparse.diags_array(d) for d in (diagonal, 1.0 / diagonal))
+    x, _ = scipy.sparse.linalg.cg(laplacian - weight, np.asarray(pull), rtol=_RTOL, maxiter=_STEPS, M=jacobi)
+    return np.clip(x, -_LARGEST, _LARGEST)
 
 
 def negative_bounce(S: IdentityPlus, grid: tuple[int, int]) -> float:
@@ -210,7 +188,7 @@ def check_energy(T: Any, F: np.ndarray, S: IdentityPlus) -> Energy:
 
 
 def _from_columns(T: Any, F: np.ndarray, lit: np.ndarray) -> float:
-    if isinstance(T, Operator):
+    if hasattr(T, "between"):  # an Operator, or the rows of a store
         try:
             sums = T.rmatvec(np.ones(len(F)))
         except InputError:  # of those that have no transpose

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Every problem ltcl raises, as one small family.
 
-A message is one line: it names the argument, says what it was and what it must be.
-`LtclError` catches them all; each child is also the builtin exception a Python user expects.
+A message is one line: the argument, what it was, what it must be. Each is also the builtin exception that a
+Python user expects, and what is beside the message has a default, so that `pickle` needs the message alone.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 
@@ -25,12 +26,9 @@ class InputTypeError(LtclError, TypeError):
 class ToleranceError(InputError):
     """A tolerance is below what float32 keeps; `least` is about what it does, infinite where not known."""
 
-    def __init__(self, message: str, least: float) -> None:
+    def __init__(self, message: str, least: float = math.inf) -> None:
         super().__init__(message)
         self.least = least
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (str(self), self.least)
 
 
 class FileError(InputError, OSError):
@@ -56,23 +54,14 @@ class ScanRefused(AcquisitionError):
 class PhotographMissing(AcquisitionError):
     """A photograph has yet to be taken by a person; `number` is its place in the shooting list."""
 
-    def __init__(self, message: str, number: int) -> None:
+    def __init__(self, message: str, number: int = 0) -> None:
         super().__init__(message)
         self.number = number
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (str(self), self.number)
-
 
 class ConvergenceError(LtclError, ArithmeticError):
-    """A solve did not reach its tolerance. `solution` holds the best iterate and the history.
+    """A solve did not reach its tolerance. `solution`, as the function returns it, holds the best iterate."""
 
-    That is a `Solution`, or what else the function that raised returns.
-    """
-
-    def __init__(self, message: str, solution: Any) -> None:
+    def __init__(self, message: str, solution: Any = None) -> None:
         super().__init__(message)
         self.solution = solution
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (str(self), self.solution)

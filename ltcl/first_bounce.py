@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The first bounce F of a measured T = S F (eq. 3), and what to do where it is dark.
 
-F_i = 1 / (T^-1)_ii, since T^-1 = F^-1 (I - A) and A has no diagonal. Where T is too large to invert, with
-F0 = diag(T) as preconditioner, T^-1 = F0^-1 S0^-1, S0 = T F0^-1. For a random vector z of signs +-1 the
-product z_i (S0^-1 z)_i has the mean (S0^-1)_ii; averaged over K probes its variance is that of the rest of
-the row, sum_{j != i} (S0^-1)_ij^2 / K (Bekas, Kokiopoulou, Saad, An estimator for the diagonal of a matrix,
-Applied Numerical Mathematics 57, 2007, after Hutchinson). That rest is one bounce spread over many pixels,
-so few probes are enough; 32 of them are solved together.
+F_i = 1 / (T^-1)_ii, since T^-1 = F^-1 (I - A) and A has no diagonal. Where T is too large to invert,
+T^-1 = F0^-1 S0^-1 with F0 = diag(T), S0 = T F0^-1, and z_i (S0^-1 z)_i of random signs z has the mean
+(S0^-1)_ii and, averaged over K probes, the variance sum_{j != i} (S0^-1)_ij^2 / K (Bekas, Kokiopoulou, Saad,
+Applied Numerical Mathematics 57, 2007): one bounce spread over many pixels, so few probes are enough.
 """
 
 from __future__ import annotations
 
+import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,142 +24,121 @@ from ltcl.errors import ConvergenceError, InputError, InputTypeError
 from ltcl.operators import Operator, interreflections
 from ltcl.solvers import solve
 
+logger = logging.getLogger(__name__)
 _BYTES = 3 * 8  # of a dense inverse, per entry: the matrix, its inverse and what LAPACK works with
 _RTOL = 1e-5  # of the solves of an estimate: far below the scatter of any affordable number of probes
 _TOGETHER = 32  # probes in one solve
 
 
-def find(matrices: Sequence[Any], first_bounce: Any) -> np.ndarray:
-    """F of each channel, (channels, N) float64, not yet checked for sign; not "estimate"."""
+def find(
+    matrices: Sequence[Any], requested: Any, device: Callable[[], Device], probes: int, seed: int
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """F of each channel, (channels, N) float64, and the standard error of an estimate; of any sign."""
     n: int = matrices[0].shape[0]
-    if isinstance(first_bounce, str):
-        checks.one_of("first_bounce", first_bounce, ("diagonal", "exact", "estimate"))
-        return np.stack([_diagonal(T) if first_bounce == "diagonal" else _exact(T) for T in matrices])
-    F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce)).astype(np.float64)
-    checks.shape("first_bounce", F, *([(n,), (1, n)] if len(matrices) == 1 else [(n,), (3, n)]))
-    return np.broadcast_to(F, (len(matrices), n))
-
-
-def too_large(matrix: Any) -> bool:
-    """Whether "exact" would invert more than the host has memory for."""
-    return _BYTES * matrix.shape[0] ** 2 > checks.host_memory()
+    checks.count("probes", probes, least=2)
+    checks.count("seed", seed, least=0)
+    if not isinstance(requested, str):
+        F = checks.finite("first_bounce", checks.real("first_bounce", requested)).astype(np.float64)
+        F = checks.shape("first_bounce", F, (n,), (len(matrices), n))
+        return np.broadcast_to(F, (len(matrices), n)), None
+    checks.one_of("first_bounce", requested, ("diagonal", "exact", "estimate"))
+    if requested == "diagonal":
+        F = np.stack([_diagonal(T) for T in matrices])
+        if (brightest := float(np.max(F))) > float(np.finfo(np.float32).max):
+            raise InputError(f"matrix reaches {brightest:.3g}, beyond float32; give it in other units")
+        return F, None
+    if requested == "exact":
+        try:
+            checks.fits_host(f"a dense inverse of {n} pixels", _BYTES * n**2)
+            return np.stack([_exact(T) for T in matrices]), None
+        except MemoryError:
+            logger.warning("T of %d pixels is too large for a dense inverse; F is estimated", n)
+    return _estimate(matrices, device(), probes, seed)
 
 
 def _diagonal(matrix: Any) -> np.ndarray:
-    if callable(getattr(matrix, "diagonal", None)):
-        return np.asarray(matrix.diagonal(), np.float64)
-    raise InputError(
-        f"first_bounce is 'diagonal', but a {type(matrix).__name__} has no diagonal(); "
-        "give first_bounce as an array (N,)"
-    )
+    if not hasattr(matrix, "diagonal"):
+        kind = type(matrix).__name__
+        raise InputError(f"first_bounce is 'diagonal', but a {kind} has no diagonal(); give an array (N,)")
+    return np.asarray(matrix.diagonal(), np.float64)
 
 
 def _exact(matrix: Any) -> np.ndarray:
     """1 / diag(T^-1), by a dense inverse of the pixels that are lit."""
-    n = matrix.shape[1]
     if not isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)):
         raise InputTypeError(
-            f"first_bounce='exact' inverts the matrix densely, which a {type(matrix).__name__} does not "
-            "allow; give 'estimate', or first_bounce as an array (N,)"
+            f"first_bounce is 'exact', but a {type(matrix).__name__} shows no entries to invert; give "
+            "'estimate' or an array (N,)"
         )
-    checks.fits_host(f"first_bounce='exact' inverts T densely, which for N = {n}", _BYTES * n * n)
     dense = (matrix if isinstance(matrix, np.ndarray) else matrix.toarray()).astype(np.float64)
     lit = dense.any(axis=0) & dense.any(axis=1)  # a dark pixel would make T singular; its F is 0
-    if not lit.all():
-        dense = dense[np.ix_(lit, lit)]
+    dense = dense[np.ix_(lit, lit)]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", scipy.linalg.LinAlgWarning)  # no digit would be right
             inverse = scipy.linalg.inv(dense, overwrite_a=True, check_finite=False)
+    except RuntimeError as error:  # SciPy's of work arrays that LAPACK did not get
+        raise MemoryError(str(error)) from error
     except (np.linalg.LinAlgError, scipy.linalg.LinAlgWarning) as error:
-        raise InputError(
-            "first_bounce is 'exact', which needs an invertible T, but this one is singular in float64; "
-            "give 'diagonal' or an array (N,)"
-        ) from error
+        text = "first_bounce is 'exact', but T is singular in float64; give 'diagonal' or an array (N,)"
+        raise InputError(text) from error
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         inverted = 1.0 / np.diagonal(inverse)
-    F = np.zeros(n)
+    F = np.zeros(lit.shape)
     F[lit] = np.where(np.isfinite(inverted), inverted, 0.0)
     return F
 
 
-def estimate(
+def _estimate(
     matrices: Sequence[Any], device: Device, probes: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """F and its standard error, (channels, N) float64 each; F is 0 where diag(T) is not positive.
-
-    Raises
-    ------
-    InputError
-        A matrix without a diagonal, or whose S0 Chebyshev's iteration cannot invert.
-
-    Examples
-    --------
-    >>> import ltcl
-    >>> T = np.array([[0.5, 0.1], [0.1, 0.5]])
-    >>> F, error = estimate([T], ltcl.open_device(), probes=400, seed=0)
-    >>> bool(np.all(abs(F - 0.48) < 4 * error)), bool(np.all(error < 0.01))
-    (True, True)
-    """
-    F0 = np.maximum(find(matrices, "diagonal"), 0.0)
+    """F and its standard error, (channels, N) float64 each; F is 0 where diag(T) is not positive."""
+    F0 = np.maximum([_diagonal(T) for T in matrices], 0.0)
     F, error = np.zeros_like(F0), np.zeros_like(F0)
     for channel, S in enumerate(interreflections(matrices, F0, device)):
-        mean, spread = _diagonal_of_inverse(S.as_it_stands(), probes, seed)
+        samples, left = _samples(S.as_it_stands(), probes, seed)
+        mean = samples.mean(axis=1, dtype=np.float64)
+        spread = np.hypot(samples.std(axis=1, ddof=1, dtype=np.float64) / np.sqrt(probes), left)
         np.divide(F0[channel], mean, out=F[channel], where=mean > 0)
         np.divide(F[channel] * spread, mean, out=error[channel], where=mean > 0)
     return F, error
 
 
-def _diagonal_of_inverse(S: Operator, probes: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """diag(S^-1) and its standard error, (N,) each; what the solves left is part of the error."""
-    n, rng = S.shape[0], np.random.default_rng(seed)
-    total, squares, worst = np.zeros(n), np.zeros(n), 0.0
-    for start in range(0, probes, _TOGETHER):
-        signs = rng.integers(0, 2, (n, min(_TOGETHER, probes - start))).astype(np.float32) * 2 - 1
-        try:
-            solution = solve(S, signs, "chebyshev", rtol=_RTOL)
-        except ConvergenceError as error:
-            raise InputError(
-                f"first_bounce is 'estimate', whose solves ended at a relative residual of "
-                f"{error.solution.residual:.2g}; T is far from that of a diffuse scene; give 'diagonal' or "
-                "an array (N,)"
-            ) from error
-        samples = signs * solution.x.astype(np.float64)
-        total += samples.sum(axis=1)
-        squares += (samples**2).sum(axis=1)
-        worst = max(worst, solution.residual)
-    mean = total / probes
-    variance = np.maximum(squares - probes * mean**2, 0.0) / (probes - 1)
-    return mean, np.hypot(np.sqrt(variance / probes), worst)
+def _samples(S: Operator, probes: int, seed: int) -> tuple[np.ndarray, float]:
+    """z_i (S^-1 z)_i of random signs z, (N, probes), and the largest relative residual of the solves."""
+    signs = np.random.default_rng(seed).choice(np.array([-1, 1], np.float32), (S.shape[0], probes))
+    some = np.split(signs, range(_TOGETHER, probes, _TOGETHER), axis=1)
+    try:
+        solutions = [solve(S, z, "chebyshev", rtol=_RTOL) for z in some]
+    except ConvergenceError as error:
+        raise InputError(
+            f"first_bounce is 'estimate', whose solves end at a residual of {error.solution.residual:.2g}: T "
+            "is far from that of a diffuse scene; give 'diagonal' or an array (N,)"
+        ) from error
+    return signs * np.hstack([s.x for s in solutions]), max(s.residual for s in solutions)
 
 
-def refuse_dark(dark: np.ndarray, grid: tuple[int, int], on_dark: str, maskable: bool) -> None:
-    """Refuse pixels without a positive first bounce, unless they may be masked and this T is `maskable`."""
-    pixels = np.flatnonzero(dark.any(axis=0))
-    if len(pixels) == dark.shape[1]:
+def mask_dark(
+    F: np.ndarray, grid: tuple[int, int], on_dark: str, may_mask: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """F with 0, and True (N,), where some channel's is not positive; refused unless it may be masked."""
+    dark: np.ndarray = np.any(F <= 0.0, axis=0)
+    pixels = np.flatnonzero(dark)
+    if len(pixels) == len(dark):
         raise InputError(
             "first_bounce is zero or negative at every pixel; it must be positive where light falls: "
             "check the sign and the black level of T"
         )
-    if on_dark == "mask" and maskable:
-        return
-    listed = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
-    more = f" and {len(pixels) - 8} more" if len(pixels) > 8 else ""
-    advice = "give on_dark='mask' to leave these pixels unlit"
-    if on_dark == "mask":
-        advice = "a LinearOperator cannot be masked here, mask it yourself"
+    if not len(pixels) or may_mask:
+        return np.where(dark, 0.0, F), dark
+    first = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
+    advice = ("give on_dark='mask' to leave these pixels unlit", "mask this LinearOperator yourself")
     raise InputError(
-        f"first_bounce is zero or negative at {len(pixels)} of {dark.shape[1]} pixels (row, column): "
-        f"{listed}{more}; it must be positive; {advice}"
+        f"first_bounce is zero or negative at {len(pixels)} of {len(dark)} pixels (row, column): {first}"
+        f"{', ...' if len(pixels) > 8 else ''}; it must be positive; {advice[on_dark == 'mask']}"
     )
 
 
 def certain(F: np.ndarray, variance: np.ndarray, sigmas: float) -> np.ndarray:
-    """`F` where it is above 0 by so many standard deviations, else 0: a pixel to be masked.
-
-    With noise for F, S = T F^-1 would be anything. What has a variance of NaN is not certain.
-
-    >>> certain(np.array([4.0, 2.0, -4.0, 4.0]), np.array([1.0, 1.0, 1.0, np.nan]), 3.0).tolist()
-    [4.0, 0.0, 0.0, 0.0]
-    """
+    """`F` where it is so many standard deviations above 0, else 0: with noise for F, S would be anything."""
     return np.where(sigmas * np.sqrt(variance) < F, F, 0.0)

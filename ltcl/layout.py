@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What users hold as arrays of a linear system: pictures as right-hand sides, matrices by colour channel.
+"""Pictures as right-hand sides of a linear system, matrices by colour channel.
 
 A picture is (h, w) or (h, w, 3), with frames in front where there are several, or flat (N,). A system of
 N pixels takes (N, k), a column a frame, and for a transport of one channel a column a colour, too.
@@ -7,6 +7,7 @@ N pixels takes (N, k), a column a frame, and for a transport of one channel a co
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,23 +19,25 @@ import scipy.sparse.linalg
 from ltcl import checks
 from ltcl.errors import InputError
 
+logger = logging.getLogger(__name__)
+UNITS = (  # of a warning
+    "it is taken as linear light in the units of T; divide by %d if it is linear light; if it is an sRGB "
+    "picture, read the file with ltcl.images.read"
+)
 _BLOCK = 2048  # pixels that are transposed at once: caches hold them
 _LARGEST_CONDITION = 1e6  # of a mixing: beyond, float32 has hardly a digit left
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The shape of a picture, so that results come back in the same one.
-
-    `colour` tells whether results have a last axis of 3; `frames` is None for a single picture.
-    """
+    """The shape of a picture: results have a last axis of 3 if `colour`, `frames` is None of a single one."""
 
     flat: bool
     frames: int | None
     colour: bool
 
     def pack(self, columns: Sequence[np.ndarray], grid: tuple[int, int]) -> np.ndarray:
-        """The picture whose right-hand sides are `columns`, one (N, k) array per transport channel."""
+        """The picture whose right-hand sides are `columns`, one (N, k) a channel."""
         frames, n = self.frames or 1, grid[0] * grid[1]
         if len(columns) == 1:
             values = np.reshape(columns[0], (n, frames, 3 if self.colour else 1)).transpose(1, 0, 2)
@@ -50,45 +53,23 @@ class Layout:
 
 
 def unpack(name: str, picture: Any, grid: tuple[int, int], channels: int) -> tuple[list[np.ndarray], Layout]:
-    """Cut a picture into the right-hand sides of each channel of a transport.
+    """Cut a picture (N,), (h, w), (h, w, 3), or frames, into the right-hand sides (N, k) of each channel.
 
-    Parameters
-    ----------
-    name : str
-        Of the argument, for messages.
-    picture : (h, w), (h, w, 3), (frames, h, w), (frames, h, w, 3) or (N,)
-        A grey picture serves all three channels of a colour transport.
-    grid : (h, w)
-    channels : int
-        1 or 3, of the transport.
-
-    Returns
-    -------
-    columns : list of (N, k) arrays, one per channel
-    layout : Layout
-
-    Raises
-    ------
-    InputError
-        Another size, NaN or infinite values.
-
-    >>> columns, layout = unpack("image", np.zeros((4, 5, 3)), (4, 5), channels=1)
-    >>> columns[0].shape, layout.pack(columns, (4, 5)).shape
-    ((20, 3), (4, 5, 3))
+    A grey picture serves all three channels. A warning where it holds the codes of a picture file.
     """
     array = checks.finite(name, checks.real(name, picture))
+    if array.dtype.kind in "iu" and array.size and array.max() > 1:
+        white = np.iinfo(array.dtype).max if array.dtype in (np.uint8, np.uint16) else 255
+        logger.warning("%s holds %s, up to %d; %s", name, array.dtype, array.max(), UNITS % white)
+    if array.dtype not in (np.float32, np.float64):
+        array = array.astype(np.float64)
     layout = _layout(name, array, grid, channels)
     n = grid[0] * grid[1]
     values = array.reshape(layout.frames or 1, n, -1)  # (frames, N, 1 or 3)
     if channels == 1:
         return [np.ascontiguousarray(values.transpose(1, 0, 2)).reshape(n, -1)], layout
-    columns = [np.empty(values.shape[1::-1], values.dtype) for _ in range(3)]
-    for start in range(0, n, _BLOCK):
-        for channel, column in enumerate(columns):
-            column[start : start + _BLOCK] = values[
-                :, start : start + _BLOCK, min(channel, values.shape[2] - 1)
-            ].T
-    return columns, layout
+    colours = [min(channel, values.shape[2] - 1) for channel in range(3)]
+    return [np.ascontiguousarray(values[..., colour].T) for colour in colours], layout
 
 
 def _layout(name: str, array: np.ndarray, grid: tuple[int, int], channels: int) -> Layout:
@@ -106,11 +87,7 @@ def _layout(name: str, array: np.ndarray, grid: tuple[int, int], channels: int) 
 
 
 def to_light(columns: Sequence[np.ndarray], F: np.ndarray, mixing: np.ndarray | None) -> list[np.ndarray]:
-    """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 where F is.
-
-    >>> to_light([np.array([[0.2], [0.3]])], np.array([[0.5, 0.0]]), None)[0].tolist()
-    [[0.4], [0.0]]
-    """
+    """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 where F is."""
     lit = (f if np.min(f) > 0 else np.where(f > 0, f, np.inf) for f in F)  # light / inf = 0
     light = [l_d / f[:, None] for l_d, f in zip(columns, lit, strict=True)]
     return light if mixing is None else list(np.einsum("ij,jnk->ink", np.linalg.inv(mixing), light))
@@ -119,41 +96,31 @@ def to_light(columns: Sequence[np.ndarray], F: np.ndarray, mixing: np.ndarray | 
 def matrices(value: Any, name: str = "matrix") -> tuple[Any, ...]:
     """The checked matrices of 1 or 3 channels; one of a sequence is grey."""
     if _is_matrix(value):
-        parts = [value]
-    elif isinstance(value, (list, tuple)) and any(_is_matrix(part) for part in value):
-        parts = list(value)
+        channels = [value]
+    elif isinstance(value, (list, tuple)) and any(map(_is_matrix, value)):
+        channels = list(value)
     else:
         array = checks.real(name, value)
-        parts = list(array) if array.ndim == 3 else [array]
-    if len(parts) not in (1, 3):
-        raise InputError(f"{name} has {len(parts)} channels; it must be one matrix, or three for RGB")
-    names = [name] if len(parts) == 1 else [f"{name}[{channel}]" for channel in range(3)]
-    checked = tuple(_checked(each, part) for each, part in zip(names, parts, strict=True))
-    shapes = [part.shape for part in checked]
-    if len(set(shapes)) > 1:
-        raise InputError(f"{name} has channels of shapes {shapes}; all must be the same")
-    return checked
+        channels = list(array) if array.ndim == 3 else [array]
+    if len(channels) not in (1, 3):
+        shape = f"shape {value.shape}" if isinstance(value, np.ndarray) else f"{len(channels)} channels"
+        raise InputError(f"{name} has {shape}; it must be (M, N), or three of these for RGB, (3, M, N)")
+    names = [name] if len(channels) == 1 else [f"{name}[{channel}]" for channel in range(3)]
+    return _checked(name, dict(zip(names, channels, strict=True)))
 
 
 def blocks(value: Any) -> tuple[tuple[Any, ...], ...] | None:
     """3 x 3 checked matrices of one shape, or None where `value` is no nested sequence or (3, 3, M, N)."""
-    stacked = isinstance(value, np.ndarray) and value.ndim == 4 and value.shape[:2] == (3, 3)
-    rows = (
-        [row for row in value if isinstance(row, (list, tuple))] if isinstance(value, (list, tuple)) else []
-    )
-    if not stacked and not any(_is_matrix(part) for row in rows for part in row):
+    rows = list(value) if isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) == 4 else []
+    nested = [isinstance(row, (list, tuple)) or getattr(row, "ndim", 0) == 3 for row in rows]
+    sizes = [len(row) if many else 1 for row, many in zip(rows, nested, strict=True)]
+    if not any(many and any(map(_is_matrix, row)) for row, many in zip(rows, nested, strict=True)):
         return None
-    sizes = [len(row) if isinstance(row, (list, tuple, np.ndarray)) else 1 for row in value]
     if sizes != [3, 3, 3]:
         raise InputError(f"matrix has rows of {sizes} matrices; it must be 3 x 3 of them, or 3, or one")
-    checked = tuple(
-        tuple(_checked(f"matrix[{c}][{d}]", part) for d, part in enumerate(row))
-        for c, row in enumerate(value)
-    )
-    shapes = sorted({part.shape for row in checked for part in row})
-    if len(shapes) > 1:
-        raise InputError(f"matrix has blocks of shapes {shapes}; all must be the same")
-    return checked
+    named = {f"matrix[{c}][{d}]": block for c, row in enumerate(rows) for d, block in enumerate(row)}
+    checked = _checked("matrix", named)
+    return checked[:3], checked[3:6], checked[6:]
 
 
 def mixing(value: Any, channels: int, coupled: Any) -> np.ndarray:
@@ -162,26 +129,30 @@ def mixing(value: Any, channels: int, coupled: Any) -> np.ndarray:
         kind = "one channel" if channels == 1 else "3 x 3 blocks, which mix colours themselves"
         raise InputError(f"mixing is given, but T has {kind}; it is for a T of 3 channels")
     M = checks.finite("mixing", checks.shape("mixing", checks.real("mixing", value), (3, 3)))
-    condition = float(np.linalg.cond(M.astype(np.float64)))
-    if not condition < _LARGEST_CONDITION:
-        raise InputError(
-            f"mixing has the condition number {condition:.3g}; it must be invertible, "
-            f"below {_LARGEST_CONDITION:g}"
-        )
-    return M.astype(np.float64)
+    M = M.astype(np.float64)
+    if not (condition := float(np.linalg.cond(M))) < _LARGEST_CONDITION:
+        most = f"{_LARGEST_CONDITION:g}"
+        raise InputError(f"mixing has the condition number {condition:.3g}; it must be below {most}")
+    return M
 
 
-def _is_matrix(part: Any) -> bool:
-    return scipy.sparse.issparse(part) or hasattr(part, "matvec") or getattr(part, "ndim", 0) == 2
+def _is_matrix(value: Any) -> bool:
+    return scipy.sparse.issparse(value) or hasattr(value, "matvec") or getattr(value, "ndim", 0) == 2
 
 
-def _checked(name: str, part: Any) -> Any:
-    if len(np.shape(part)) != 2:
-        raise InputError(f"{name} has shape {np.shape(part)}; it must be (M, N)")
-    if 0 in np.shape(part):
-        raise InputError(f"{name} has shape {np.shape(part)}; it must have at least one row and one column")
-    if scipy.sparse.issparse(part):
-        return checks.csr(name, part)
-    if hasattr(part, "matvec"):
-        return scipy.sparse.linalg.aslinearoperator(part)
-    return checks.finite(name, checks.real(name, part))
+def _checked(name: str, named: dict[str, Any]) -> tuple[Any, ...]:
+    """Matrices by their names as arrays, csr_array or LinearOperator, all of one shape."""
+    checked = []
+    for each, matrix in named.items():
+        if len(np.shape(matrix)) != 2 or 0 in np.shape(matrix):
+            raise InputError(f"{each} has shape {np.shape(matrix)}; it must be (M, N), not empty")
+        if scipy.sparse.issparse(matrix):
+            checked.append(checks.csr(each, matrix))
+        elif hasattr(matrix, "matvec"):
+            checked.append(scipy.sparse.linalg.aslinearoperator(matrix))
+        else:
+            checked.append(checks.finite(each, checks.real(each, matrix)))
+    shapes = sorted({matrix.shape for matrix in checked})
+    if len(shapes) > 1:
+        raise InputError(f"{name} has parts of shapes {shapes}; all must be the same")
+    return tuple(checked)

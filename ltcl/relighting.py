@@ -22,12 +22,8 @@ def relight(T: Transport, pattern: Any) -> np.ndarray:
     Returns
     -------
     array, float32
-        On the camera's grid; in colour where the transport or the pattern is.
-
-    Raises
-    ------
-    InputError
-        A pattern of another size, NaN or infinite values.
+        On the camera's grid; in colour where the transport or the pattern is. A pattern of another size, NaN
+        or infinite values raise InputError.
 
     Examples
     --------

@@ -19,21 +19,15 @@ from ltcl.solvers import Solution
 
 
 def plain(value: Any) -> Any:
-    """`value` in the types that JSON knows; numbers that are not finite become None.
-
-    >>> plain({"rho": np.float32(0.5), "products": float("inf"), "grid": (4, 5)})
-    {'rho': 0.5, 'products': None, 'grid': [4, 5]}
-    """
+    """`value` in the types that JSON knows; numbers that are not finite become None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     if isinstance(value, dict):
         return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
+    if isinstance(value, (np.ndarray, np.generic)):
         return plain(value.tolist())
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, (bool, int, str)) else str(value)
@@ -52,14 +46,10 @@ def write(path: str | os.PathLike[str], value: Any) -> None:
 
 def solution(solved: Solution | tuple[Solution, ...]) -> list[dict[str, Any]]:
     """Facts of a solve, one entry per colour channel, without the solution itself."""
-    names = ("method", "iterations", "products", "residual", "seconds", "reason", "error")
+    names = ("method", "iterations", "products", "residual", "residuals", "seconds", "reason", "error")
     return [
         {name: getattr(one, name) for name in names}
-        | {
-            "status": one.status.name.lower(),
-            "residuals": list(one.residuals),
-            "standard_error": _spread(one.standard_error),
-        }
+        | {"status": one.status.name.lower(), "standard_error": _spread(one.standard_error)}
         for one in (solved if isinstance(solved, tuple) else (solved,))
     ]
 
@@ -75,17 +65,13 @@ def _spread(error: np.ndarray | None) -> dict[str, float] | None:
 
 def device(opened: Device) -> dict[str, Any]:
     """Which device worked."""
-    return {
-        "index": opened.description.index,
-        "name": opened.name,
-        "kind": opened.kind,
-        "driver": opened.driver,
-    }
+    facts = {name: getattr(opened, name) for name in ("name", "kind", "driver")}
+    return {"index": opened.description.index, **facts}
 
 
 def versions() -> dict[str, str]:
     """Versions that a result can depend on."""
     from ltcl import __version__  # `ltcl` itself imports this module
 
-    found = {"ltcl": __version__, "python": platform.python_version(), "system": platform.platform()}
-    return found | {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "pyopencl")}
+    own = {"ltcl": __version__, "python": platform.python_version(), "system": platform.platform()}
+    return own | {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "pyopencl")}

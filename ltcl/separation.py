@@ -9,9 +9,8 @@ light that bounced at least once, and of it b_1 = X l^(1) bounced exactly once, 
 Equal to the paper's chain b_k = b_(k-1) - X b_(k-1) in exact arithmetic; in this form the bounces and the
 rest add up to the picture whatever the tolerance of the solves. Nothing is clipped on the way.
 
-One projector and one camera see T = P S F Q (eq. 28), and bounces are exact of Lambertian scenes only
-(eq. 29, section 8.4): elsewhere P A^k F Q is no power of anything that T tells. A T whose I - S^-1 takes
-light away, or that is far from reciprocal, gives such a scene away: the result then carries a warning.
+With one camera bounces are exact of Lambertian scenes only (section 8.4, eq. 28 and 29). A T whose I - S^-1
+takes light away, or that is far from reciprocal, is of another: the result carries a warning.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from ltcl.solvers.solve import SAMPLED
 from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
 
 logger = logging.getLogger(__name__)
-Parts = list[np.ndarray]  # (N, k) of each channel
 
 # Of a scene taken for Lambertian: noise of path tracing alone gives a defect of 0.05 and takes 0.0004.
 LARGEST_DEFECT = 0.1
@@ -43,27 +41,22 @@ class Separation:
 
     Attributes
     ----------
-    direct : array
-        Bounce 0: light that went from projector to surface to camera.
-    indirect : array
-        Everything else: image - direct.
+    direct, indirect : array
+        Bounce 0, light that went from projector to surface to camera; and the rest of the image.
     bounces : array, (bounces, ...)
         bounces[0] is the first indirect bounce.
     rest : array
         All further bounces together: direct + sum of bounces + rest is the image.
     solutions : tuple
         Solves in the order direct, first bounce, ...; per entry one Solution, or 3 in colour.
-    reciprocity_defect : float
-        Of T, see `ltcl.diagnostics`: 0 of a Lambertian scene measured without noise; NaN where unknown.
-    negative_bounce : float
-        Share of light that a bounce as T has it would take away, see `ltcl.diagnostics`: 0 of a Lambertian
-        scene. The first bounce of a glossy scene is off by a few times as much, later ones by more.
+    reciprocity_defect, negative_bounce : float
+        Of T, see `ltcl.diagnostics`: both 0 of a Lambertian scene measured without noise; NaN where unknown.
+        The relative error of the first bounce of a glossy scene is a few times the latter, of others more.
     warning : str
         Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 and the
         negative light at most 0.005, or unknown; of a compressed T both may be more by its error.
     transport_error : float
-        ``.error`` of the T that all of this is of, the one that was given, or `exact` where that was: what a
-        compressed one may be off by itself, beyond the tolerance of each solve; 0 of others.
+        ``.error`` of T, or of `exact` where that was given, beyond the tolerance of each solve.
     """
 
     direct: np.ndarray
@@ -77,8 +70,8 @@ class Separation:
     transport_error: float = 0.0
 
     def __repr__(self) -> str:
-        shape, off = " x ".join(map(str, self.direct.shape)), error_note(self.transport_error)
-        return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces{off}>"
+        shape, error = " x ".join(map(str, self.direct.shape)), error_note(self.transport_error)
+        return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces{error}>"
 
 
 def separate(
@@ -103,11 +96,11 @@ def separate(
     bounces : int
         How many indirect bounces to tell apart.
     method, rtol, **options
-        Of `ltcl.solve`; rtol is per bounce, 1e-3 when not given, or what a compressed T or an inverse is
-        off by where that is more.
+        Of `ltcl.solve`; rtol is per bounce, 1e-3 when not given, or the error of a compressed T or an inverse
+        where that is more.
     exact : Transport, optional
-        The uncompressed transport that a compressed T stands for: T then solves, to an `rtol` as `ltcl.solve`
-        says, and all that is told is of `exact`.
+        The uncompressed transport that T was compressed from: T then solves, to an `rtol` as `ltcl.solve`
+        says; residuals and warnings are computed with `exact`.
     inverse : Inverse, optional
         Of T, as `ltcl.invert` makes it: each bounce is then one product, and `rtol` the error it may have.
 
@@ -147,32 +140,29 @@ def separate(
             )
     options |= {"rtol": default_rtol(RTOL, T, exact, inverse) if rtol is None else rtol, "exact": judges}
 
-    def undo(parts: Parts, k: int) -> tuple[Solution, ...]:
-        """S^-1 of what is left of each channel before bounce k."""
-        if inverse is not None:
-            return tuple(inverse.solve(l, channel) for channel, l in enumerate(parts))
-        return solve_each(T.systems, parts, method, **_with_seed(method, options, k))
+    def picture(channels: list[np.ndarray]) -> np.ndarray:
+        return shape.pack(channels, T.grid).astype(np.float32, copy=False)
 
-    def picture(parts: Parts) -> np.ndarray:
-        return shape.pack(parts, T.grid).astype(np.float32, copy=False)
-
-    found, solutions, indirect = [], [], np.empty(0)
-    left = [l_out.astype(np.float64) for l_out in columns]
+    pictures, solutions = [], []
+    indirect = rest = [l_out.astype(np.float64) for l_out in columns]
     for k in range(bounces + 1):
-        solutions.append(undo(left, k))
+        if inverse is not None:
+            solutions.append(tuple(inverse.solve(l, channel) for channel, l in enumerate(rest)))
+        else:
+            solutions.append(solve_each(T.systems, rest, method, **_with_seed(method, options, k)))
         b_k = [solution.x.astype(np.float64) for solution in solutions[-1]]
-        left = [l - b for l, b in zip(left, b_k, strict=True)]
-        found.append(picture(b_k))
+        rest = [l - b for l, b in zip(rest, b_k, strict=True)]
         if k == 0:
-            indirect = picture(left)
+            indirect = rest
+        pictures.append(picture(b_k))
     warning = _warning(true.reciprocity_defect, max(true.negative_bounces), true.error)
     if warning:
         logger.warning(warning)
     return Separation(
-        direct=found[0],
-        indirect=indirect,
-        bounces=np.stack(found[1:]) if bounces else np.empty((0, *found[0].shape), np.float32),
-        rest=picture(left),
+        direct=pictures[0],
+        indirect=picture(indirect),
+        bounces=np.stack(pictures)[1:],
+        rest=picture(rest),
         solutions=tuple(each[0] if T.channels == 1 else each for each in solutions),
         reciprocity_defect=true.reciprocity_defect,
         negative_bounce=max(true.negative_bounces),
@@ -182,18 +172,15 @@ def separate(
 
 
 def _warning(defect: float, negative: float, error: float) -> str:
-    """Why bounces are approximate; nothing where both numbers are within that of T's compression, or NaN."""
+    """Why bounces are approximate; nothing where both numbers are within the limits, or NaN."""
     reasons = []
     if defect > (most := LARGEST_DEFECT + error):
         reasons.append(f"T is not reciprocal (defect {defect:.2g}, above {most:.2g})")
     if negative > (most := LARGEST_NEGATIVE + error):
-        reasons.append(f"a bounce takes away {negative:.2g} of its light (above {most:.2g})")
-    if not reasons:
-        return ""
-    return (
-        f"{' and '.join(reasons)}: surfaces reflect differently to different sides, or T is noisy; with one "
-        "camera the bounces of such a scene are approximate (section 8.4, eq. 28 and 29)"
-    )
+        reasons.append(f"a bounce holds a share {negative:.2g} of negative light (above {most:.2g})")
+    why = "surfaces reflect differently to different sides, or T is noisy; with one camera"
+    such = "the bounces of such a scene are approximate (section 8.4, eq. 28 and 29)"
+    return f"{' and '.join(reasons)}: {why} {such}" if reasons else ""
 
 
 def _with_seed(method: str, options: dict[str, Any], k: int) -> dict[str, Any]:
@@ -201,5 +188,5 @@ def _with_seed(method: str, options: dict[str, Any], k: int) -> dict[str, Any]:
     if method not in SAMPLED:
         return options
     seed = options.get("seed", 0)
-    monte_carlo.check_seed(seed)
+    checks.count("seed", seed, least=0, most=(1 << 64) - 1)
     return {**options, "seed": (seed + k) % 2**64}

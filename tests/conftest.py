@@ -22,9 +22,9 @@ ROOM = (SMALL - SPARE_BYTES) // 4  # values of the largest array then
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Each test draws its own numbers from its module's `random`, whatever ran before it."""
-    module = getattr(item, "module", None)
-    if isinstance(getattr(module, "random", None), np.random.Generator):
-        module.random = np.random.default_rng(zlib.crc32(item.name.encode()))
+    names = vars(item.module) if isinstance(item, pytest.Function) else {}
+    if isinstance(names.get("random"), np.random.Generator):
+        names["random"] = np.random.default_rng(zlib.crc32(item.name.encode()))
 
 
 @pytest.fixture(scope="session", autouse=True)

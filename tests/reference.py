@@ -17,38 +17,19 @@ UNIT = 2.0**-24  # largest relative error of rounding to float32
 _LEAVES = 4096  # work-items among which the dot product spreads its rows, where there are that many
 
 
-def csr_matvec(
-    pointers: np.ndarray,
-    columns: np.ndarray,
-    values: np.ndarray,
-    x: np.ndarray,
-    scale: float = 1.0,
-    add: np.ndarray | None = None,
-) -> np.ndarray:
-    """out = scale * (A x) + add, row by row; x is (N,) or (N, k)."""
-    x, values = np.asarray(x, np.float64), np.asarray(values, np.float64)
-    rows = itertools.pairwise(pointers)
-    out = scale * np.array([values[start:stop] @ x[columns[start:stop]] for start, stop in rows])
-    return out if add is None else out + add
+def csr_matvec(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A x, row by row; x is (N,) or (N, k)."""
+    rows, values = itertools.pairwise(pointers), np.asarray(values, np.float64)
+    return np.array([values[start:stop] @ x[columns[start:stop]] for start, stop in rows])
 
 
-def tile_matvec(
-    pointers: np.ndarray,
-    columns: np.ndarray,
-    values: np.ndarray,
-    factors: np.ndarray,
-    x: np.ndarray,
-    scale: float = 1.0,
-    add: np.ndarray | None = None,
-) -> np.ndarray:
-    """out = scale * diag(factors) (A x) + add; columns are the first of each tile, values (tiles, width)."""
-    x, values = np.asarray(x, np.float64), np.asarray(values, np.float64)
+def tile_matvec(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A x; columns are the first of each tile, values (tiles, width)."""
     sums = np.zeros((len(pointers) - 1, *x.shape[1:]))
     for row, (start, stop) in enumerate(itertools.pairwise(pointers)):
         for tile in range(start, stop):
             sums[row] += values[tile] @ x[columns[tile] : columns[tile] + values.shape[1]]
-    out = scale * (sums.T * factors).T
-    return out if add is None else out + add
+    return sums
 
 
 def dense_matvec(
@@ -59,11 +40,9 @@ def dense_matvec(
     return out if add is None else out + add
 
 
-def dense_rmatvec(
-    matrix: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
-) -> np.ndarray:
-    """out = scale * (A^T x) + add."""
-    return dense_matvec(matrix.T, x, scale, add)
+def dense_rmatvec(matrix: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A^T x."""
+    return dense_matvec(matrix.T, x)
 
 
 def vector_fill(count: int, value: float) -> np.ndarray:
@@ -72,14 +51,6 @@ def vector_fill(count: int, value: float) -> np.ndarray:
 
 def vector_axpby(a: float, x: np.ndarray, b: float, y: np.ndarray) -> np.ndarray:
     return a * np.asarray(x, np.float64) + b * np.asarray(y, np.float64)
-
-
-def vector_axpby_columns(a: np.ndarray, x: np.ndarray, b: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """a_c x_c + b_c y_c in every column c of (N,) or (N, k), operands with coefficient 0 left out."""
-    terms = [
-        np.where(c == 0, 0.0, c * np.asarray(v, np.float64).reshape(len(v), -1)) for c, v in ((a, x), (b, y))
-    ]
-    return (terms[0] + terms[1]).reshape(x.shape)
 
 
 def vector_scale_rows(d: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -103,10 +74,6 @@ def vector_step(
 def vector_sums(sums: np.ndarray) -> np.ndarray:
     """(slots, groups, k) added up over the groups, (slots, k)."""
     return np.sum(np.asarray(sums, np.float64), axis=1)
-
-
-def vector_triad(a: float, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    return vector_axpby(a, b, 1.0, c)
 
 
 def relax_rows(
@@ -178,7 +145,7 @@ def southwell_step(S: np.ndarray, parts: int, x: np.ndarray, r: np.ndarray) -> t
     return x + d, r - S @ d
 
 
-def random_philox(counters: np.ndarray, seed: int) -> np.ndarray:
+def philox(counters: np.ndarray, seed: int) -> np.ndarray:
     """Philox4x32-10 of counters (n, 4) and a key of 64 bits, as (n, 4) uint32."""
     c = [counters[:, i].astype(np.uint64) for i in range(4)]
     low, key = np.uint64(0xFFFFFFFF), [seed & 0xFFFFFFFF, seed >> 32]
@@ -255,13 +222,12 @@ def walk(
     pixels: np.ndarray,
     samples: np.ndarray,
     seed: int,
-    stream: int = 0,
-    collision: bool = True,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Walks from pixels[w], sample samples[w], all at once: scores (w, k) float32, ends and lengths (w,).
+    stream: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Walks from pixels[w], sample samples[w], all at once: scores (w, k) float32, and ends (w,).
 
     `tables` are records, entries, channels and links or None; column j of b is of channel j % channels. steps
-    are (L, 2) uint32. Without b a walk scores its weight where it ends, the adjoint.
+    are (L, 2) uint32. A walk scores b at every step; without b its weight where it ends, the adjoint.
     """
     records, entries, channels, links = tables
     row, step = np.array(pixels), np.zeros(len(pixels), np.int64)
@@ -269,10 +235,9 @@ def walk(
     scores = np.zeros((len(row), 1 if b is None else b.shape[1]), np.float32)
     alive = np.ones(len(row), bool)
     while alive.any():
-        counters = np.stack([pixels, samples, step // 2, np.full(len(row), stream)], axis=1)
-        words = random_philox(counters.astype(np.uint32), seed).astype(np.uint64).reshape(-1, 2, 2)
-        word = words[np.arange(len(row)), step % 2]
-        word = word[:, 0] | word[:, 1] << np.uint64(32)
+        counters = np.stack([pixels, samples, step, np.full(len(row), stream)], axis=1)
+        block = philox(counters.astype(np.uint32), seed).astype(np.uint64)
+        word = block[:, 0] | block[:, 1] << np.uint64(32)
         target, factor = _draw(records[row], entries, word)
         factor = factor[:, None]
         if links is not None:
@@ -285,13 +250,12 @@ def walk(
         worth = weight[here] * np.ascontiguousarray(steps[step[here], 0]).view(np.float32)[:, None]
         goes_on = (word[here] & np.uint64(2**22 - 1)) < steps[step[here], 1]
         step[here] += 1
-        scored = here if collision else here[~goes_on]
-        value = worth if collision else worth[~goes_on]
-        scores[scored] += (
-            value if b is None else np.tile(value, scores.shape[1] // value.shape[1]) * b[row[scored]]
-        )
+        if b is None:
+            scores[here[~goes_on]] += worth[~goes_on]
+        else:
+            scores[here] += np.tile(worth, scores.shape[1] // channels) * b[row[here]]
         alive[here] = goes_on
-    return scores, row, step
+    return scores, row
 
 
 def walk_rows(
@@ -302,40 +266,24 @@ def walk_rows(
     samples: np.ndarray,
     seed: int,
     stream: int,
-    collision: bool,
     chunk: int,
 ) -> np.ndarray:
-    """Sum, its rounding, sum of squares and its rounding of each chunk, (P, chunks, k, 4) float32."""
+    """Sum and sum of squares of each chunk, (P, chunks, k, 2) float32."""
     count = len(samples)
     which = np.repeat(pixels, count), np.tile(samples, len(pixels))
-    scores, _, _ = walk(tables, steps, b, *which, seed, stream, collision)
+    scores, _ = walk(tables, steps, b, *which, seed, stream)
     scores = scores.reshape(len(pixels), count, -1).swapaxes(0, 1)
     chunks = [scores[start : start + chunk] for start in range(0, count, chunk)]
-    return np.stack([np.stack([*two_sums(c), *two_sums(c**2)], axis=-1) for c in chunks], axis=1)
+    in_order = [np.stack([np.add.accumulate(part)[-1] for part in (c, c**2)], axis=-1) for c in chunks]
+    return np.stack(in_order, axis=1)
 
 
 def walk_columns(
-    tables: tuple[Any, ...],
-    steps: np.ndarray,
-    source: int,
-    samples: np.ndarray,
-    seed: int,
-    stream: int = 0,
+    tables: tuple[Any, ...], steps: np.ndarray, source: int, samples: np.ndarray, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where samples from row `source` end, and what they bring there, float32."""
-    start = np.full(len(samples), source)
-    scores, ends, _ = walk(tables, steps, None, start, samples, seed, stream, collision=False)
+    scores, ends = walk(tables, steps, None, np.full(len(samples), source), samples, seed, 0)
     return ends, scores[:, 0]
-
-
-def random_loads(items: int, chains: int, steps: int, words: np.ndarray) -> np.ndarray:
-    """Sums over the chains of each item after so many loads, (items,) uint64."""
-    with np.errstate(over="ignore"):
-        state = np.arange(1, items * chains + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-        for _ in range(steps):
-            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            state ^= words[(state >> np.uint64(32)) * np.uint64(len(words)) >> np.uint64(32)]
-        return state.reshape(items, chains).sum(axis=1)
 
 
 def _draw(records: np.ndarray, entries: np.ndarray, word: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -359,17 +307,6 @@ def _linked(links: np.ndarray, records: np.ndarray, target: np.ndarray) -> tuple
     links = np.append(links, np.zeros((1, 4), np.uint32), axis=0)
     link = links[np.where(full, start + (target >> 1), -1)]
     return link[:, 0].astype(np.int64) << 1, np.ascontiguousarray(link[:, 1:]).view(np.float32)
-
-
-def two_sums(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over the first axis in float32, in order, and what their rounding took (Knuth)."""
-    total, low = (np.zeros(values.shape[1:], np.float32) for _ in range(2))
-    for value in values:
-        new = total + value
-        added = new - total
-        low = low + ((total - (new - added)) + (value - added))
-        total = new
-    return total, low
 
 
 def form_factor_pair(
@@ -468,12 +405,6 @@ def visibility_rows(
     return np.divide(count, faced, out=np.ones_like(count), where=faced > 0)
 
 
-def visibility_pairs(i: np.ndarray, j: np.ndarray, *rays: np.ndarray) -> np.ndarray:
-    """The same of listed pairs, (P,)."""
-    starts, ends, normals, blocks = rays
-    return visibility_rows(starts, ends, normals, blocks)[i, j]
-
-
 def gamma(roundings: float) -> float:
     """Relative error of that many roundings in a row.
 
@@ -506,11 +437,6 @@ def dot_error(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return gamma(roundings) * vector_dot(np.abs(x), np.abs(y))
 
 
-def krylov_dots(V: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """<v_j, w> of every column for V (J, N, k), and <w, w>: (J + 1, k)."""
-    return np.einsum("jnk,nk->jk", np.concatenate([V, w[None]]), w, dtype=np.float64)
-
-
 def krylov_pairs(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray) -> np.ndarray:
     """sum_i weights_i x_i y_i of every column for each pair."""
     return np.stack([np.sum(weights.astype(np.float64) * x * y, axis=0) for x, y in pairs])
@@ -527,11 +453,11 @@ def krylov_subtract(
 def krylov_cg(
     sums: np.ndarray, previous: np.ndarray, last: np.ndarray, moves: np.ndarray, *vectors: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """alpha (k,), then p, q, x and r after a step, of z, w, p, q, x and r before; sums <z, z> and <w, z>."""
-    (square, product), (z, w, p, q, x, r) = sums, (v.astype(np.float64) for v in vectors)
+    """alpha (k,), then p, q, x and r after a step, of w, p, q, x and r before; sums <r, r> and <w, r>."""
+    (square, product), (w, p, q, x, r) = sums, (v.astype(np.float64) for v in vectors)
     beta = square / previous
     alpha = square / (product - beta * square / last)
-    p, q = np.where(moves, z + beta * p, p), np.where(moves, w + beta * q, q)
+    p, q = np.where(moves, r + beta * p, p), np.where(moves, w + beta * q, q)
     alpha = np.where(moves, alpha, 0.0)
     return alpha, p, q, x + alpha * p, r - alpha * q
 
@@ -620,59 +546,25 @@ def wavelet_side(pixels: int, level: int, taps: np.ndarray) -> np.ndarray:
     return M
 
 
-def wavelet_split_rows(x: np.ndarray, width: int, level: int, taps: np.ndarray) -> np.ndarray:
-    """Lines of which each row of x (rows, n, k) makes one."""
-    return np.einsum("ij,rjk->rik", wavelet_side(width, level, taps), np.asarray(x, np.float64))
-
-
-def wavelet_split_columns(lines: np.ndarray, height: int, level: int, taps: np.ndarray) -> np.ndarray:
-    """The same down the columns of (n, columns, k)."""
-    return np.einsum("ij,jck->ick", wavelet_side(height, level, taps), np.asarray(lines, np.float64))
-
-
-def wavelet_join_columns(x: np.ndarray, height: int, level: int, taps: np.ndarray) -> np.ndarray:
-    """The inverse of orthonormal ones is the transpose."""
-    return np.einsum("ji,jck->ick", wavelet_side(height, level, taps), np.asarray(x, np.float64))
-
-
-def wavelet_join_rows(lines: np.ndarray, width: int, level: int, taps: np.ndarray) -> np.ndarray:
-    """The inverse of wavelet_split_rows."""
-    return np.einsum("ji,rjk->rik", wavelet_side(width, level, taps), np.asarray(lines, np.float64))
-
-
-def wavelet_split_all(x: np.ndarray, levels: int, taps: np.ndarray) -> np.ndarray:
-    """Coefficients of pictures (h, w, k), after all levels."""
-    (h, w), x = x.shape[:2], np.array(x, np.float64)
+def wavelet_split(grid: tuple[int, int], levels: int, taps: np.ndarray) -> np.ndarray:
+    """W (N, N), from pictures of h x w pixels to their coefficients after all levels."""
+    (h, w), n = grid, grid[0] * grid[1]
+    W = np.eye(n).reshape(h, w, n)
     for level in range(levels):
         corner = np.s_[: -(-h // 2**level), : -(-w // 2**level)]
-        x[corner] = wavelet_split_columns(wavelet_split_rows(x[corner], w, level, taps), h, level, taps)
-    return x
+        down, across = (wavelet_side(side, level, taps) for side in grid)
+        W[corner] = np.einsum("ij,jlk,ml->imk", down, W[corner], across, optimize=True)
+    return W.reshape(n, n)
 
 
-def wavelet_join_all(x: np.ndarray, levels: int, taps: np.ndarray) -> np.ndarray:
-    """Pictures (h, w, k) of coefficients."""
-    (h, w), x = x.shape[:2], np.array(x, np.float64)
-    for level in reversed(range(levels)):
-        corner = np.s_[: -(-h // 2**level), : -(-w // 2**level)]
-        x[corner] = wavelet_join_rows(wavelet_join_columns(x[corner], h, level, taps), w, level, taps)
-    return x
+def wavelet_join(grid: tuple[int, int], levels: int, taps: np.ndarray) -> np.ndarray:
+    """W^T, which is the inverse of an orthonormal W."""
+    return wavelet_split(grid, levels, taps).T
 
 
-def ordered_gather(
-    order: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
-) -> np.ndarray:
-    """out = scale * x[order] + add."""
-    out = scale * np.asarray(x, np.float64)[order]
-    return out if add is None else out + add
-
-
-def ordered_scatter(
-    order: np.ndarray, rows: int, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
-) -> np.ndarray:
-    """out[order] = scale * x, 0 in the other rows, + add."""
-    out = np.zeros((rows, *np.shape(x)[1:]))
-    out[order] = scale * np.asarray(x, np.float64)
-    return out if add is None else out + add
+def ordered_gather(order: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """x[order]."""
+    return np.asarray(x, np.float64)[order]
 
 
 def pyramid_gather(x: np.ndarray) -> np.ndarray:
@@ -686,8 +578,6 @@ def pyramid_gather(x: np.ndarray) -> np.ndarray:
     return np.reshape(sums, (-1, k))
 
 
-def pyramid_spread(x: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
-    """Pictures (h, w, k) of cells (cells, k): the transpose of pyramid_gather."""
-    h, w = grid
-    units = np.eye(h * w).reshape(h, w, -1)
-    return (pyramid_gather(units).T @ np.asarray(x, np.float64)).reshape(h, w, -1)
+def pyramid_spread(grid: tuple[int, int]) -> np.ndarray:
+    """W^T (N, cells): pictures of cells, the transpose of pyramid_gather."""
+    return pyramid_gather(np.eye(grid[0] * grid[1]).reshape(*grid, -1)).T

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Refusals name the argument, what it was and what it must be, in one line."""
+"""Refusals name the argument and its value in one line; what is good passes unchanged."""
 
 from __future__ import annotations
 
-import itertools
+import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,157 +13,107 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.errors import InputError, InputTypeError, LtclError, MemoryLimitError
+from ltcl.operators import Dense
 from tests import gallery
 
 
-def csr(indptr, indices, data, shape):
+def csr(indptr, indices, data, shape=(2, 3)):
     """A csr_array as it stands, with nothing checked: as read from a spoilt file."""
     matrix = scipy.sparse.csr_array(shape)
     matrix.indptr, matrix.indices, matrix.data = np.asarray(indptr), np.asarray(indices), np.asarray(data)
     return matrix
 
 
-GOOD = ([0, 1, 3], [0, 0, 2], [1.0, 2.0, 3.0], (2, 3))
-
-REFUSED = {
-    "nan": (
-        lambda: checks.finite("b", np.array([0, np.nan])),
-        "b has 1 NaN or infinite value(s), the first at 1;",
-    ),
-    "inf": (
-        lambda: checks.finite("b", np.array([[0, np.inf], [-np.inf, 0]])),
-        "b has 2 NaN .* the first at (0, 1)",
-    ),
-    "shape": (
-        lambda: checks.shape("b", np.zeros(3), (4,), (4, 2)),
-        "b has shape (3,); it must be (4,) or (4, 2)",
-    ),
-    "grid of three": (
-        lambda: checks.grid("grid", (1, 2, 3)),
-        "grid is (1, 2, 3); it must be two positive integers",
-    ),
-    "grid of a number": (lambda: checks.grid("grid", 7), "grid is 7; it must be two"),
-    "grid of halves": (lambda: checks.grid("grid", (2.5, 2)), "grid is (2.5, 2); it must be"),
-    "grid of text": (lambda: checks.grid("grid", "44"), "grid is '44'; it must be"),
-    "infinite grid": (lambda: checks.grid("grid", (np.inf, 1)), "it must be two positive integers"),
-    "nan grid": (lambda: checks.grid("grid", (np.nan, 1)), "it must be two positive integers"),
-    "empty grid": (lambda: checks.grid("grid", (0, 4)), "grid is (0, 4); it must be"),
-    "grid of others": (
-        lambda: checks.grid("grid", (2, 3), 5),
-        "grid is 2 x 3 = 6 pixels, but the matrix is for 5",
-    ),
-    "number below": (
-        lambda: checks.number("rtol", 0.0, above=0),
-        "rtol is 0.0; it must be a finite number above 0",
-    ),
-    "number beyond": (
-        lambda: checks.number("m", 1.5, least=0, most=1),
-        "m is 1.5; it must be a finite number at least 0 and at most 1",
-    ),
-    "number at the edge": (
-        lambda: checks.number("m", 1, below=1),
-        "m is 1; it must be a finite number below 1",
-    ),
-    "number of nothing": (lambda: checks.number("m", None), "m is None; it must be a finite number"),
-    "number of text": (lambda: checks.number("m", "1"), "m is '1'; it must be a finite number"),
-    "number of truth": (lambda: checks.number("m", True), "m is True; it must be a finite number"),
-    "not a number": (lambda: checks.number("m", np.nan), "m is nan; it must be a finite number"),
-    "infinite number": (
-        lambda: checks.number("m", np.inf, above=0),
-        "m is inf; it must be a finite number above 0",
-    ),
-    "count": (lambda: checks.count("k", 0), "k is 0; it must be a whole number of at least 1"),
-    "count of a float": (lambda: checks.count("k", 2.0), "k is 2.0; it must be a whole number"),
-    "count of truth": (lambda: checks.count("k", True), "k is True; it must be a whole number"),
-    "name": (
-        lambda: checks.one_of("method", "magic", ["jacobi", "cg"]),
-        "method is 'magic'; it must be one of jacobi, cg",
-    ),
-    "channels": (lambda: checks.colours("channels", 2), "channels is 2; it must be 1 or 3"),
-    "sparse vector": (
-        lambda: checks.csr("T", scipy.sparse.coo_array([1.0, 2.0])),
-        "T has shape (2,); it must be (M, N)",
-    ),
-    "sparse nan": (lambda: checks.csr("T", csr(*GOOD[:2], [1, np.nan, 3], (2, 3))), "T.data has 1 NaN"),
-    "coo nan": (lambda: checks.csr("T", scipy.sparse.coo_array([[np.nan]])), "T.data has 1 NaN"),
-    "column beyond": (
-        lambda: checks.csr("T", csr([0, 1, 3], [0, 0, 3], *GOOD[2:])),
-        "T.indices holds 3; .* 0..2",
-    ),
-    "negative column": (lambda: checks.csr("T", csr([0, 1, 3], [0, -1, 2], *GOOD[2:])), "T.indices holds -1"),
-    "row of csc beyond": (
-        lambda: checks.csr("T", csr([0, 1, 3], [0, 0, 3], *GOOD[2:]).T),
-        "T.indices holds 3; column indices must be in 0..2",
-    ),
-    "falling pointers": (lambda: checks.csr("T", csr([0, 3, 2], *GOOD[1:])), "T.indptr falls after entry 1"),
-    "few pointers": (
-        lambda: checks.csr("T", csr([0, 3], *GOOD[1:])),
-        "T.indptr has 2 entries from 0; it must have 3",
-    ),
-    "late pointers": (lambda: checks.csr("T", csr([1, 2, 3], *GOOD[1:])), "T.indptr has 3 entries from 1"),
-    "no pointers": (
-        lambda: checks.csr("T", csr(np.zeros(0, int), *GOOD[1:])),
-        "T.indptr has 0 entries from none",
-    ),
-    "short indices": (
-        lambda: checks.csr("T", csr([0, 1, 3], [0, 1], *GOOD[2:])),
-        "ends at 3 with 2 indices and 3 values",
-    ),
-    "short values": (
-        lambda: checks.csr("T", csr(*GOOD[:2], [1.0], (2, 3))),
-        "ends at 3 with 3 indices and 1 values",
-    ),
-    "float pointers": (
-        lambda: checks.csr("T", csr([0.0, 1, 3], *GOOD[1:])),
-        "T.indptr must be a vector of integers",
-    ),
-    "square values": (
-        lambda: checks.csr("T", csr(*GOOD[:2], [[1.0], [2], [3]], (2, 3))),
-        "T.data has shape (3, 1)",
-    ),
-}
-
-WRONG_TYPES = {
-    "masked array": (
-        lambda: checks.real("desired", np.ma.masked_greater(np.arange(4.0), 2)),
-        "desired is a masked array with 1 masked",
-    ),
-    "text": (lambda: checks.real("b", ["a"]), "b holds <U1; it must hold real numbers"),
-    "complex": (lambda: checks.real("b", [1j]), "b holds complex128"),
-    "object": (lambda: checks.real("b", [None]), "b holds object"),
-    "complex sparse": (lambda: checks.csr("T", scipy.sparse.coo_array([[1j]])), "T holds complex128"),
-    "array for sparse": (lambda: checks.csr("T", np.eye(2)), "T is a ndarray; it must be a scipy.sparse"),
-}
+P, I, X = [0, 1, 3], [0, 0, 2], [1.0, 2.0, 3.0]
+# The argument and the value that each refusal names.
+REFUSED: list[tuple[Callable[[str], object], str]] = [
+    (lambda name: checks.finite(name, np.array([0, np.nan])), "1 NaN .* at 1;"),
+    (lambda name: checks.finite(name, np.array([[0, np.inf], [-np.inf, 0]])), r"2 NaN .* at \(0, 1\)"),
+    (lambda name: checks.shape(name, np.zeros(3), (4,), (4, 2)), r"\(3,\).*\(4,\) or \(4, 2\)"),
+    (lambda name: checks.grid(name, (1, 2, 3)), r"\(1, 2, 3\)"),
+    (lambda name: checks.grid(name, 7), "7"),
+    (lambda name: checks.grid(name, (2.5, 2)), r"\(2.5, 2\)"),
+    (lambda name: checks.grid(name, "44"), "'44'"),
+    (lambda name: checks.grid(name, (np.inf, 1)), "inf"),
+    (lambda name: checks.grid(name, (np.nan, 1)), "nan"),
+    (lambda name: checks.grid(name, (0, 4)), r"\(0, 4\)"),
+    (lambda name: checks.grid(name, (2, 3), 5), "6.* 5"),
+    (lambda name: checks.number(name, 0.0, above=0), "0.0; .* above 0"),
+    (lambda name: checks.number(name, 1.5, least=0, most=1), "1.5; .* at least 0 and at most 1"),
+    (lambda name: checks.number(name, 1, below=1), "1; .* below 1"),
+    (lambda name: checks.number(name, None), "None"),
+    (lambda name: checks.number(name, "1"), "'1'"),
+    (lambda name: checks.number(name, True), "True"),
+    (lambda name: checks.number(name, np.nan), "nan"),
+    (lambda name: checks.number(name, np.inf, above=0), "inf"),
+    (lambda name: checks.interval(name, (1, 1)), r"\(1, 1\)"),
+    (lambda name: checks.interval(name, (0, np.inf)), "inf"),
+    (lambda name: checks.count(name, 0), "0"),
+    (lambda name: checks.count(name, 2.0), "2.0"),
+    (lambda name: checks.count(name, True), "True"),
+    (lambda name: checks.count(name, 4, most=3), "4.* 3"),
+    (lambda name: checks.one_of(name, "magic", ["jacobi", "cg"]), "'magic'.*jacobi, cg"),
+    (lambda name: checks.one_of(name, 2, (1, 3)), "2"),
+    (lambda name: checks.csr(name, scipy.sparse.coo_array([1.0, 2.0])), r"\(2,\)"),
+    (lambda name: checks.csr(name, csr(P, I, [1, np.nan, 3])), "data .*1 NaN"),
+    (lambda name: checks.csr(name, scipy.sparse.coo_array([[np.nan]])), "data .*1 NaN"),
+    (lambda name: checks.csr(name, csr(P, [0, 0, 3], X)), r"indices .*3; .*0\.\.2"),
+    (lambda name: checks.csr(name, csr(P, [0, -1, 2], X)), "indices .*-1"),
+    (lambda name: checks.csr(name, csr(P, [0, 0, 3], X).T), r"indices .*3; .*0\.\.2"),
+    (lambda name: checks.csr(name, csr([0, 3, 2], I, X)), "indptr .*never fall"),
+    (lambda name: checks.csr(name, csr([0, 5, 0], np.zeros(0, int), [])), "indptr .*never fall"),
+    (lambda name: checks.csr(name, csr([0, 3], I, X)), "indptr .*2 entries.* 3"),
+    (lambda name: checks.csr(name, csr([1, 2, 3], I, X)), "indptr .*from 1"),
+    (lambda name: checks.csr(name, csr(np.zeros(0, int), I, X)), "indptr .*0 entries"),
+    (lambda name: checks.csr(name, csr([0, 1, 2], I, X)), "ends at 2 with 3 indices and 3"),
+    (lambda name: checks.csr(name, csr(P, [0, 1], X)), "ends at 3 with 2 indices and 3"),
+    (lambda name: checks.csr(name, csr(P, I, [1.0])), "ends at 3 with 3 indices and 1"),
+    (lambda name: checks.csr(name, csr([0.0, 1, 3], I, X)), "indptr .*float64"),
+    (lambda name: checks.csr(name, csr(P, I, [[1.0], [2], [3]])), r"data .*\(3, 1\)"),
+]
+WRONG_TYPES: list[tuple[Callable[[str], object], str]] = [
+    (lambda name: checks.real(name, np.ma.masked_greater(np.arange(4.0), 2)), "1 masked"),
+    (lambda name: checks.real(name, [np.ma.masked_greater(np.arange(4.0), 2), np.ones(4)]), "1 masked"),
+    (lambda name: checks.real(name, "wall.png"), "'wall.png'"),
+    (lambda name: checks.real(name, Path("wall.png")), "'wall.png'"),
+    (lambda name: checks.real(name, ["a"]), "<U1"),
+    (lambda name: checks.real(name, [1j]), "complex"),
+    (lambda name: checks.real(name, [None]), "objects"),
+    (lambda name: checks.real(name, None), "None"),
+    (lambda name: checks.flag(name, 1), "1"),
+    (lambda name: checks.csr(name, scipy.sparse.coo_array([[1j]])), "complex"),
+    (lambda name: checks.csr(name, np.eye(2)), "ndarray"),
+]
 
 
-def refusal(kind: type[LtclError], act, part: str) -> None:
-    with pytest.raises(kind) as error:
-        act()
-    text = str(error.value)
-    assert all(piece in text for piece in part.split(" .* ")), text
-    assert "\n" not in text
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_bad_values(name):
-    refusal(InputError, *REFUSED[name])
-
-
-@pytest.mark.parametrize("name", WRONG_TYPES)
-def test_bad_types(name):
-    refusal(InputTypeError, *WRONG_TYPES[name])
+@pytest.mark.parametrize(
+    ("kind", "check", "value"),
+    [(InputError, *case) for case in REFUSED] + [(InputTypeError, *case) for case in WRONG_TYPES],
+)
+def test_bad_values_are_refused_by_name(
+    kind: type[LtclError], check: Callable[[str], object], value: str
+) -> None:
+    with pytest.raises(kind, match=rf"\Aargument.*{value}") as error:
+        check("argument")
+    assert "\n" not in str(error.value)
 
 
 def test_good_values_are_handed_on():
     array = np.array([1.0, -2.0])
-    assert checks.finite("b", array) is array
     assert checks.real("b", array) is array
     assert checks.shape("b", array, (3,), (2,)) is array
     assert checks.grid("grid", np.array([2, 3]), 6) == checks.grid("grid", [2.0, 3.0]) == (2, 3)
     assert checks.number("m", np.float32(0.5), above=0, below=1) == 0.5
     assert checks.number("m", 1, least=1, most=1) == 1.0
     assert checks.count("k", np.int64(3)) == 3
-    assert checks.one_of("method", "cg", ["jacobi", "cg"]) == "cg"
+    np.testing.assert_array_equal(checks.real("b", np.ma.masked_array(array, False)), array)
+
+
+@pytest.mark.parametrize("times", ["product", "transposed", "upload"])
+def test_no_product_drops_a_mask(device, times):
+    A, x = Dense(device, np.eye(2)), np.ma.masked_array([1.0, 2.0], [False, True])
+    with pytest.raises(InputTypeError, match="1 masked"):
+        {"product": A.dot, "transposed": A.T.dot, "upload": device.upload}[times](x)
 
 
 @pytest.mark.parametrize(
@@ -173,60 +125,41 @@ def test_finite_numbers_pass_even_where_their_sum_does_not(array):
 
 
 @pytest.mark.parametrize("form", ["csr", "csc", "coo", "lil", "dok", "bsr", "dia"])
-@pytest.mark.parametrize("dtype", ["float32", "float64", "int8", "bool"])
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64", "int8", "bool"])
 def test_every_sparse_format_becomes_a_canonical_csr_array(form, dtype):
-    dense = (gallery.sparse(5, 7).toarray() * 100).astype(dtype)
-    matrix = scipy.sparse.coo_array(dense).asformat(form)
+    half, dense = dtype == "float16", (gallery.sparse(5, 7).toarray() * 100).astype(dtype)
+    matrix = scipy.sparse.coo_array(dense.astype("float32" if half else dtype)).asformat(form)
+    if half and form in ("csr", "csc", "coo", "bsr", "dia"):  # the others compute with it themselves
+        matrix.data = matrix.data.astype(dtype)
     result = checks.csr("T", matrix)
     assert type(result) is scipy.sparse.csr_array
     np.testing.assert_array_equal(result.toarray(), dense)
-    # Again by hand: SciPy remembers what it once found.
-    assert all(np.all(np.diff(result.indices[a:b]) > 0) for a, b in itertools.pairwise(result.indptr))
+    row = np.repeat(np.arange(5), np.diff(result.indptr))
+    assert np.all(np.diff(row * 7 + result.indices) > 0)  # by hand: SciPy remembers what it once saw
 
 
 def test_disorder_is_seen_even_where_scipy_remembers_order():
     matrix = scipy.sparse.csr_array(np.array([[1, 2, 3]], np.float32))
     assert matrix.has_canonical_format
     matrix.indices[:] = [2, 1, 0]  # as a program that fills the arrays of a matrix in place
-    result = checks.csr("T", matrix)
-    assert result.indices.tolist() == [0, 1, 2]
-    assert result.toarray().tolist() == [[3, 2, 1]]
+    assert checks.csr("T", matrix).toarray().tolist() == [[3, 2, 1]]
 
 
 def test_memory_of_the_host_is_asked_first(monkeypatch):
-    assert checks.host_memory() > 1 << 20
     monkeypatch.setattr(checks, "host_memory", lambda: 1 << 20)
     checks.fits_host("a matrix", 1 << 20)
-    with pytest.raises(MemoryLimitError, match=r"^a matrix needs 1 GiB, but the host has 1 MiB free$"):
+    with pytest.raises(MemoryLimitError, match=r"a matrix .*1 GiB.*1 MiB"):
         checks.fits_host("a matrix", 1 << 30)
 
 
-def test_memory_is_known_without_proc(monkeypatch):
-    def missing(*_, **__):
-        raise FileNotFoundError
+@pytest.mark.skipif(sys.platform != "linux", reason="a limit of addresses is Linux's")
+def test_memory_is_what_a_limit_of_the_process_leaves():
+    import resource
 
-    monkeypatch.setattr("builtins.open", missing)
-    assert checks.host_memory() > 1 << 20
-
-
-@pytest.mark.parametrize(
-    ("nbytes", "text"),
-    [
-        (0, "0 B"),
-        (1023, "1023 B"),
-        (1536, "1.5 KiB"),
-        (1 << 20, "1 MiB"),
-        (3 << 30, "3 GiB"),
-        (1 << 50, "1024 TiB"),
-    ],
-)
-def test_sizes_as_people_read_them(nbytes, text):
-    assert checks.size(nbytes) == text
-
-
-@pytest.mark.parametrize("form", ["csr", "csc", "coo", "bsr", "dia"])
-def test_half_precision_is_converted(form):
-    matrix = gallery.sparse(5, 7).asformat(form)
-    wanted = matrix.toarray().astype(np.float16)
-    matrix.data = matrix.data.astype(np.float16)
-    np.testing.assert_array_equal(checks.csr("T", matrix).toarray(), wanted)
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), before[1]))
+    try:
+        assert checks.host_memory() <= 64 << 20
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,15 +41,6 @@ def test_row_sums_are_those_of_A(device, form, rho):
     assert (found.negative_entries, found.negative_light) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("albedo", [0.3, 0.62, 0.9])
-def test_a_closed_room_tells_its_albedo(device, albedo):
-    box = enclosure(40, albedo)
-    found = check(device, box.T, box.F)
-    assert found.bounce_highest == pytest.approx(albedo, abs=2e-3)
-    assert found.albedo_from_columns == pytest.approx(albedo, abs=1e-5)
-    assert found.conserved
-
-
 def test_a_surface_that_returns_more_than_it_gets_is_found(device):
     box = enclosure(40, 0.6)
     A = box.A.copy()
@@ -72,9 +64,9 @@ def test_hidden_entries_leave_what_products_tell(device):
     scene = lambertian(30, 0.5)
     found = check(device, scene.T, scene.F, aslinearoperator)
     assert found.bounce_highest == pytest.approx(scene.A.sum(axis=1).max(), abs=2e-3)
-    assert all(
-        math.isnan(x) for x in (found.albedo_from_columns, found.negative_entries, found.negative_light)
-    )
+    defect = diagnostics.reciprocity_defect(aslinearoperator(scene.T), scene.F)
+    unknown = defect, found.albedo_from_columns, found.negative_entries, found.negative_light
+    assert np.isnan(unknown).all()
 
 
 def test_where_the_solve_fails_nothing_is_claimed(device):
@@ -107,25 +99,19 @@ def test_independent_noise_shows_at_its_size(form, noise):
 
 
 @FORMS
-def test_light_that_goes_one_way_only_has_defect_one(form):
+def test_light_that_goes_one_way_has_defect_one_and_no_light_none(form):
     T = np.eye(20) + np.triu(np.random.default_rng(0).random((20, 20)), 1)
     assert diagnostics.reciprocity_defect(form(T), np.ones(20)) == pytest.approx(1.0)
-
-
-@FORMS
-def test_no_indirect_light_is_reciprocal(form):
     assert diagnostics.reciprocity_defect(form(np.diag(gain(9))), np.ones(9)) == 0.0
 
 
 @FORMS
-def test_dense_and_sparse_agree_and_a_sample_is_like_the_whole(form):
-    rng = np.random.default_rng(5)
-    T = lambertian(300, 0.8).T * rng.uniform(0.5, 1.5, (300, 300))
-    whole = diagnostics.reciprocity_defect(T, np.diag(T))
-    assert diagnostics.reciprocity_defect(form(T), np.diag(T)) == pytest.approx(whole, rel=1e-4)
-    assert diagnostics.reciprocity_defect(form(T), np.diag(T), entries=100**2) == pytest.approx(
-        whole, rel=0.1
-    )
+def test_a_sample_is_like_the_whole(form):
+    T = lambertian(300, 0.8).T * np.random.default_rng(5).uniform(0.5, 1.5, (300, 300))
+    whole = diagnostics.reciprocity_defect(form(T), np.diag(T))
+    some = diagnostics.reciprocity_defect(form(T), np.diag(T), entries=100**2)
+    assert some == pytest.approx(whole, rel=0.1)
+    assert some != whole
 
 
 @FORMS
@@ -135,10 +121,6 @@ def test_masked_pixels_and_negative_entries_are_no_obstacle(form):
     T[:, 7], F[7] = 5.0, 0.0
     T[3, 4] = T[4, 3] = -1e-3
     assert diagnostics.reciprocity_defect(form(T), F) < 0.05
-
-
-def test_hidden_entries_are_unknown():
-    assert np.isnan(diagnostics.reciprocity_defect(aslinearoperator(np.eye(4)), np.ones(4)))
 
 
 def test_a_path_traced_diffuse_corner_is_reciprocal_up_to_its_noise(shared_data: Path):
@@ -166,34 +148,14 @@ def test_it_is_that_of_the_dense_inverse(device):
     assert T.negative_bounces[0] == pytest.approx(wanted, rel=2e-2)
 
 
-def test_noise_averages_out_over_the_parts(device):
-    """5 % of noise in every entry of a diffuse corner; each part has 18 pixels."""
-    scene = box(12, 2, 0.7)
-    (clean,) = scene.matrices()
-    noisy = clean * np.random.default_rng(1).normal(1.0, 0.05, clean.shape)
-    T = ltcl.Transport(noisy, scene.grid, device=device)
-    assert max(T.negative_bounces) < 2e-3
-
-
 def test_gloss_takes_more_the_more_there_is(device, caplog):
     found = []
     for gloss in (0.1, 0.3, 0.8):
-        scene = glossy(
-            box(1, sides=3),
-            6,
-            gloss=gloss,
-            projector=(2.0, 1.4, 1.2),
-            camera=(1.5, 1.2, 1.9),
-            directions=16,
-        )
+        views: dict[str, Any] = {"projector": (2.0, 1.4, 1.2), "camera": (1.5, 1.2, 1.9)}
+        scene = glossy(box(1, sides=3), 6, gloss=gloss, directions=16, **views)
         T = scene.transport(device=device)
         b = ltcl.separate(T, T @ np.ones(T.grid), bounces=1)
         assert "section 8.4" in b.warning
         assert b.warning in caplog.text
         found.append(b.negative_bounce)
     assert found == sorted(found)
-
-
-def test_it_is_computed_once(device):
-    T = box(3, 3, 0.5).transport(device=device)
-    assert T.negative_bounces is T.negative_bounces

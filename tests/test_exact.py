@@ -12,10 +12,9 @@ import scipy.sparse
 
 import ltcl
 from ltcl import checks
-from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Shifted, Wavelet
-from tests.bases import Given, rotation, stands_for, two_sided
+from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Wavelet
+from tests.bases import stands_for, two_sided
 from tests.problems import enclosure
 
 GRID = (6, 7)
@@ -51,35 +50,13 @@ def colour(device, keep=0.5):
     return C, ltcl.Transport(true, GRID, first_bounce=F, device=device)
 
 
-def test_operators_are_taken_as_they_stand(device):
-    matrix, S, _ = given(device)
-    T = ltcl.Transport(matrix, GRID, first_bounce=F[1])
-    assert T.device is device
-    assert T.systems == (matrix.A,)
-    assert T.operators == (matrix,)
-    assert T.error == matrix.A.solution_error > 0.0
-    assert T.nbytes == matrix.A.nbytes
-    p = rng.uniform(0.0, 1.0, GRID)
-    np.testing.assert_allclose((T @ p).ravel(), S @ (F[1] * p.ravel()), rtol=1e-5)
-    assert repr(T).startswith("<ltcl Transport 42 x 42, grey, grid 6 x 7, compressed to ")
-    assert repr(T).endswith(f" with an error of {T.error:.2g}>")
-
-
-def test_three_share_what_they_share(device):
-    W = Given(device, rotation(N))
-    cores = [CSR(device, scipy.sparse.csr_array(scene.R)) for scene in SCENES]
-    matrices = [ScaledColumns(IdentityPlus(Compressed(C, W, W)), f) for C, f in zip(cores, F, strict=True)]
-    T = ltcl.Transport(matrices, GRID, first_bounce=F)
-    assert T.nbytes == sum(core.nbytes for core in cores) + W.nbytes
-
-
 def test_another_first_bounce_makes_another_S(device):
     """T = S F = S' F': the same picture, S' = S F / F', and a bound that F / F' widens."""
     matrix, S, true = given(device)
     other = F[1] * rng.uniform(0.8, 1.25, N)
     T = ltcl.Transport(matrix, GRID, first_bounce=other)
     found = T.systems[0]
-    assert isinstance(found.R, Shifted)
+    assert isinstance(found.R, ScaledColumns)
     np.testing.assert_allclose(found.to_dense(), S * F[1] / other, atol=1e-5)
     ratio = F[1] / other
     assert T.error == pytest.approx(matrix.A.solution_error * ratio.max() / ratio.min())
@@ -91,7 +68,7 @@ def test_another_first_bounce_makes_another_S(device):
 def test_masked_pixels_stay_dark(device):
     f = np.where(np.arange(N) % 5 == 0, 0.0, F[1])
     matrix, _, _ = given(device, f=f)
-    with pytest.raises(InputError, match="give on_dark='mask'"):
+    with pytest.raises(InputError, match="on_dark"):
         ltcl.Transport(matrix, GRID, first_bounce=f)
     T = ltcl.Transport(matrix, GRID, first_bounce=f, on_dark="mask")
     assert T.systems == (matrix.A,)
@@ -116,104 +93,71 @@ def test_results_tell_of_which_T_they_are(device):
     alone = ltcl.compensate(C, desired, rtol=C.error)
     missed = np.linalg.norm(T @ alone.pattern - alone.appearance) / np.linalg.norm(alone.appearance)
     assert 0.0 < missed <= alone.transport_error == C.error
-    assert f" with a T that itself is off by {checks.upwards(C.error)}, " in repr(alone)
+    assert checks.upwards(C.error) in repr(alone)
     parts = ltcl.separate(C, desired, 1)
     assert parts.transport_error == C.error
-    assert repr(parts).endswith(f"1 bounces with a T that itself is off by {checks.upwards(C.error)}>")
-    for found in (
-        ltcl.compensate(C, desired, exact=T, rtol=1e-4),
-        ltcl.compensate(T, desired),
-        ltcl.separate(C, desired, 1, exact=T),
-        ltcl.separate(T, desired, 1),
-    ):
-        assert found.transport_error == 0.0
-        assert "itself" not in repr(found)
+    assert checks.upwards(C.error) in repr(parts)
+    np.testing.assert_allclose(parts.direct + parts.bounces.sum(axis=0) + parts.rest, desired, atol=1e-5)
+    assert ltcl.compensate(C, desired, exact=T, rtol=1e-4).transport_error == 0.0
+    assert ltcl.separate(C, desired, 1, exact=T).transport_error == 0.0
 
 
 @pytest.mark.parametrize("kind", [pair, colour])
-@pytest.mark.parametrize("gain", [1.0, "auto"])
-def test_compensation_beside_the_exact_one(device, kind, gain):
-    C, T = kind(device)
-    desired = rng.uniform(0.1, 0.3, GRID)
-    ours = ltcl.compensate(C, desired, gain=gain, exact=T, rtol=1e-5)
-    theirs = ltcl.compensate(T, desired, gain=gain, rtol=1e-5, method="direct")
-    assert ours.gain == pytest.approx(theirs.gain, rel=1e-4)
-    np.testing.assert_allclose(ours.pattern, theirs.pattern, atol=1e-4)
-    np.testing.assert_allclose(ours.appearance, T @ ours.pattern, rtol=1e-5)  # not that of C
-    assert ours.error == pytest.approx(theirs.error, abs=1e-4)
-
-
-@pytest.mark.parametrize("kind", [pair, colour])
-@pytest.mark.parametrize("rtol", [1e-7, 1e-10])
-def test_tasks_beside_the_exact_one_below_float32(device, kind, rtol):
-    """Solutions as they are before a picture is rounded: those of T itself by a factorization in float64."""
+@pytest.mark.parametrize(("rtol", "close"), [(1e-5, 1e-4), (1e-7, 1e-6), (1e-10, 1e-6)])
+def test_tasks_beside_the_exact_one(device, kind, rtol, close):
+    """Below float32, too: solutions of T itself by a factorization, before a picture is rounded."""
     C, T = kind(device)
     desired = T @ rng.uniform(0.2, 0.8, GRID)  # within the bounds
-    ours, theirs = (
-        ltcl.compensate(C, desired, exact=T, rtol=rtol),
-        ltcl.compensate(T, desired, method="direct"),
-    )
-    np.testing.assert_allclose(ours.pattern, theirs.pattern, rtol=1e-6)
+    ours = ltcl.compensate(C, desired, exact=T, rtol=rtol)
+    theirs = ltcl.compensate(T, desired, method="direct")
+    np.testing.assert_allclose(ours.pattern, theirs.pattern, rtol=close)
     image = T @ rng.uniform(0.2, 0.8, GRID)
     ours, theirs = ltcl.separate(C, image, 2, exact=T, rtol=rtol), ltcl.separate(T, image, 2, method="direct")
-    np.testing.assert_allclose(ours.direct, theirs.direct, rtol=1e-5)
-    for one in ours.solutions:
-        for s in one if isinstance(one, tuple) else (one,):
-            assert s.converged
-            assert s.residual <= rtol
+    np.testing.assert_allclose(ours.direct, theirs.direct, rtol=max(close, 1e-5))
+    np.testing.assert_allclose(ours.bounces, theirs.bounces, atol=max(close, 1e-5))
+    assert ours.reciprocity_defect == theirs.reciprocity_defect < 1e-6
+    for s in (s for each in ours.solutions for s in (each if isinstance(each, tuple) else (each,))):
+        assert s.converged
+        assert s.residual <= rtol
 
 
 def test_beyond_the_projector(device):
     """Least squares within the bounds takes products with the transpose, compressed ones or exact."""
     C, T = pair(device)
     desired = rng.uniform(0.0, 3.0, GRID)
-    alone = ltcl.compensate(C, desired, rtol=C.error)
-    matrix = C.operators[0].to_dense()
+    alone, matrix = ltcl.compensate(C, desired, rtol=C.error), C.operators[0].to_dense()
     assert alone.clipped > 0.0
-    left = np.linalg.norm(desired.ravel() - matrix @ alone.pattern.ravel()) / np.linalg.norm(desired)
-    assert alone.error == pytest.approx(left, rel=1e-3)
+    missed = np.linalg.norm(desired.ravel() - matrix @ alone.pattern.ravel()) / np.linalg.norm(desired)
+    assert alone.error == pytest.approx(missed, rel=1e-3)
     assert alone.gap <= C.error
     ours, theirs = ltcl.compensate(C, desired, exact=T, rtol=1e-4), ltcl.compensate(T, desired, rtol=1e-4)
     assert ours.error == pytest.approx(theirs.error, abs=2e-4)
 
 
-@pytest.mark.parametrize("kind", [pair, colour])
-def test_separation_beside_the_exact_one(device, kind):
-    C, T = kind(device)
-    image = T @ rng.uniform(0.2, 0.8, GRID)
-    ours, theirs = ltcl.separate(C, image, 2, exact=T, rtol=1e-5), ltcl.separate(T, image, 2, rtol=1e-5)
-    np.testing.assert_allclose(ours.direct, theirs.direct, atol=1e-4)
-    np.testing.assert_allclose(ours.bounces, theirs.bounces, atol=1e-4)
-    assert ours.reciprocity_defect == theirs.reciprocity_defect < 1e-6
-    alone = ltcl.separate(C, image, 2, rtol=C.error)
-    np.testing.assert_allclose(alone.direct + alone.bounces.sum(axis=0) + alone.rest, image, atol=1e-5)
-
-
 def test_what_does_not_lie_beside(device, small_device):
     C, T = pair(device)
-    rgb = colour(device)[1]
-    matrix = T.matrices[0]
+    rgb, matrix = colour(device)[1], T.matrices[0]
     S: Any = T.interreflection
-    for other, kind, part in (
+    turned = ltcl.Transport(matrix, (7, 6))
+    brighter = ltcl.Transport(matrix, GRID, first_bounce=2 * F[1])
+    tall = ltcl.Transport(matrix[:12], GRID, camera_grid=(3, 4))
+    elsewhere = ltcl.Transport(matrix, GRID, first_bounce=F[1], device=small_device)
+    for other, kind, says in (
         (matrix, InputTypeError, "exact is a ndarray"),
         (S, InputTypeError, "exact is a IdentityPlus"),
-        (rgb, InputError, "exact has channels 3; it must be that of T, 1"),
-        (
-            ltcl.Transport(matrix, (7, 6)),
-            InputError,
-            r"exact has grid \(7, 6\); .* of T, \(6, 7\)",
-        ),
-        (ltcl.Transport(matrix, GRID, first_bounce=2 * F[1]), InputError, "exact has another first bounce"),
-        (ltcl.Transport(matrix[:12], GRID, camera_grid=(3, 4)), InputError, "needs both on one grid"),
-        (ltcl.Transport(matrix, GRID, first_bounce=F[1], device=small_device), InputError, "another device"),
+        (rgb, InputError, "exact has channels 3.* 1"),
+        (turned, InputError, r"exact has grid \(7, 6\).*\(6, 7\)"),
+        (brighter, InputError, "exact.*first bounce"),
+        (tall, InputError, "one grid"),
+        (elsewhere, InputError, "device"),
     ):
         for task in (ltcl.compensate, ltcl.separate):
-            with pytest.raises(kind, match=part):
+            with pytest.raises(kind, match=says):
                 task(C, np.ones(GRID), exact=other)
     mixed = ltcl.Transport(rgb.matrices, GRID, first_bounce=F, mixing=np.eye(3) + 0.1)
-    with pytest.raises(InputError, match="exact mixes colours in another way"):
+    with pytest.raises(InputError, match=r"exact.*mixes"):
         ltcl.compensate(rgb, np.ones((*GRID, 3)), exact=mixed)
-    with pytest.raises(InputTypeError, match="'monte_carlo' samples; leave it out"):
+    with pytest.raises(InputTypeError, match="monte_carlo"):
         ltcl.separate(C, np.ones(GRID), method="monte_carlo", exact=T)
 
 
@@ -237,11 +181,10 @@ def test_tasks_accept_a_T_without_any_bound(device):
     R = two_sided(device, SCENES[1].R, 0.5)
     C = ltcl.Transport(ScaledColumns(IdentityPlus(R, solution_error=np.inf), F[1]), GRID, first_bounce=F[1])
     T = pair(device)[1]
-    with pytest.raises(InputError, match="off by inf"):
+    with pytest.raises(InputError, match="inf"):
         ltcl.compensate(C, np.ones(GRID))
     assert ltcl.compensate(C, T @ np.full(GRID, 0.5), exact=T, rtol=1e-5).error < 1e-4
     assert ltcl.analyze(C).channels[0].negative_bounce < 0.01
-    assert isinstance(C.device, Device)
 
 
 def test_what_was_dropped_is_not_taken_for_gloss(device):
@@ -250,15 +193,12 @@ def test_what_was_dropped_is_not_taken_for_gloss(device):
     T = scene.transport(first_bounce=scene.first_bounce, device=device)
     W = Wavelet(device, T.grid, "db2")
     R = T.systems[0].to_dense() - np.eye(T.shape[0])
-    C = W.to_dense() @ R @ W.to_dense().T
-    core = CSR(device, scipy.sparse.csr_array(np.where(np.abs(C) < 1e-3, 0.0, C)))
+    core = W.to_dense() @ R @ W.to_dense().T
+    core = CSR(device, scipy.sparse.csr_array(np.where(np.abs(core) < 1e-3, 0.0, core)))
     compressed = Compressed(core, W, W)
-    S = np.eye(len(R)) + compressed.to_dense()
-    kept = ScaledColumns(
-        IdentityPlus(compressed, solution_error=bound(S, np.eye(len(R)) + R)), T.first_bounce
-    )
-    found = ltcl.separate(
-        ltcl.Transport(kept, T.grid, first_bounce=T.first_bounce), T @ np.ones(T.grid), 1, rtol=0.1
-    )
+    S, F = np.eye(len(R)) + compressed.to_dense(), T.first_bounce
+    matrix = ScaledColumns(IdentityPlus(compressed, solution_error=bound(S, np.eye(len(R)) + R)), F)
+    C = ltcl.Transport(matrix, T.grid, first_bounce=F)
+    found = ltcl.separate(C, T @ np.ones(T.grid), 1, rtol=0.1)
     assert found.negative_bounce > 0.005
     assert found.warning == ""

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import errno
-import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import ltcl
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import fill_folder, input_file, replace_file
 
+MANAGERS = [replace_file, fill_folder]
 ENDINGS = [ValueError, KeyboardInterrupt, SystemExit]
 
 
@@ -24,25 +26,28 @@ def everything(folder: Path) -> dict[str, bytes | None]:
     }
 
 
-def fill(folder: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text(text)
-
-
-def fail_halfway(path: Path, ending: type[BaseException]) -> None:
-    path.write_bytes(b"half")
-    raise ending
-
-
-def one_line(error: pytest.ExceptionInfo[BaseException], path: Path) -> str:
+def refused(path: Path, block: Callable[[], object], *says: str) -> None:
+    """Refused in one line that begins with the path."""
+    with pytest.raises(FileError) as error:
+        block()
     text = str(error.value)
     assert text.startswith(str(path))
     assert "\n" not in text
-    return text
+    assert all(word in text for word in says)
 
 
-def test_replace_file_writes_a_new_file_with_the_usual_permissions(tmp_path):
+def write(manager: Any, path: Path, files: dict[str, str], ending: BaseException | None = None) -> None:
+    """Write the one file, or `files` into the folder, and then raise `ending`."""
+    with manager(path) as temporary:
+        for name, text in files.items():
+            place = temporary if manager is replace_file else temporary / name
+            place.parent.mkdir(exist_ok=True)
+            place.write_text(text)
+        if ending is not None:
+            raise ending
+
+
+def test_a_new_file_appears_with_the_usual_permissions(tmp_path):
     (tmp_path / "usual").touch()
     with replace_file(tmp_path / "a" / "b" / "out.npz") as temporary:
         assert temporary.parent == tmp_path / "a" / "b"
@@ -52,140 +57,81 @@ def test_replace_file_writes_a_new_file_with_the_usual_permissions(tmp_path):
     assert (tmp_path / "a/b/out.npz").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_replace_file_leaves_the_earlier_file_when_the_block_fails(tmp_path, ending):
-    path = tmp_path / "out.png"
-    path.write_bytes(b"old")
-    with pytest.raises(ending), replace_file(path) as temporary:
-        fail_halfway(temporary, ending)
-    assert everything(tmp_path) == {"out.png": b"old"}
-
-
-def test_replace_file_removes_the_folders_it_made_when_the_block_fails(tmp_path):
-    with pytest.raises(ValueError, match="stop"), replace_file(tmp_path / "a" / "b" / "out.png"):
-        raise ValueError("stop")
-    assert everything(tmp_path) == {}
-
-
-def test_replace_file_keeps_permissions_and_links(tmp_path):
+def test_permissions_and_links_stay(tmp_path):
     real, link = tmp_path / "real.txt", tmp_path / "link.txt"
     real.write_text("old")
     real.chmod(0o640)
     link.symlink_to(real)
-    with replace_file(link) as temporary:
-        temporary.write_text("new")
+    write(replace_file, link, {"": "new"})
     assert link.is_symlink()
     assert real.read_text() == "new"
     assert real.stat().st_mode & 0o777 == 0o640
 
 
-@pytest.mark.parametrize("name", ["folder", "file/below.png", "file/deeper/below.png", "x" * 300 + ".png"])
-def test_replace_file_refuses_places_that_cannot_hold_a_file(tmp_path, name):
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "file").write_bytes(b"old")
-    before = everything(tmp_path)
-    with pytest.raises(FileError) as error, replace_file(tmp_path / name) as temporary:
-        temporary.write_bytes(b"new")
-    one_line(error, tmp_path / name)
-    assert everything(tmp_path) == before
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/null"), reason="no device files")
-def test_replace_file_never_replaces_a_device():
-    with pytest.raises(FileError, match="no regular file"), replace_file("/dev/null"):
-        pass
-
-
-def test_replace_file_turns_a_full_disk_into_one_line(tmp_path):
-    path = tmp_path / "out.png"
-    with pytest.raises(FileError) as error, replace_file(path):
-        raise OSError(28, "No space left on device")
-    assert "No space left on device" in one_line(error, path)
-
-
-def test_replace_file_passes_on_errors_about_other_files(tmp_path):
-    with pytest.raises(FileNotFoundError), replace_file(tmp_path / "out" / "a.png"):
-        (tmp_path / "elsewhere.txt").read_text()
-
-
-@pytest.mark.parametrize("manager", [replace_file, fill_folder])
-def test_a_read_only_folder_is_one_line(tmp_path, manager, monkeypatch):
-    def refuse(folder, *_, **__):  # root may write anywhere, so the refusal is played
-        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(FileError, match="Permission denied"), manager(tmp_path / "deep" / "out"):
-        pass
-
-
-def test_fill_folder_appears_whole(tmp_path):
+def test_a_new_folder_appears_whole_and_joins_an_earlier_one(tmp_path):
     path = tmp_path / "a" / "report"
     with fill_folder(path) as temporary:
-        (temporary / "one.txt").write_text("1")
-        (temporary / "sub").mkdir()
-        (temporary / "sub" / "two.txt").write_text("2")
+        (temporary / "one.txt").write_text("old")
+        (temporary / "mine.txt").write_text("stays")
         assert not path.exists()
-    assert everything(path) == {"one.txt": b"1", "sub": None, "sub/two.txt": b"2"}
-    assert everything(tmp_path).keys() == {"a", "a/report"} | {f"a/report/{k}" for k in everything(path)}
-
-
-def test_fill_folder_joins_an_existing_folder(tmp_path):
-    path = tmp_path / "report"
-    (path / "sub").mkdir(parents=True)
-    (path / "mine.txt").write_text("stays")
-    (path / "one.txt").write_text("old")
-    with fill_folder(path) as temporary:
-        assert list(temporary.iterdir()) == []
-        (temporary / "one.txt").write_text("new")
-        (temporary / "sub").mkdir()
-        (temporary / "sub" / "two.txt").write_text("2")
+    assert everything(tmp_path).keys() == {"a", "a/report", "a/report/one.txt", "a/report/mine.txt"}
+    write(fill_folder, path, {"one.txt": "new", "sub/two.txt": "2"})
     assert everything(path) == {"mine.txt": b"stays", "one.txt": b"new", "sub": None, "sub/two.txt": b"2"}
 
 
 @pytest.mark.parametrize("existing", [False, True])
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_fill_folder_changes_nothing_when_the_block_fails(tmp_path, ending, existing):
-    path = tmp_path / "deep" / "report"
+@pytest.mark.parametrize("manager", MANAGERS)
+def test_nothing_changes_when_the_block_fails(tmp_path, manager, ending, existing):
+    path = tmp_path / "deep" / "er" / "out"
     if existing:
-        path.mkdir(parents=True)
-        (path / "one.txt").write_text("old")
+        write(manager, path, {"one.txt": "old"})
     before = everything(tmp_path)
-    with pytest.raises(ending), fill_folder(path) as temporary:
-        fail_halfway(temporary / "one.txt", ending)
+    with pytest.raises(ending):
+        write(manager, path, {"one.txt": "half"}, ending())
+    assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("manager", "name"),
+    [(replace_file, name) for name in ("folder", "file/below.png", "file/a/b.png", "x" * 300 + ".png", "\0")]
+    + [(fill_folder, name) for name in ("file", "file/below", "x" * 300, "\0")],
+)
+def test_places_that_cannot_hold_it_are_refused(tmp_path, manager, name):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_bytes(b"old")
+    before = everything(tmp_path)
+    refused(tmp_path / name, lambda: write(manager, tmp_path / name, {"a": "new"}))
     assert everything(tmp_path) == before
 
 
 @pytest.mark.parametrize("name", ["file/below.txt", "folder"])
-def test_fill_folder_moves_nothing_when_a_name_is_taken(tmp_path, name):
-    path = tmp_path / "report"
-    (path / "folder").mkdir(parents=True)
-    (path / "a.txt").write_text("old")
-    (path / "file").write_text("old")
+def test_nothing_moves_when_a_name_is_taken(tmp_path, name):
+    write(fill_folder, tmp_path / "report", {"folder/b": "old", "a.txt": "old", "file": "old"})
     before = everything(tmp_path)
-    with pytest.raises(FileError) as error, fill_folder(path) as temporary:
-        fill(temporary, {"a.txt": "new", name: "new"})
-    one_line(error, path)
+    refused(
+        tmp_path / "report", lambda: write(fill_folder, tmp_path / "report", {"a.txt": "new", name: "new"})
+    )
     assert everything(tmp_path) == before
 
 
-def test_fill_folder_refuses_a_file(tmp_path):
-    path = tmp_path / "report"
-    path.write_text("old")
-    with pytest.raises(FileError, match="is a file"), fill_folder(path):
-        pass
-    assert path.read_text() == "old"
+@pytest.mark.parametrize("manager", MANAGERS)
+def test_a_full_disk_is_one_line_and_other_errors_pass(tmp_path, manager):
+    path, full = tmp_path / "out.png", OSError(errno.ENOSPC, "No space left on device")
+    refused(path, lambda: write(manager, path, {"a": "half"}, full), "No space left on device")
+    elsewhere = FileNotFoundError(errno.ENOENT, "No such file", str(tmp_path.parent / "elsewhere.txt"))
+    with pytest.raises(FileNotFoundError):
+        write(manager, path, {"a": "half"}, elsewhere)
+    assert everything(tmp_path) == {}
 
 
-def test_input_file_refuses_what_cannot_be_read(tmp_path):
+def test_what_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "empty").touch()
     (tmp_path / "full").write_bytes(b"x")
     assert input_file(str(tmp_path / "full")) == tmp_path / "full"
-    wanted = {"empty": "empty", "none": "no such file", "": "folder", "full/x": "cannot", "\0": "cannot"}
-    for name, text in wanted.items():
-        with pytest.raises(FileError, match=text) as error:
-            input_file(tmp_path / name)
-        one_line(error, tmp_path / name)
-    with pytest.raises(InputTypeError, match="path"):
+    for name in ("empty", "none", "", "full/x", "\0"):
+        refused(tmp_path / name, lambda name=name: input_file(tmp_path / name))
+    with pytest.raises(InputTypeError, match=r"path .*3"):
         input_file(3)
 
 

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
-from ltcl.errors import InputError, InputTypeError
+from ltcl.errors import InputError
 from ltcl.layout import unpack
 
 GRID = (4, 5)
@@ -44,39 +46,13 @@ def test_pictures_come_back(name):
     np.testing.assert_array_equal(packed, np.broadcast_to(values[..., None], result) if grey else values)
 
 
-def test_columns_are_frames_and_within_them_colours():
-    values = picture((2, *GRID, 3))
-    (columns,), _ = unpack("image", values, GRID, 1)
-    for frame in range(2):
-        for colour in range(3):
-            np.testing.assert_array_equal(columns[:, 3 * frame + colour], values[frame, :, :, colour].ravel())
-    blocks, _ = unpack("image", values, GRID, 3)
-    for colour, block in enumerate(blocks):
-        np.testing.assert_array_equal(block, values[..., colour].reshape(2, N).T)
-
-
-def test_a_camera_may_have_another_grid():
-    columns, layout = unpack("pattern", picture((2, *GRID, 3)), GRID, 3)
-    seen = [column[:6] for column in columns]  # a transport to 2 x 3 camera pixels
-    assert layout.pack(seen, (2, 3)).shape == (2, 2, 3, 3)
-
-
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize(
     "shape", [(), (19,), (20, 1), (5, 4), (4, 5, 4), (4, 5, 1), (0, 4, 5), (2, 3, 4, 5), (1, 2, 4, 5, 3)]
 )
-def test_other_shapes_are_refused_with_those_that_fit(shape, channels):
-    with pytest.raises(
-        InputError, match=r"image has shape \(.*\); it must be \(4, 5\), \(4, 5, 3\) or frames"
-    ):
+def test_other_shapes_are_refused(shape, channels):
+    with pytest.raises(InputError, match=f"image .*{re.escape(str(shape))}"):
         unpack("image", np.zeros(shape), GRID, channels)
-
-
-def test_unusable_numbers_are_refused():
-    with pytest.raises(InputError, match=r"image has 1 NaN or infinite value\(s\), the first at \(0, 2\)"):
-        unpack("image", np.where(np.arange(N).reshape(GRID) == 2, np.nan, 0), GRID, 1)
-    with pytest.raises(InputTypeError, match="image holds"):
-        unpack("image", np.full(GRID, "a"), GRID, 1)
 
 
 def test_ambiguous_shapes_are_colour():

@@ -40,13 +40,6 @@ def test_every_solution_has_its_curve_and_name() -> None:
     assert axes.get_xlim() == (0, 4)
 
 
-def test_names_do_not_overlap() -> None:
-    figure = plots.convergence(SOLUTIONS, rtol=1e-2)
-    figure.draw_without_rendering()
-    boxes = [text.get_window_extent() for text in figure.axes[0].texts if text.get_text() != "tolerance"]
-    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
-
-
 @pytest.mark.parametrize(("solutions", "rtol"), [({}, 1e-2), (SOLUTIONS, 0.0), (SOLUTIONS, 2.0)])
 def test_nothing_to_draw_is_refused(solutions: dict[str, Solution], rtol: float) -> None:
     with pytest.raises(InputError):
@@ -81,22 +74,6 @@ def test_contact_sheet_shows_the_pictures_as_they_are(tmp_path: Path) -> None:
     assert picture.shape[1] == 1600
     same = np.abs(picture - (0.5, 0.2, 0.1)).max(axis=-1) < 0.01
     assert same.sum() > 3 * 450 * 330
-
-
-def test_uncovered_pixels_show_the_page(tmp_path: Path) -> None:
-    plots.save(plots.contact_sheet(sheet((0.5, 0.2, 0.1, 0.0))), tmp_path / "sheet.png")
-    picture = images.read(tmp_path / "sheet.png")
-    assert np.abs(picture[300, 300] - picture[5, 5]).max() < 0.01
-
-
-def test_texts_stay_on_the_page() -> None:
-    figure = plots.contact_sheet(sheet())
-    figure.draw_without_rendering()
-    page = figure.bbox
-    for text in [*figure.texts, *(text for axes in figure.axes for text in axes.texts)]:
-        box = text.get_window_extent()
-        assert box.x0 >= page.x0
-        assert box.x1 <= page.x1
 
 
 def test_unknown_extension_and_failure_leave_the_old_file(tmp_path: Path) -> None:

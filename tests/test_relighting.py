@@ -30,29 +30,23 @@ def test_it_is_the_product_with_the_matrix(device, shape, camera, channels):
 
     colour = shape[-1] == 3
     frames = pattern.reshape(-1, N, 3 if colour else 1)
-    wanted = [
-        frames[..., c if colour else 0] @ matrices[c % channels].T
+    exact = [
+        frames[..., c % frames.shape[2]] @ matrices[c % channels].T
         for c in range(max(channels, frames.shape[2]))
     ]
     pixels = (rows,) if shape == (N,) else camera or GRID
     front = shape[:1] if len(shape) - colour == 3 else ()
-    wanted_shape = (*front, *pixels, *((3,) if len(wanted) == 3 else ()))
-    np.testing.assert_allclose(picture, np.stack(wanted, axis=-1).reshape(wanted_shape), rtol=1e-6)
+    layout = (*front, *pixels, *((3,) if len(exact) == 3 else ()))
+    np.testing.assert_allclose(picture, np.stack(exact, axis=-1).reshape(layout), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("pattern", "error", "says"),
     [
-        (
-            np.ones((5, 3)),
-            InputError,
-            r"pattern has shape \(5, 3\); it must be \(3, 5\), \(3, 5, 3\) or frames",
-        ),
-        (np.ones((2, 2, 3, 5, 3)), InputError, "pattern has shape"),
-        (np.ones(14), InputError, "pattern has shape"),
-        (np.ones((0, 3, 5)), InputError, "pattern has shape"),
-        (np.full(GRID, np.nan), InputError, "pattern has 15 NaN or infinite value"),
-        (np.ones(GRID) * 1j, InputTypeError, "pattern holds complex128"),
+        (np.ones((5, 3)), InputError, r"pattern has shape \(5, 3\).*\(3, 5\)"),
+        *[(np.ones(shape), InputError, "pattern has shape") for shape in ((2, 2, 3, 5, 3), 14, (0, 3, 5))],
+        (np.full(GRID, np.nan), InputError, "pattern has 15 NaN"),
+        (np.ones(GRID) * 1j, InputTypeError, "pattern holds complex"),
     ],
 )
 def test_bad_patterns_are_refused_by_name(pattern, error, says):

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ltcl
-from ltcl.errors import ConvergenceError, InputError, InputTypeError
+from ltcl.errors import ConvergenceError, InputError, InputTypeError, MemoryLimitError
 from ltcl.solvers import Status
 from tests.problems import lambertian
 
@@ -26,8 +26,8 @@ def transport(device, scene=SCENE, **arguments):
     return ltcl.Transport(scene.T, GRID, **({"first_bounce": scene.F, "device": device} | arguments))
 
 
-def close(found: np.ndarray, wanted: np.ndarray, tolerance: Any) -> bool:
-    return bool(np.linalg.norm(np.asarray(found, float).ravel() - np.ravel(wanted)) <= tolerance)
+def close(picture: np.ndarray, exact: np.ndarray, tolerance: Any) -> bool:
+    return bool(np.linalg.norm(np.asarray(picture, float).ravel() - np.ravel(exact)) <= tolerance)
 
 
 @pytest.mark.parametrize("first_bounce", ["given", "exact"])
@@ -39,19 +39,19 @@ def test_the_bounces_are_powers_of_A(device, method, first_bounce):
     image = SCENE.T @ p
     b = ltcl.separate(T, image.reshape(GRID), bounces=5, method=method, rtol=rtol)
     assert b.bounces.shape == (5, *GRID)
-    for k, found in enumerate([b.direct, *b.bounces]):
-        assert close(found, SCENE.bounce(k, p), 2 * (k + 1) * rtol * np.linalg.norm(image))
+    assert all(isinstance(solution, ltcl.Solution) and solution.converged for solution in b.solutions)
+    for k, bounce in enumerate([b.direct, *b.bounces]):
+        assert close(bounce, SCENE.bounce(k, p), 2 * (k + 1) * rtol * np.linalg.norm(image))
     assert close(b.indirect, image - SCENE.F * p, 2 * rtol * np.linalg.norm(image))
     later = image - sum(SCENE.bounce(k, p) for k in range(6))
     assert close(b.rest, later, 12 * rtol * np.linalg.norm(image))
 
 
-@pytest.mark.parametrize("rho", [1.5, 4.0])
-def test_where_the_series_diverges_bounces_come_all_the_same(device, rho):
-    scene, p = lambertian(N, rho, seed=62), random.uniform(0.0, 1.0, N)
+def test_where_the_series_diverges_bounces_come_all_the_same(device):
+    scene, p = lambertian(N, 4.0, seed=62), random.uniform(0.0, 1.0, N)
     b = ltcl.separate(transport(device, scene), (scene.T @ p).reshape(GRID), method="chebyshev", rtol=1e-5)
-    for k, found in enumerate([b.direct, *b.bounces]):
-        assert close(found, scene.bounce(k, p), 1e-3 * np.linalg.norm(scene.T @ p))
+    for k, bounce in enumerate([b.direct, *b.bounces]):
+        assert close(bounce, scene.bounce(k, p), 1e-3 * np.linalg.norm(scene.T @ p))
     with pytest.raises(ConvergenceError) as caught:
         ltcl.separate(transport(device, scene), (scene.T @ p).reshape(GRID), method="jacobi")
     assert caught.value.solution.status is Status.DIVERGED
@@ -94,59 +94,30 @@ def test_negative_values_are_not_clipped(device):
     image = random.normal(size=N)
     b = ltcl.separate(transport(device), image, bounces=3, rtol=1e-6, method="direct")
     assert b.direct.min() < 0
-    left = image
-    for found in [b.direct, *b.bounces]:
-        wanted = left - SCENE.A @ left
-        left = left - wanted
-        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-5)
-
-
-def test_each_channel_has_its_own_bounces(device):
-    T = ltcl.Transport([scene.T for scene in SCENES], GRID, "exact", device=device)
-    p = random.uniform(0.0, 1.0, N)
-    image = np.stack([scene.T @ p for scene in SCENES], axis=-1).reshape(*GRID, 3)
-    b = ltcl.separate(T, image, bounces=2, rtol=1e-6)
-    for k, found in enumerate([b.direct, *b.bounces]):
-        wanted = np.stack([scene.bounce(k, p) for scene in SCENES], axis=-1)
-        assert close(found, wanted, 1e-4 * np.linalg.norm(image))
-    assert [isinstance(channels, tuple) and len(channels) for channels in b.solutions] == [3, 3, 3]
-
-
-def test_no_bounces_is_direct_and_rest(device):
-    image = random.uniform(0.0, 1.0, GRID)
-    b = ltcl.separate(transport(device), image, bounces=0)
-    assert b.bounces.shape == (0, *GRID)
-    np.testing.assert_array_equal(b.rest, b.indirect)
-    (solution,) = b.solutions
-    assert isinstance(solution, ltcl.Solution)
-    assert solution.converged
+    for bounce in [b.direct, *b.bounces]:
+        np.testing.assert_allclose(bounce, image - SCENE.A @ image, rtol=0, atol=1e-5)
+        image = SCENE.A @ image
 
 
 FINE = np.ones(GRID)
-BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
-    "image of another size": (
-        {"image": np.ones((7, 4))},
-        InputError,
-        r"image has shape \(7, 4\); .*\(4, 7\)",
-    ),
-    "image has NaN": ({"image": FINE * np.nan}, InputError, "image has 28 NaN or infinite value"),
-    "bounces negative": (
-        {"bounces": -1},
-        InputError,
-        "bounces is -1; it must be a whole number of at least 0",
-    ),
-    "bounces a fraction": ({"bounces": 1.5}, InputError, "bounces is 1.5; it must be"),
-    "bounces a flag": ({"bounces": True}, InputError, "bounces is True; it must be"),
-    "unknown method": ({"method": "magic"}, InputError, "method is 'magic'; it must be one of"),
-    "unknown option": ({"omega": 1}, InputTypeError, "unknown option 'omega'"),
-    "rtol": ({"rtol": 2.0}, InputError, "rtol is 2.0; it must be"),
-}
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_refused_by_name(device, case):
-    change, error, says = BAD[case]
-    with pytest.raises(error, match=says) as caught:
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"image": np.ones((7, 4))}, InputError, r"image has shape \(7, 4\); .*\(4, 7\)"),
+        ({"image": FINE * np.nan}, InputError, "image has 28 NaN"),
+        ({"bounces": -1}, InputError, "bounces is -1"),
+        ({"bounces": 1.5}, InputError, "bounces is 1.5"),
+        ({"bounces": True}, InputError, "bounces is True"),
+        ({"bounces": 10**12}, MemoryLimitError, "1000000000000 bounces"),
+        ({"method": "magic"}, InputError, "method is 'magic'"),
+        ({"omega": 1}, InputTypeError, "option 'omega'"),
+        ({"rtol": 2.0}, InputError, "rtol is 2.0"),
+    ],
+)
+def test_bad_input_is_refused_by_name(device, change, error, words):
+    with pytest.raises(error, match=words) as caught:
         ltcl.separate(transport(device), **{"image": FINE, **change})
     assert "\n" not in str(caught.value)
 
@@ -161,11 +132,6 @@ def test_bounces_are_sampled_with_random_numbers_of_their_own(device):
         x = ltcl.solve(T.interreflection, left, "monte_carlo", rtol=1e-3, samples=64, seed=seed).x
         np.testing.assert_array_equal(found.ravel(), x.astype(np.float32))
         left = left - x.astype(np.float64)
-
-
-def test_more_bounces_than_the_host_can_hold_are_refused(device):
-    with pytest.raises(ltcl.errors.MemoryLimitError, match="separating 1000000000000 bounces"):
-        ltcl.separate(transport(device), FINE, bounces=10**12)
 
 
 # What one camera cannot know (section 8.4).

@@ -13,7 +13,6 @@ import scipy.sparse
 from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 import ltcl
-from ltcl import first_bounce
 from ltcl.errors import DeviceError, InputError, InputTypeError, LtclError
 from ltcl.operators import Dense, IdentityPlus, ScaledColumns
 from tests.problems import lambertian
@@ -69,26 +68,21 @@ def test_every_form_relights_alike(device, form):
 
 @pytest.mark.parametrize(
     ("form", "collect"),
-    [
-        *((form, kind) for form in ("array", "csr", "operator", "lists") for kind in (tuple, list)),
-        ("array", np.stack),
-    ],
+    [("array", np.stack), ("array", tuple), ("csr", list), ("operator", tuple), ("lists", list)],
 )
-def test_three_make_colour(device, form, collect):
-    matrix = collect([FORMS[form](scene.T) for scene in SCENES])
-    T = transport(matrix, first_bounce=[scene.F for scene in SCENES], device=device)
+def test_three_make_colour_and_one_is_grey(device, form, collect):
+    T = transport(
+        collect([FORMS[form](scene.T) for scene in SCENES]),
+        first_bounce=[scene.F for scene in SCENES],
+        device=device,
+    )
     p = pattern(*GRID, 3)
     wanted = np.stack([scene.T @ p[..., c].ravel() for c, scene in enumerate(SCENES)], axis=-1)
     np.testing.assert_allclose(T @ p, wanted.reshape(*GRID, 3), rtol=ROUNDING)
-    assert T.channels == 3
+    assert (T.channels, len(T.systems), T.first_bounce.shape) == (3, 3, (3, 35))
     assert T.interreflection is T.systems
-    assert len(T.systems) == 3
-    assert T.first_bounce.shape == (3, 35)
-
-
-def test_one_of_a_sequence_is_grey(device):
-    assert transport([SCENE.T], device=device).channels == 1
-    assert transport(SCENE.T[None], device=device).channels == 1
+    one = transport(collect([FORMS[form](SCENE.T)]), first_bounce=SCENE.F, device=device)
+    assert one.channels == 1
 
 
 def test_no_device_is_opened_before_the_first_product():
@@ -115,43 +109,24 @@ def test_the_device_wanted_is_the_device_used(small_device):
 
 
 @pytest.mark.parametrize("form", ["array", "csr", "operator"])
-def test_a_rectangular_T_relights_and_has_no_S(device, form):
-    matrix = pattern(12, 35)
-    T = transport(FORMS[form](matrix), camera_grid=(3, 4), device=device)
+@pytest.mark.parametrize("camera", [(3, 4), (7, 5)])
+def test_a_camera_of_another_grid_relights_and_has_no_S(device, form, camera):
+    """Of 7 x 5 pixels T is square, but they are not those of the projector."""
+    matrix = pattern(camera[0] * camera[1], 35)
+    T = transport(FORMS[form](matrix), camera_grid=camera, device=device)
     np.testing.assert_allclose((T @ pattern(*GRID)).ravel(), matrix @ pattern(35), rtol=ROUNDING)
-    assert (T @ pattern(2, *GRID, 3)).shape == (2, 3, 4, 3)
-    refuses = [
+    assert (T @ pattern(2, *GRID, 3)).shape == (2, *camera, 3)
+    for refuse in (
         lambda: T.first_bounce,
         lambda: T.interreflection,
-        lambda: ltcl.separate(T, pattern(3, 4)),
+        lambda: ltcl.separate(T, pattern(*camera)),
         lambda: ltcl.analyze(T),
-    ]
-    for refuse in refuses:
-        with pytest.raises(InputError, match=r"projector of 5 x 7 pixels to a camera of 3 x 4.*only relight"):
+    ):
+        with pytest.raises(InputError, match=rf"5 x 7.*{camera[0]} x {camera[1]}"):
             refuse()
 
 
-def test_grids_that_differ_cannot_share_pixels(device):
-    """35 camera pixels, but not those of the projector: there is no S, whatever the shape of T says."""
-    T = transport(SCENE.T, camera_grid=(7, 5), device=device)
-    assert (T @ pattern(*GRID)).shape == (7, 5)
-    with pytest.raises(InputError, match="only relight"):
-        ltcl.separate(T, pattern(7, 5))
-
-
-# Bad input: (matrix, other arguments, error, what the message says).
-
-
-def broken(part: str, index: int, value: Any) -> scipy.sparse.csr_array:
-    matrix = scipy.sparse.csr_array(SCENE.T)
-    getattr(matrix, part)[index] = value
-    return matrix
-
-
-def holed(value: float) -> np.ndarray:
-    matrix = SCENE.T.copy()
-    matrix[3, 4] = value
-    return matrix
+# Bad input: matrix, other arguments, error, and the argument and value that its message names.
 
 
 class Bare(LinearOperator):
@@ -161,96 +136,58 @@ class Bare(LinearOperator):
         return SCENE.T @ x
 
 
-BARE = Bare(np.float64, (35, 35))
-BAD: dict[str, tuple[Any, dict[str, Any], type[LtclError], str]] = {
-    "a number": (3.0, {}, InputError, r"matrix has shape \(\); it must be \(M, N\)"),
-    "a vector": (np.ones(35), {}, InputError, r"matrix has shape \(35,\); it must be \(M, N\)"),
-    "four dimensions": (np.ones((1, 3, 3, 3)), {}, InputError, r"matrix has shape \(1, 3, 3, 3\)"),
-    "two channels": ([SCENE.T] * 2, {}, InputError, "matrix has 2 channels; it must be one matrix, or three"),
-    "unequal channels": ([SCENE.T, SCENE.T, SCENE.T[:4]], {}, InputError, "matrix has channels of shapes"),
-    "empty": (np.ones((0, 0)), {}, InputError, r"matrix has shape \(0, 0\); it must have at least one row"),
-    "empty sparse": (scipy.sparse.csr_array((0, 5)), {}, InputError, r"matrix has shape \(0, 5\)"),
-    "sparse vector": (scipy.sparse.coo_array(np.ones(35)), {}, InputError, r"matrix has shape \(35,\)"),
-    "CSR vector": (scipy.sparse.csr_array(np.ones(35)), {}, InputError, r"matrix has shape \(35,\)"),
-    "complex": (SCENE.T * 1j, {}, InputTypeError, "matrix holds complex128; it must hold real numbers"),
-    "complex CSR": (scipy.sparse.csr_array(SCENE.T * 1j), {}, InputTypeError, "matrix holds complex128"),
-    "text": ("T.npz", {}, InputTypeError, "matrix holds <U5; it must hold real numbers"),
-    "nothing": (None, {}, InputTypeError, "matrix holds object"),
-    "ragged": ([[1.0, 2.0], [3.0]], {}, LtclError, "matrix"),
-    "NaN": (holed(np.nan), {}, InputError, r"matrix has 1 NaN or infinite value\(s\), the first at \(3, 4\)"),
-    "Inf": ([SCENE.T, holed(np.inf), SCENE.T], {}, InputError, r"matrix\[1\] has 1 NaN or infinite"),
-    "NaN in CSR": (broken("data", 7, np.nan), {}, InputError, r"matrix.data has 1 NaN or infinite .* at 7"),
-    "NaN in COO": (scipy.sparse.coo_array(holed(np.nan)), {}, InputError, "matrix.* has 1 NaN or infinite"),
-    "column too large": (broken("indices", 9, 35), {}, InputError, r"matrix.indices holds 35; .* in 0\.\.34"),
-    "column negative": (broken("indices", 9, -1), {}, InputError, r"matrix.indices holds -1; .* in 0\.\.34"),
-    "pointers fall": (broken("indptr", 5, 999), {}, InputError, "matrix.indptr falls after entry 5"),
-    "pointers end early": (
-        broken("indptr", -1, 1220),
-        {},
-        InputError,
-        "matrix.indptr ends at 1220 with 1225",
-    ),
-    "pointers start late": (broken("indptr", 0, 1), {}, InputError, "matrix.indptr has 36 entries from 1"),
-    "grid too small": (SCENE.T, {"grid": (5, 6)}, InputError, r"grid is 5 x 6 = 30 pixels, .* must be 35"),
-    "grid a number": (
-        SCENE.T,
-        {"grid": 35},
-        InputError,
-        r"grid is 35; it must be two positive integers \(h, w\)",
-    ),
-    "grid fractions": (SCENE.T, {"grid": (2.5, 14)}, InputError, r"grid is \(2.5, 14\); it must be"),
-    "grid negative": (SCENE.T, {"grid": (-5, -7)}, InputError, r"grid is \(-5, -7\); it must be"),
-    "no camera grid": (SCENE.T[:12], {}, InputError, r"camera_grid is None.*h \* w = 12"),
-    "wrong camera grid": (
-        SCENE.T[:12],
-        {"camera_grid": (3, 5)},
-        InputError,
-        "camera_grid is 3 x 5 = 15 pixels",
-    ),
-    "on_dark": (SCENE.T, {"on_dark": "skip"}, InputError, "on_dark is 'skip'; it must be one of raise, mask"),
-    "F unknown": (
-        SCENE.T,
-        {"first_bounce": "guess"},
-        InputError,
-        "first_bounce is 'guess'; it must be one of",
-    ),
-    "F short": (
-        SCENE.T,
-        {"first_bounce": np.ones(3)},
-        InputError,
-        r"first_bounce has shape \(3,\); .*\(35,\)",
-    ),
-    "F NaN": (SCENE.T, {"first_bounce": np.full(35, np.nan)}, InputError, "first_bounce has 35 NaN"),
-    "F text": (SCENE.T, {"first_bounce": ["a"] * 35}, InputTypeError, "first_bounce holds <U1"),
-    "no diagonal": (
-        BARE,
-        {},
-        InputError,
-        "first_bounce is 'diagonal', .* Bare",
-    ),
-    "no inverse": (BARE, {"first_bounce": "exact"}, InputTypeError, "first_bounce='exact' inverts.*Bare"),
-    "singular": (
-        np.ones((35, 35)),
-        {"first_bounce": "exact"},
-        InputError,
-        "first_bounce is 'exact', which needs an inv",
-    ),
-}
+def spoilt() -> scipy.sparse.csr_array:
+    matrix = scipy.sparse.csr_array(SCENE.T)
+    matrix.indices[9] = 35
+    return matrix
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_refused_by_name(case, monkeypatch):
-    monkeypatch.setattr("ltcl.transport.open_device", lambda _: pytest.fail("a device was opened"))
-    matrix, arguments, error, says = BAD[case]
+T35, BARE = SCENE.T, Bare(np.float64, (35, 35))
+NAN = np.where(np.arange(35 * 35).reshape(35, 35) == 3 * 35 + 4, np.nan, T35)
+BAD: list[tuple[Any, dict[str, Any], type[LtclError], str]] = [
+    (3.0, {}, InputError, r"matrix .*\(\)"),
+    (np.ones(35), {}, InputError, r"matrix .*\(35,\)"),
+    (np.ones((1, 3, 3, 3)), {}, InputError, r"matrix .*\[3\]"),
+    (np.ones((1, 1, 3, 3, 3)), {}, InputError, r"matrix .*\(1, 1, 3, 3, 3\)"),
+    ([T35] * 2, {}, InputError, "matrix .*2 channels"),
+    (np.ones((5, 4, 4)), {}, InputError, r"matrix .*\(5, 4, 4\)"),
+    ([np.ma.masked_array([1.0, 0], [False, True]), [0, 1.0]], {}, InputTypeError, "matrix .*1 masked"),
+    ([T35, T35, T35[:4]], {}, InputError, r"matrix .*\(4, 35\), \(35, 35\)"),
+    (np.ones((0, 0)), {}, InputError, r"matrix .*\(0, 0\)"),
+    (scipy.sparse.csr_array((0, 5)), {}, InputError, r"matrix .*\(0, 5\)"),
+    (scipy.sparse.csr_array(np.ones(35)), {}, InputError, r"matrix .*\(35,\)"),
+    (T35 * 1j, {}, InputTypeError, "matrix .*complex"),
+    (scipy.sparse.csr_array(T35 * 1j), {}, InputTypeError, "matrix .*complex"),
+    ("T.npz", {}, InputTypeError, "matrix .*'T.npz'"),
+    (None, {}, InputTypeError, "matrix is None"),
+    ([[1.0, 2.0], [3.0]], {}, LtclError, "matrix"),
+    (T35 * 1e39, {}, InputError, "matrix .*e\\+3[89].* float32"),
+    ([T35, NAN, T35], {}, InputError, r"matrix\[1\] .*1 NaN .*\(3, 4\)"),
+    (spoilt(), {}, InputError, r"matrix.indices .*35"),
+    (T35, {"grid": (5, 6)}, InputError, "grid .*30 .* 35"),
+    (T35, {"grid": 35}, InputError, "grid .*35"),
+    (T35[:12], {}, InputError, "camera_grid .*None.* 12"),
+    (T35[:12], {"camera_grid": (3, 5)}, InputError, "camera_grid .*15.* 12"),
+    (T35[:12], {"camera_grid": (3, 4), "first_bounce": "exact"}, InputError, r"first_bounce .*\(12, 35\)"),
+    (T35, {"on_dark": "skip"}, InputError, "on_dark .*'skip'"),
+    (T35, {"first_bounce": "guess"}, InputError, "first_bounce .*'guess'"),
+    (T35, {"first_bounce": np.ones(3)}, InputError, r"first_bounce .*\(3,\).*\(35,\)"),
+    (T35, {"first_bounce": np.full(35, np.nan)}, InputError, "first_bounce .*35 NaN"),
+    (T35, {"first_bounce": ["a"] * 35}, InputTypeError, "first_bounce .*<U1"),
+    (T35, {"probes": 1}, InputError, "probes .*1"),
+    (T35, {"probes": 2.5}, InputError, "probes .*2.5"),
+    (T35, {"seed": -1}, InputError, "seed .*-1"),
+    (BARE, {}, InputError, "first_bounce .*'diagonal'.*Bare"),
+    (BARE, {"first_bounce": "exact"}, InputTypeError, "first_bounce.*'exact'.*Bare"),
+    (np.ones((35, 35)), {"first_bounce": "exact"}, InputError, "first_bounce .*'exact'.*singular"),
+]
+
+
+@pytest.mark.parametrize(("matrix", "arguments", "error", "says"), BAD)
+def test_bad_input_is_refused_by_name_before_a_device_is_opened(matrix, arguments, error, says):
     with pytest.raises(error, match=says) as caught:
-        transport(matrix, **arguments)
+        transport(matrix, device="there is no such device", **arguments)
     assert "\n" not in str(caught.value)
-
-
-def test_what_would_not_fit_the_host_is_said_before(monkeypatch):
-    monkeypatch.setattr("ltcl.checks.host_memory", lambda: 1024)
-    with pytest.raises(MemoryError, match="first_bounce='exact' inverts T densely, which for N = 35 needs"):
-        first_bounce.find([SCENE.T], "exact")  # a Transport would turn to an estimate
 
 
 # Copies.
@@ -285,13 +222,58 @@ def test_a_used_transport_is_copied_and_pickled(device, kind, again):
 def test_a_bare_operator_cannot_leave_its_device(device):
     with pytest.raises(InputTypeError, match="T is made of Dense"):
         pickle.dumps(transport(Dense(device, SCENE.T)))
+    with pytest.raises(InputTypeError, match="IdentityPlus"):
+        pickle.dumps(transport(SCENE.T, device=device).interreflection)
+
+
+def test_a_compressed_transport_and_an_inverse_are_unpickled_without_a_device(device, monkeypatch):
+    """A pool of processes waits for ever for a worker that fails while it unpickles its work."""
+    T = ltcl.compress(ltcl.scenes.dihedral(4).transport(device=device), 0.05)
+    inverse, p = ltcl.invert(T, 0.1), np.full(T.grid, 0.5)
+    texts = pickle.dumps(T), pickle.dumps(inverse)
+    with monkeypatch.context() as patch:
+        patch.setattr("ltcl.device.discovery.open_device", None)
+        patch.setattr("ltcl.transport.open_device", None)
+        patch.setattr("ltcl.solvers.inverse.open_device", None)
+        T_again, inverse_again = (pickle.loads(text) for text in texts)  # noqa: S301
+        assert (T_again.shape, T_again.channels, inverse_again.channels) == (T.shape, 1, 1)
+        T_again = pickle.loads(pickle.dumps(T_again))  # noqa: S301
+    np.testing.assert_array_equal(T_again @ p, T @ p)
+    np.testing.assert_array_equal(inverse_again.pattern(p), inverse.pattern(p))
 
 
 @pytest.mark.parametrize("form", ["array", "csr", "operator"])
 @pytest.mark.parametrize("share", [1e-4, 1e-30])
 def test_relighting_has_all_digits_whatever_the_first_bounce(device, form, share):
-    """I + R holds no digit of a diagonal of T that is far below F."""
+    """I + R holds no digit of a diagonal of T that is far below F: no picture is undone with it."""
     F = np.diag(SCENE.T) / share
     T = transport(FORMS[form](SCENE.T), first_bounce=F, device=device)
     p = pattern(*GRID)
     np.testing.assert_allclose((T @ p).ravel(), SCENE.T @ p.ravel(), rtol=ROUNDING)
+    if form != "operator":
+        with pytest.raises(InputError, match=r"first_bounce is .* 16"):
+            ltcl.separate(T, SCENE.T @ p.ravel())
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_first_bounce_too_small_for_float32_is_refused():
+    with pytest.raises(InputError, match=r"float32.* first bounce"):
+        ltcl.relight(ltcl.Transport([[1, 0.5], [0.3, 1e-39]], (1, 2)), np.ones((1, 2)))
+
+
+def test_codes_of_a_picture_file_are_worth_a_warning(caplog):
+    T = transport(SCENE.T)
+    for task in (
+        T.__matmul__,
+        lambda p: ltcl.separate(T, p),
+        lambda p: ltcl.compensate(T, FLAT, background=p),
+    ):
+        caplog.clear()
+        task(np.full(GRID, 200, np.uint8))
+        assert "uint8, up to 200" in caplog.text
+    caplog.clear()
+    ltcl.compensate(T, FLAT, weights=np.full(GRID, 200, np.uint8))
+    assert not caplog.records
+
+
+FLAT = np.full(GRID, 0.1)

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Sums over the rows of arrays (rows, k), column by column, and updates with coefficients of each column.
 //
-// An item has some rows of one column: neighbouring ones where ADJACENT is 1, as caches of CPUs like it; else every
-// so many, so that loads of neighbouring items lie side by side. A group has up to its size of the columns, and
-// get_group_id(2) says which. It leaves its partial sums at [slice][sum][column], and every group of the next kernel
-// adds up the slices itself, in one order. Launches that share partial sums have the same get_num_groups(0).
+// An item has some rows of one column: neighbouring ones where ADJACENT is 1, as caches of CPUs like it; else every so
+// many, so that loads of neighbouring items lie side by side. A group has up to its size of the columns, of which
+// get_group_id(2) says. It leaves partial sums at [slice][sum][column], which every group of the next kernel adds up,
+// in one order, with the same get_num_groups(0). `scratch` holds a real an item and those that a kernel names.
 
 #ifndef LTCL_COLUMNS_H
 #define LTCL_COLUMNS_H
@@ -15,8 +15,8 @@
 #error "columns.h needs -DADJACENT=<1: an item has neighbouring rows; 0: neighbouring items have>"
 #endif
 
-// Values first, first + step, ... below end, in the rows `row`, row + rows, ...; they are of column origin + column,
-// of the `width` columns from `origin` on that the group has.
+// Values first, first + step, ... below end, in the rows row, row + rows, ..., of column origin + column; the group
+// has `width` columns from `origin` on.
 typedef struct {
     int first, step, end, column, origin, width, row, rows;
 } share;

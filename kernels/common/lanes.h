@@ -3,9 +3,6 @@
 // offset .. offset + K - 1 of row-major arrays with `stride` columns. Where these are all the columns there
 // are, -DPACKED tells the compiler so: addresses get cheaper, a fifth less time at random columns.
 
-#ifndef LTCL_LANES_H
-#define LTCL_LANES_H
-
 #include "common/real.h"
 
 #ifndef K
@@ -46,8 +43,4 @@ typedef real lanes;
 typedef union {
     lanes vector;
     real item[sizeof(lanes) / sizeof(real)];
-} lanes_items;
-
-typedef lanes_items sums;  // of a row, one for each right-hand side
-
-#endif
+} sums;  // of a row, one for each right-hand side

@@ -1,9 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// k right-hand sides in pieces of K, all of them whole: the last one begins early, and does not store again what the
-// piece before it does.
-
-#ifndef LTCL_PIECES_H
-#define LTCL_PIECES_H
+// k right-hand sides in whole pieces of K: the last one begins early, and does not store again what the piece before
+// it does.
 
 #include "common/lanes.h"
 
@@ -23,7 +20,7 @@ static inline piece piece_of(int p, int k)
 // out = a v + b y at i .. i + K - 1, but for the first `skip` of them. Where b is 0, y is not read.
 INLINE void put(global real *out, int i, lanes v, int skip, real a, real b, global const real *y)
 {
-    lanes_items items;
+    sums items;
     items.vector = b != 0 ? a * v + b * LOAD(y + i) : a * v;
     if (skip == 0) {
         STORE(items.vector, out + i);
@@ -32,5 +29,3 @@ INLINE void put(global real *out, int i, lanes v, int skip, real a, real b, glob
     for (int c = skip; c < K; ++c)
         out[i + c] = items.item[c];
 }
-
-#endif

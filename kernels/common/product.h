@@ -1,22 +1,23 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// What a product makes of the sum of a row: the epilogue that csr.cl, dense.cl and tile.cl share.
+// Kernels over the rows of a matrix: what csr.cl, dense.cl and tile.cl share, and what becomes of the sum of a row.
 //
 //   without STEP   out = a (A x) + b y + c x
 //   with STEP      one step of a stationary iteration on S = a A + c I along the direction x:
 //                  iterate += x;  r -= S x;  next = keep x + gain r;  and the squares of the new r, summed over a
 //                  work-group, to partials[group_at + group]: the norm of a residual costs no launch of its own
 //
-// A format defines SLAB_ARGUMENTS and calls, in its kernels, row_sum or row_add of its own between these macros:
-//   ITEM_ROW .. FINISH_ITEMS(sum)   one work-item a row; `inside` tells whether it has one
-//   GROUP_ROW .. FINISH_GROUP(sum)  one work-group a row, its items side by side along the row
+// Three kernels of a format do the same; the device layer times them and takes the fastest:
 //
+//   <format>_matvec         one work-item a row, as it reads in a textbook
+//   <format>_matvec_stream  one work-item a row, in wide loads; for CPUs
+//   <format>_matvec_group   one work-group a row, its items side by side along the row; for GPUs
+//
+// Each is BY_ITEM or BY_GROUP of a statement that adds item `me` of `items`' share of row `row` to `sum`.
+// Required define: K, see common/lanes.h. Optional: STEP, and PACKED, see there.
 // Layout: a slab of `rows` rows, the first of which is row `first` of the matrix. x, y, out, iterate, r and next
 // are row-major with `stride` reals a row, and a launch works on their columns offset .. offset + K - 1. partials has
 // a row of `stride` reals for each group. y is not read where b is 0, nor x[row] where c is 0; y may be out.
 // `scratch` holds K reals a work-item.
-
-#ifndef LTCL_PRODUCT_H
-#define LTCL_PRODUCT_H
 
 #include "common/lanes.h"
 #include "common/reduce.h"
@@ -60,11 +61,11 @@ static inline void finish_row(PRODUCT_ARGUMENTS, int row, real *sum)
 
 static inline void keep_squares(PRODUCT_ARGUMENTS, const real *squares)
 {
-    for (int k = 0; k < K; ++k)
+    for (int k = 0; k < K && get_local_id(0) == 0; ++k)
         partials[(group_at + (int)get_group_id(0)) * stride + offset + k] = squares[k];
 }
-#define SUM_SQUARES(sum) group_sums((sum).item, scratch)
-#define KEEP_SQUARES(sum) keep_squares(PRODUCT_NAMES, (sum).item)
+#define SUM_SQUARES(sum) group_sums(sum.item, scratch)
+#define KEEP_SQUARES(sum) keep_squares(PRODUCT_NAMES, sum.item)
 #else
 static inline void finish_row(PRODUCT_ARGUMENTS, int row, const real *sum)
 {
@@ -81,26 +82,23 @@ static inline void finish_row(PRODUCT_ARGUMENTS, int row, const real *sum)
     const bool inside = row < rows; \
     sums sum = {0}
 #define FINISH_ITEMS(sum) \
-    do { \
-        if (inside) \
-            finish_row(PRODUCT_NAMES, row, (sum).item); \
-        SUM_SQUARES(sum); \
-        if (get_local_id(0) == 0) { \
-            KEEP_SQUARES(sum); \
-        } \
-    } while (0)
+    if (inside) \
+        finish_row(PRODUCT_NAMES, row, sum.item); \
+    SUM_SQUARES(sum); \
+    KEEP_SQUARES(sum)
 
-#define GROUP_ROW \
+#define BY_ITEM(row_sum) \
+    ITEM_ROW; \
+    if (inside) \
+        row_sum; \
+    FINISH_ITEMS(sum)
+
+#define BY_GROUP(row_sum) \
     stride = STRIDE(stride); \
     const int row = get_group_id(0), me = get_local_id(0), items = get_local_size(0); \
-    sums sum = {0}
-#define FINISH_GROUP(sum) \
-    do { \
-        group_sums((sum).item, scratch); \
-        if (me == 0) { \
-            finish_row(PRODUCT_NAMES, row, (sum).item); \
-            KEEP_SQUARES(sum); \
-        } \
-    } while (0)
-
-#endif
+    sums sum = {0}; \
+    row_sum; \
+    group_sums(sum.item, scratch); \
+    if (me == 0) \
+        finish_row(PRODUCT_NAMES, row, sum.item); \
+    KEEP_SQUARES(sum)

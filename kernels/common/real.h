@@ -1,60 +1,48 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// The number type of every kernel, and wide loads and stores.
+// The number type of every kernel, wide loads and stores at any address of a real, and the epilogue of products.
 //
-// Products are written a * b + c, never fma(): PoCL compiles fma() on vectors to a library call,
-// which made the CSR product with 8 right-hand sides 1.7 times slower. Compilers contract a * b + c
-// where the device has the instruction.
+// Products are written a * b + c, never fma(), which PoCL compiles to a library call on vectors (1.7 times slower);
+// compilers contract a * b + c where the device has the instruction. PoCL 3.0 compiles vload8 to a call, too: twice
+// as slow as the load that Clang makes of a vector type whose alignment is lowered.
 
 #ifndef LTCL_REAL_H
 #define LTCL_REAL_H
 
 typedef float real;
+typedef float2 real2;
 typedef float4 real4;
 typedef float8 real8;
 
-// Wide loads and stores at any address that is aligned to one real. PoCL 3.0 compiles vload8 to a call, twice as
-// slow as the unaligned load instruction that Clang makes of a vector type with its alignment lowered.
+// INLINE: for what works on several values at once; a call would pass each of them through memory.
 #ifdef __clang__
-typedef float2 real2_packed __attribute__((aligned(4)));
+typedef real2 real2_packed __attribute__((aligned(4)));
 typedef real4 real4_packed __attribute__((aligned(4)));
 typedef real8 real8_packed __attribute__((aligned(4)));
-#define LOAD2(p) (*(global const real2_packed *)(p))
-#define LOAD4(p) (*(global const real4_packed *)(p))
-#define LOAD8(p) (*(global const real8_packed *)(p))
-#define STORE2(v, p) (*(global real2_packed *)(p) = (v))
-#define STORE4(v, p) (*(global real4_packed *)(p) = (v))
-#define STORE8(v, p) (*(global real8_packed *)(p) = (v))
-#else
-#define LOAD2(p) vload2(0, p)
-#define LOAD4(p) vload4(0, p)
-#define LOAD8(p) vload8(0, p)
-#define STORE2(v, p) vstore2(v, 0, p)
-#define STORE4(v, p) vstore4(v, 0, p)
-#define STORE8(v, p) vstore8(v, 0, p)
-#endif
-
-// What works on several values at once must be inlined: a call passes each of them through memory.
-#ifdef __clang__
+#define LOAD_WIDE(n, p) (*(global const real##n##_packed *)(p))
+#define STORE_WIDE(n, v, p) (*(global real##n##_packed *)(p) = (v))
 #define INLINE static inline __attribute__((always_inline))
 #else
+#define LOAD_WIDE(n, p) vload##n(0, p)
+#define STORE_WIDE(n, v, p) vstore##n(v, 0, p)
 #define INLINE static inline
 #endif
+#define LOAD2(p) LOAD_WIDE(2, p)
+#define LOAD4(p) LOAD_WIDE(4, p)
+#define LOAD8(p) LOAD_WIDE(8, p)
+#define STORE2(v, p) STORE_WIDE(2, v, p)
+#define STORE4(v, p) STORE_WIDE(4, v, p)
+#define STORE8(v, p) STORE_WIDE(8, v, p)
 
-// The epilogue of a product, value by value: out = a sum + b y + c x; y is not read where b is 0, nor x where c is.
+// out = a sum + b y + c x, one value; y is not read where b is 0, nor x where c is.
 static inline void finish(
     int i, real sum, real a, real b, real c, global const real *x, global const real *y, global real *out)
 {
-    real value = a * sum;
-    if (b != 0)
-        value += b * y[i];
-    if (c != 0)
-        value += c * x[i];
-    out[i] = value;
+    out[i] = a * sum + (b == 0 ? 0 : b * y[i]) + (c == 0 ? 0 : c * x[i]);
 }
 
 static inline real sum8(real8 v)
 {
-    real4 h = v.lo + v.hi;
+    const real4 h = v.lo + v.hi;
     return (h.s0 + h.s1) + (h.s2 + h.s3);
 }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Sum and largest over a work-group as binary trees in local memory: the same order every time, any group size.
-// All items of the group must call them.
+// Sum and largest over a work-group as a binary tree in local memory: the same order every time, any group size.
+// All items of the group must call it.
 
 #ifndef LTCL_REDUCE_H
 #define LTCL_REDUCE_H
@@ -10,25 +10,14 @@
 // values[j], j < period, becomes the sum of values[j], values[j + period], ... below count, or the largest of them.
 static inline void fold(local real *values, int count, int period, int largest)
 {
-    for (int rows = (count + period - 1) / period; rows > 1;) {
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int rows = (count + period - 1) / period; rows > 1; rows = (rows + 1) / 2) {
         const int upper = (rows + 1) / 2 * period;  // rounds up, so the rows need not be a power of two
-        barrier(CLK_LOCAL_MEM_FENCE);
         for (int j = get_local_id(0); j + upper < count; j += get_local_size(0))
             values[j] = largest ? fmax(values[j], values[j + upper]) : values[j] + values[j + upper];
         count = upper;
-        rows = upper / period;
+        barrier(CLK_LOCAL_MEM_FENCE);
     }
-    barrier(CLK_LOCAL_MEM_FENCE);
-}
-
-// The sum of one value an item, in every item. `scratch` holds one real an item.
-static inline real group_sum(real value, local real *scratch)
-{
-    scratch[get_local_id(0)] = value;
-    fold(scratch, get_local_size(0), 1, 0);
-    const real total = scratch[0];
-    barrier(CLK_LOCAL_MEM_FENCE);  // so that the caller may use scratch again
-    return total;
 }
 
 #endif

@@ -1,20 +1,14 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Binary search in a sparse row, whose columns ascend.
 
-#ifndef LTCL_SEARCH_H
-#define LTCL_SEARCH_H
-
-// The first of the entries j .. end in `column` or a column after it; `end` where there is none.
+// The first of the entries j .. end of a sparse row, whose columns ascend, in `column` or after it; else `end`.
 static inline int entry_from(global const int *columns, int j, int end, int column)
 {
     while (j < end) {
-        const int half_way = j + (end - j) / 2;
-        if (columns[half_way] < column)
-            j = half_way + 1;
+        const int middle = j + (end - j) / 2;
+        if (columns[middle] < column)
+            j = middle + 1;
         else
-            end = half_way;
+            end = middle;
     }
     return j;
 }
-
-#endif

@@ -2,9 +2,6 @@
 // LANES neighbouring values that one work-item handles together: 8 on CPUs, 1 on GPUs, where neighbours are
 // the business of neighbouring items.
 
-#ifndef LTCL_STRETCH_H
-#define LTCL_STRETCH_H
-
 #include "common/real.h"
 
 #ifndef LANES
@@ -36,5 +33,3 @@ INLINE stretch magnitude(stretch v)
 {
     return v < 0 ? -v : v;
 }
-
-#endif

@@ -1,9 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Sums over tiles j .. end of a row times x, for K right-hand sides: as in a textbook, by one work-item or by many
-// side by side (tile_add), and in wide loads (tile_sum). x points at the first right-hand side of the launch.
-
-#ifndef LTCL_TILE_SUMS_H
-#define LTCL_TILE_SUMS_H
+// Sums over tiles of a row times x, for K right-hand sides, as those of common/row_sums.h.
 
 #include "common/lanes.h"
 
@@ -21,14 +17,12 @@ typedef ushort place;
 // common/real.h).
 #ifdef __clang__
 typedef ushort8 ushort8_packed __attribute__((aligned(2)));
-typedef char8 char8_packed __attribute__((aligned(1)));
+typedef uchar8 uchar8_packed __attribute__((aligned(1)));
 #define LOAD8_USHORT(p) (*(global const ushort8_packed *)(p))
-#define LOAD8_CHAR(p) (*(global const char8_packed *)(p))
-#define LOAD8_UCHAR(p) as_uchar8(LOAD8_CHAR(p))
+#define LOAD8_UCHAR(p) (*(global const uchar8_packed *)(p))
 #else
 #define LOAD8_USHORT(p) vload8(0, p)
-#define LOAD8_CHAR(p) vload8(0, p)
-#define LOAD8_UCHAR(p) vload8(0, p)
+#define LOAD8_UCHAR(p) vload8(0, (global const uchar *)(p))
 #endif
 
 #if VALUES == 0
@@ -45,7 +39,7 @@ typedef ushort narrow;
 #elif VALUES == 2
 typedef char narrow;
 #define WIDEN(p) ((real)*(p))
-#define WIDEN8(p) convert_float8(LOAD8_CHAR(p))
+#define WIDEN8(p) convert_float8(as_char8(LOAD8_UCHAR(p)))
 #else
 #error "tile_sums.h needs -DVALUES=<type of the numbers: 0 float32, 1 float16, 2 int8>"
 #endif
@@ -72,11 +66,10 @@ static inline void tile_add(
     }
 }
 
-static inline sums tile_sum(
+static inline lanes tile_sum(
     global const place *columns, global const narrow *values, global const uchar *scales, global const real *x,
     int stride, int j, int end)
 {
-    sums sum;
     lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;  // four sums hide the latency of the addition
 #if WIDTH == 1
 #if K == 1
@@ -123,8 +116,5 @@ static inline sums tile_sum(
         s3 = (lanes)(v.s7) * LOAD(y + 7 * stride) + s3;
     }
 #endif
-    sum.vector = (s0 + s1) + (s2 + s3);
-    return sum;
+    return (s0 + s1) + (s2 + s3);
 }
-
-#endif

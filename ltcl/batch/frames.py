@@ -170,7 +170,7 @@ def _checked(T: Transport, gain: Any, loss: Any, options: dict[str, Any]) -> tup
         count = layout.unpack(name, value, T.camera_grid, T.channels)[1].frames
         if count is not None:
             raise InputError(f"{name} holds {count} frame(s); it must be one picture, for all frames alike")
-    return problem.bounds(options.get("bounds", (0.0, 1.0)))
+    return checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
 
 
 def _apart(source: Path, targets: dict[str, Any]) -> None:

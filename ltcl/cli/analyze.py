@@ -10,6 +10,14 @@ import typer
 
 from ltcl.cli import console, options, transports
 
+_CERTIFICATES = {
+    "none": "no forecast",
+    "free bounds": "from row sums, at no extra products",
+    "collatz-wielandt": "from certified bounds on rho(R)",
+    "power iteration": "from an estimate of rho(R)",
+    "trial sweeps": "from sweeps that were tried",
+    "ritz values": "from an estimate of the spectrum of S",
+}
 _COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
 _Plot = Annotated[
     Path | None,
@@ -68,25 +76,35 @@ def _show(found: list[dict[str, Any]], rtol: float) -> None:
         "S between",
     )
     console.table((*columns, "first bounce"), _rows(found, _spectrum))
-    typer.echo(f"\nProducts with S, or sweeps of about the cost of one, to a relative residual of {rtol:g}")
+    typer.echo(
+        f"\nProducts with S to a relative residual of {rtol:g}; a sweep costs about one product, and a"
+    )
+    typer.echo("solve by sweeps two more; -: no forecast")
     console.table(("file", "channel", *methods), _rows(found, _forecast))
     for name in methods:
         certificates = {channel["certificates"][name] for entry in found for channel in entry["channels"]}
-        typer.echo(f"  {name}: by {', '.join(sorted(certificates))}")
+        typer.echo(f"  {name}: {', '.join(str(_CERTIFICATES.get(one, one)) for one in sorted(certificates))}")
     orders = tuple(f"n = {terms['n']}" for terms in found[0]["channels"][0]["series"])
-    typer.echo("\nError of n terms of the series at most: inverse (eq. 16), forward (eq. 15)")
+    typer.echo("\nBound on the error of the series with powers 0 to n: inverse (eq. 16), forward (eq. 15)")
     console.table(("file", "channel", *orders), _rows(found, _series))
-    typer.echo("  n terms cancel bounces 2 to n and leave bounce n + 1 with the sign (-1)^n (eq. 13)")
+    typer.echo(
+        "  powers 1 to n of R cancel bounces 2 to n and leave bounce n + 1 with the sign (-1)^n (eq. 13)"
+    )
     typer.echo("\nChecks of the measurement")
     columns = (
         "reciprocity defect",
-        "one bounce takes",
-        "one bounce keeps",
-        "albedo by columns",
-        "negative entries",
-        "their light",
+        "negative light",
+        "share passed on",
+        "albedo from columns",
+        "entries below 0",
+        "light of these",
     )
     console.table(("file", "channel", *columns), _rows(found, _checks))
+    typer.echo("  negative light: in one bounce between parts of the picture; should be 0")
+    typer.echo("  share passed on: of the light of each pixel by one bounce; must be at least 0 and below 1")
+    typer.echo(
+        "  albedo from columns: of a closed room whose R has the largest column sum; a guess of the scene's"
+    )
 
 
 def _rows(found: list[dict[str, Any]], cells: Any) -> list[tuple]:

@@ -45,8 +45,8 @@ _Basis = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME",
-        help="pixels, a wavelet (haar, db2, db4, ...), its rows alone ('db2 rows'), or a sum "
-        "('db2 + pixels'); may be given more than once. Default: the best of db2, haar, db4, pixels and it.",
+        help="pixels, a wavelet (haar, db2, db4, ...), or its rows alone ('db2 rows'); may be given more "
+        "than once. Default: the best of db2, haar, db4 and pixels.",
         show_default=False,
     ),
 ]
@@ -110,7 +110,7 @@ def _show(text: dict[str, Any]) -> None:
             for trial in channel["trials"]
         ],
     )
-    typer.echo("  taken: the fewest bytes of all whose launches x bytes are within a quarter of the least")
+    typer.echo("  the basis that needs the fewest bytes is taken")
     typer.echo("\nTaken, on all pixels")
     console.table(
         (
@@ -128,8 +128,9 @@ def _show(text: dict[str, Any]) -> None:
         [(colour, *_taken(channel)) for colour, channel in pairs],
     )
     typer.echo(
-        "  dropped, rounded: Frobenius norms; error: 2-norm of all that was; solution: error times norm"
+        "  dropped: Frobenius norm of the numbers left out; rounded: that of the rounding of the others"
     )
+    typer.echo("  error: 2-norm of both together, at most; solution: error times norm of S^-1, relative to x")
     within = checks.upwards(text["solution_error"])
     before, after = (checks.size(text[name]) for name in ("bytes", "bytes_compressed"))
     more = ", which is more" if text["bytes_compressed"] >= text["bytes"] else ""

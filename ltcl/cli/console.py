@@ -7,6 +7,7 @@ import logging
 import math
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -91,7 +92,7 @@ class Steps:
     """Progress through several items and the solves in each, on stderr.
 
     On a terminal a bar; elsewhere a line an item, by default once the whole has taken longer than two
-    seconds, and then one about every second of a long solve.
+    seconds, then also for what has begun before, and one about every second of a long solve.
 
     Parameters
     ----------
@@ -107,6 +108,8 @@ class Steps:
         self._item = self._solve = 0
         self._name, self._doing, self._said = "", "", 0.0
         self._quiet_until = time.monotonic() + _PATIENCE if patient else 0.0
+        self._overdue = threading.Timer(_PATIENCE, self._say_what_began)
+        self._overdue.daemon = True
         console = Console(stderr=True)
         self._is_terminal = console.is_terminal
         columns = (
@@ -121,9 +124,12 @@ class Steps:
     def __enter__(self) -> Steps:
         if self._is_terminal:
             self._bar.start()
+        elif time.monotonic() < self._quiet_until:
+            self._overdue.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._overdue.cancel()
         if self._is_terminal:
             self._bar.stop()
 
@@ -133,14 +139,14 @@ class Steps:
         counted = f"{self._item}/{self._items} {name}" if self._items > 1 else name
         done = (self._item - 1) * self._solves
         self._bar.update(self._task, description=counted, completed=done, text="")
-        self._name = counted
+        self._name, self._doing = counted, ""
         self._say(counted, 0.0)
 
     def at(self, text: str, share: float) -> None:
         """A `progress` for this item: what is being done, and the share that is."""
         if text != self._doing:
+            self._doing = text
             self._say(text, 0.0)
-        self._doing = text
         self._bar.update(self._task, completed=(self._item - 1 + share) * self._solves, text=text)
 
     def solve(self, rtol: float) -> Callable[[int, float], None]:
@@ -156,6 +162,11 @@ class Steps:
             self._say(f"{self._name}: {text}", _OFTEN)
 
         return step
+
+    def _say_what_began(self) -> None:
+        """A line for what began too early for one."""
+        if (text := self._doing or self._name) and not self._said:
+            self._say(text, 0.0)
 
     def _say(self, text: str, again: float) -> None:
         """A line, unless it is too early for any, or less than `again` seconds after the last."""

@@ -132,16 +132,15 @@ def on_device(device: Device) -> dict[str, Callable[[], str]]:
 def _compile(device: Device, file: str) -> str:
     """Build a kernel file with the defines that it asks for, each with every value of `_VALUES` in turn."""
     source = kernels.load(file)
-    names = dict.fromkeys(
-        name for line in _NEEDS.findall(source.text) for name in re.findall(r"-D(\w+)", line)
-    )
+    names = dict.fromkeys(name for line in _NEEDS.findall(source) for name in re.findall(r"-D(\w+)", line))
     choices = {name: _VALUES.get(name, (1,)) for name in names}
     choices |= {"LANES": (8 if device.is_cpu else 1,)} if "LANES" in names else {}
     usual = {name: values[0] for name, values in choices.items()}
     variants = [usual] + [usual | {name: value} for name, values in choices.items() for value in values[1:]]
+    entries = re.findall(r"\bkernel void (\w+)", source)
     for defines in variants:
-        device.kernel(file, source.kernels[0], **defines)
-    return f"compiles, {len(variants)} variant(s), {len(source.kernels)} kernel(s) each"
+        device.kernel(file, entries[0], **defines)
+    return f"compiles, {len(variants)} variant(s), {len(entries)} kernel(s) each"
 
 
 def _product(A: Operator, truth: np.ndarray) -> str:

@@ -18,7 +18,6 @@ import typer
 from ltcl import __version__
 from ltcl.cli import console, device_checks, options
 from ltcl.device import open_device
-from ltcl.device.discovery import suspects
 from ltcl.errors import FileError, LtclError
 
 # What pyproject.toml asks for, where ltcl runs from a checkout and so has no metadata.
@@ -66,7 +65,7 @@ def examine(device: str | None) -> Iterator[Finding]:
     yield drivers
     if not drivers.passed:  # what crashes a child would crash this process, too
         return
-    opening = attempt("device", lambda: str(open_device(device)), _opening_fix)
+    opening = attempt("device", lambda: str(open_device(device)), _OPENING)
     yield opening
     if not opening.passed:
         return
@@ -82,11 +81,6 @@ def _cache_fix(error: Exception) -> str:
     elsewhere = "set LTCL_CACHE=DIR to a folder that can be written"
     changeable = isinstance(error, (FileError, PermissionError))
     return f"chmod 700 the folder, or {elsewhere}" if changeable else elsewhere
-
-
-def _opening_fix(error: Exception) -> str:
-    hiding = suspects() if str(error).startswith("no OpenCL device") else []
-    return f"unset {' and '.join(hiding)}; or {_OPENING}" if hiding else _OPENING
 
 
 def attempt(check: str, action: Callable[[], str], fix: str | Callable[[Exception], str]) -> Finding:

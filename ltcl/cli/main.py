@@ -113,7 +113,8 @@ _RTOL = re.compile(r"(\brtol is \S+; it must be) (?:a finite number at least 0 a
 _COMMAND = re.compile(r"ltcl\.(invert|compress)\(T(?:, (\w+)=(?:\.\.\.|'(\w+)'))?\)")
 
 _WORDS = {
-    "rtol and atol are both 0; one of them must be positive": "--rtol is 0; it must be above 0",
+    ", or atol above 0": "",
+    "bounds is (": "(--low, --high) is (",
     "bounds[0] is": "--low is",
     "bounds[1] is": "--high is",
     "resume=True": "--resume",

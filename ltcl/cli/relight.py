@@ -61,7 +61,7 @@ def run(
     rows = [
         (Path(entry["file"]).name, entry["brightest"], entry["png_scale"], entry["exr"]) for entry in entries
     ]
-    console.table(("pattern", "brightest", "white in png", "picture"), rows)
+    console.table(("pattern", "brightest in picture", "white in png", "picture"), rows)
     typer.echo(f"\npictures as .exr and .png in {out}")
     if told := transports.caveat("they are", T):
         typer.echo(told)

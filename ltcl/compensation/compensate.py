@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import layout
+from ltcl import checks, layout
 from ltcl.compensation import gain as gains
 from ltcl.compensation import problem as problems
 from ltcl.compensation.problem import Columns, Limits, Problem, systems
-from ltcl.errors import ConvergenceError
+from ltcl.errors import ConvergenceError, InputError
 from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
 from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
 
@@ -49,25 +49,23 @@ class Compensation:
         gain * desired.
     out_of_reach : array
         target - appearance where the projector's limits keep the scene too dark (positive) or too bright
-        (negative). 0 where nothing is clipped; else 0 where a solve's tolerance explains it: where weight *
-        abs(target - appearance) is at most 3 times what ``max(rtol ||W target||, atol)`` of this frame and
-        colour makes in the root mean square. So it is 0 where the weight is.
+        (negative). 0 where nothing is clipped, and where weight * abs(target - appearance) is at most 3 times
+        what ``max(rtol ||W target||, atol)`` of this frame and colour makes in the root mean square.
     error : float
-        ``||W (appearance - target)|| / ||W target||`` of all frames and colours together, with the T that was
-        given, or `exact` where that was: what `transport_error` tells of that T is not in it.
+        ``||W (appearance - target)|| / ||W target||`` of all frames and colours together, with T as it is, or
+        `exact` where that was given; see `transport_error`.
     gap : float
-        What the error is above the least that the bounds allow, at most: no pattern within them has an error
-        below error - gap. A bound that was computed for this result.
+        Bound on what the error is above the least: no pattern within the bounds has one below error - gap.
     frame_errors, frame_clipped : (frames,) float64
         `error` and `clipped` of each frame by itself; of a single picture, one value.
     solution : Solution or tuple of 3
         What the light would be without bounds, one per channel of the transport; of a T without S, `limited`.
     limited : tuple of Bounded
-        The solves within the bounds; empty where the bounds cost nothing. Their products are those of the
-        search for a gain, too.
+        The solves within the bounds, with the products of the search for a gain; empty where these cost
+        nothing.
     transport_error : float
-        ``.error`` of that T: what a compressed one may be off by itself, 0 of others. The scene may look that
-        much farther from the target, in relation to T pattern.
+        ``.error`` of that T, 0 of uncompressed ones: the scene may look that much farther from the target, in
+        relation to T pattern.
     rtol : float
         Tolerance of the solves: as given, or what was chosen.
     """
@@ -127,24 +125,24 @@ def compensate(
         at a loss at most 1 % below the largest there is.
     loss : float, optional
         Of gain="auto": relative error, weights included, that the gain may cost, from 1e-6 to 1. When not
-        given, none where some gain is within reach exactly and there are no `weights`; else `rtol` or 1.1
-        times the least error of all gains (found to 1 %), whichever is more.
+        given, no error is allowed where some gain is within reach exactly and there are no `weights`;
+        elsewhere the larger of `rtol` and 1.1 times the smallest error that any gain has.
     weights : like `desired` or one frame of it, optional
-        How much the error at each camera pixel counts, at least 0. When not given 1, and 0 where T.masked.
+        Factor, at least 0, of the residual at each camera pixel, before it is squared. When not given 1, and
+        0 where T.masked.
     method, rtol, **options
         Of `ltcl.solve`; rtol is 1e-2 when not given, or the error of a compressed T or an inverse where that
         is more, as the result's `rtol` says. Within the bounds the error is the least there is up to `rtol`,
         relative to gain * desired - background. Where no bound holds, noise of a method that samples stays;
         it is part of `error` and `gap`, and makes the gain that gain="auto" finds smaller.
     exact : Transport, optional
-        The uncompressed transport that a compressed T stands for: T then solves, to an `rtol` as
-        `ltcl.solve` says, and everything else is of `exact`; the pattern itself is rounded to float32, 6e-8.
+        The uncompressed transport that T was compressed from: T then solves, to an `rtol` as `ltcl.solve`
+        says; errors and pictures are computed with `exact`. The pattern itself is rounded to float32, 6e-8.
     inverse : Inverse, optional
         Of T, as `ltcl.invert` makes it: the light without bounds is then one product, whatever the method.
     clamp : bool
-        Clamp the light to the bounds where it exceeds them, and leave it at that: quick, for videos. What is
-        lost is the light by which other pixels would make up for it; `error` tells how far off that is, and
-        `gap` is the whole error, since nothing is proved.
+        Clamp the light to the bounds, and leave it at that: quick, for videos. Other pixels do not make up
+        for it; `error` tells how far off that is, and `gap` is the whole error, since nothing is proved.
 
     Returns
     -------
@@ -176,37 +174,39 @@ def compensate(
     (0.6, [[1.0, 1.0]])
     """
     require(T, square=False)
-    low_high, requested = problems.bounds(bounds), problems.gain(gain, loss)
+    low_high, requested = checks.interval("bounds", bounds), problems.gain(gain, loss)
     limits = Limits.in_float32(low_high, T.join([T.masked] * T.channels)[0])
-    wanted, shape = problems.desired(desired, T)
-    dark = problems.background(background, T, shape, wanted)
-    counts, unit = problems.weights(weights, T, shape, wanted)
+    d, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
+    dark = problems.background(background, T, shape, d)
+    W, unit = problems.weights(weights, T, shape, d)
     if inverse is not None:
         require_inverse(T, inverse, rtol, exact=exact, method=None if method == "auto" else method)
     rtol = default_rtol(RTOL, T, exact, inverse) if rtol is None else rtol
     rules = problems.rules(T, method, rtol, options)
-    problems.clamp(clamp, T)
+    if checks.flag("clamp", clamp) and not T.is_square:
+        raise InputError("clamp is True, but this T has no S; its light is found within the bounds only")
     true, judges = resolve_reference(T, exact)
 
-    def undo(parts: Columns) -> tuple[Solution, ...]:
+    def undo(targets: Columns) -> tuple[Solution, ...]:
         """S^-1 of one target a system: one solution a channel."""
-        parts = T.split(parts)
+        targets = T.split(targets)
         if inverse is not None:
-            return tuple(inverse.solve(b, channel) for channel, b in enumerate(parts))
+            return tuple(inverse.solve(b, channel) for channel, b in enumerate(targets))
         return solve_each(
-            T.systems, parts, method, exact=judges, rtol=rtol, with_residual=rtol >= _COARSE, **options
+            T.systems, targets, method, exact=judges, rtol=rtol, with_residual=rtol >= _COARSE, **options
         )
 
     problem = Problem(
         systems(true),
-        T.join(wanted),
+        T.join(d),
         T.join(dark),
-        None if counts is None else T.join(counts),
+        None if W is None else T.join(W),
         limits,
         {**rules, "atol": rules["atol"] / unit},
         unit,
     )
     start = _start(T, problem, undo, requested, loss, exactly=weights is None)
+    problems.check_range(problem, start.gain)
     light, limited = _within(problem, start, options.get("throw", True), clamp)
     c = _result(true, problem, shape, start, light, limited)
     if requested is not None and c.clipped > 0.0:
@@ -241,27 +241,26 @@ def _start(
     if not T.is_square:
         if gain is None:
             return _Start(*gains.within_loss(problem, loss))
-        return _Start(gain, [np.zeros((len(system.scale), k)) for system in problem.systems])
+        return _Start(gain, [np.zeros((len(scale), k)) for _, scale in problem.systems])
+
+    def light(direct: Columns) -> Columns:
+        return T.join(T.to_light(direct))
+
     if gain is not None:
         solutions = undo(problem.target(gain))
         # S^-1 meets every pixel but those of masked ones, which count only where weights say so.
         masked = problem.limits.masked
-        counted = problem.weights is not None and any(part[masked].any() for part in problem.weights)
-        return _Start(gain, _light(T, [s.x for s in solutions]), solutions, meets=not counted)
+        counted = problem.weights is not None and any(w[masked].any() for w in problem.weights)
+        return _Start(gain, light([s.x for s in solutions]), solutions, meets=not counted)
     # Light is affine in the gain: desired and background are solved side by side, once.
     both = undo([np.hstack(sides) for sides in zip(problem.desired, problem.dark, strict=True)])
-    u, v = (_light(T, [s.x[:, part] for s in both]) for part in (slice(k), slice(k, None)))
+    u, v = (light([s.x[:, side] for s in both]) for side in (slice(k), slice(k, None)))
     gain = gains.exact(u, v, problem.limits) if exactly and loss is None else None
-    if gain is not None:
-        solutions = tuple(_combined(s, gain, k) for s in both)
-        return _Start(gain, _light(T, [s.x for s in solutions]), solutions, meets=True)
-    gain, light = gains.within_loss(problem, loss)
-    return _Start(gain, light, tuple(_combined(s, gain, k) for s in both))
-
-
-def _light(T: Transport, parts: Columns) -> Columns:
-    """Projector light, one array a system, of one direct component a channel."""
-    return T.join(T.to_light(parts))
+    if meets := gain is not None:
+        nearest = [gain * slope - shift for slope, shift in zip(u, v, strict=True)]
+    else:
+        gain, nearest = gains.within_loss(problem, loss)
+    return _Start(gain, nearest, tuple(_combined(s, gain, k) for s in both), meets)
 
 
 def _combined(both: Solution, gain: float, k: int) -> Solution:
@@ -298,7 +297,7 @@ def _result(
     limited: list[Bounded | None],
 ) -> Compensation:
     target = problem.scaled(start.gain)
-    solved = tuple(found for found in limited if found is not None)
+    solved = tuple(solution for solution in limited if solution is not None)
     solutions, frames = start.solutions or solved, shape.frames or 1
     frame_clipped = _clipped(light, start.light, limited, problem.limits, frames)
     clipped = float(np.mean(frame_clipped))
@@ -308,14 +307,13 @@ def _result(
         seen = [T_p.get() for T_p in queued]
         if not problem.is_dark:
             seen = [T_p + dark for T_p, dark in zip(seen, problem.dark, strict=True)]
-        missing = [wanted - found for wanted, found in zip(target, seen, strict=True)]
+        missing = [d - c for d, c in zip(target, seen, strict=True)]
     else:  # the light of the solve as it is, whose residual is what is missing
         missing = T.join(missing)
-        seen = [wanted - left for wanted, left in zip(target, missing, strict=True)]
-    sizes, errors = (problem.norms(parts, frames) for parts in (target, missing))
-    size, error = (float(np.linalg.norm(norms)) for norms in (sizes, errors))
-    size = size or 1.0
-    least = np.sqrt(sum(float(np.sum(np.square(found.least / problem.unit))) for found in solved))
+        seen = [d - r for d, r in zip(target, missing, strict=True)]
+    sizes, errors = (problem.norms(columns, frames) for columns in (target, missing))
+    size, error = float(np.linalg.norm(sizes)) or 1.0, float(np.linalg.norm(errors))
+    least = np.linalg.norm([np.linalg.norm(solution.least / problem.unit) for solution in solved])
 
     def picture(columns: Columns, grid: tuple[int, int]) -> np.ndarray:
         return shape.pack(T.split(columns), grid).astype(np.float32, copy=False)
@@ -344,24 +342,24 @@ def _clipped(
     light: Columns, free: Columns, limited: list[Bounded | None], limits: Limits, frames: int
 ) -> np.ndarray:
     """Share of values at a bound that want to go beyond it, (frames,), of pixels that are lit."""
-    shares = []
-    for p, without, solution in zip(light, free, limited, strict=True):
-        held = limits.exceeded(without) if solution is None else solution.held & limits.touched(p)
-        if held is None:
-            shares.append(np.zeros(frames))
-            continue
-        lit = held[~limits.masked]
-        shares.append(lit.reshape(len(lit), frames, -1).mean(axis=(0, 2)))
-    return np.mean(shares, axis=0)
+    shares = np.zeros(frames)
+    for p, unlimited, solution in zip(light, free, limited, strict=True):
+        if solution is None:
+            beyond = limits.exceeded(unlimited)
+        else:
+            beyond = solution.held & ((p <= limits.low) | (p >= limits.high))
+        if beyond is not None:
+            lit = beyond[~limits.masked]
+            shares += lit.reshape(len(lit), frames, -1).mean(axis=(0, 2))
+    return shares / len(light)
 
 
 def _beyond(problem: Problem, missing: Columns, target: Columns) -> Columns:
     """What is missing, without what the tolerance of a solve explains."""
-    counted = zip(missing, problem.weighted(missing), problem.weighted(target), strict=True)
     rtol, atol = problem.rules["rtol"], problem.rules["atol"]
     beyond = []
-    for part, wrong, wanted in counted:
-        norms = np.sqrt(np.einsum("mk,mk->k", wanted, wanted, dtype=np.float64))
-        allowed = np.maximum(rtol * norms, atol) / np.sqrt(len(part))
-        beyond.append(np.where(np.abs(wrong) > _EXPLAINED * allowed, part, 0.0))
+    for r, wr, wd in zip(missing, problem.weighted(missing), problem.weighted(target), strict=True):
+        norms = np.sqrt(np.einsum("mk,mk->k", wd, wd, dtype=np.float64))
+        allowed = np.maximum(rtol * norms, atol) / np.sqrt(len(r))
+        beyond.append(np.where(np.abs(wr) > _EXPLAINED * allowed, r, 0.0))
     return beyond

@@ -4,19 +4,17 @@
 Exactly: the light without bounds is affine in the gain, p = gain u - v with T u = desired and T v =
 background, so that each pixel allows an interval of gains.
 
-Up to a loss: with C the pictures T p + background of all p within the bounds, which is convex, and W d the
-weighted desired picture,
+Up to a loss: with C the pictures T p + background of all p within the bounds, which is convex,
 
     h(gain) = min over c in C of ||W (gain d - c)|| - loss ||gain W d||
 
-is convex in the gain, so that the gains with h <= 0 are an interval. Its upper end is held between two
-numbers. Every c comes within the loss at gains of its own, where a quadratic is at most 0: the largest of
-these is in reach. Every solve at a gain has a certificate, and with it a tangent below h: its zero cannot be
-passed, and is where Newton's method goes on. Where such a tangent has no zero, h has none.
+is convex in the gain, so that the gains with h <= 0 are an interval. Its upper end is enclosed: every c is
+within the loss at gains where a quadratic is at most 0, and the largest of these is in reach; every solve has
+a certificate, and with it a tangent below h, whose zero cannot be passed and is the next gain (Newton).
 
-A certificate may take thousands of products where T has fewer rows than columns, or small singular values.
-So a system of few numbers is solved on the host, exactly, by active sets (Stark and Parker, Bounded-variable
-least squares, Computational Statistics 10, 1995); a large one in a limited number of steps.
+A certificate may take thousands of products where T has fewer rows than columns, or small singular values:
+systems of few numbers are solved on the host by active sets (Stark and Parker, Bounded-variable least
+squares, Computational Statistics 10, 1995), large ones in a limited number of steps.
 """
 
 from __future__ import annotations
@@ -67,12 +65,7 @@ class Trial:
 
 
 def exact(u: Columns, v: Columns, limits: Limits) -> float | None:
-    """The largest gain with low <= gain u - v <= high at all pixels that are lit; None where there is none.
-
-    >>> limits = Limits(0.0, 1.0, np.array([False, False, True]))
-    >>> exact([np.array([[0.5], [-0.1], [9.0]])], [np.array([[0.0], [-0.1], [0.0]])], limits)
-    1.0
-    """
+    """The largest gain with low <= gain u - v <= high at all pixels that are lit; None if there is none."""
     least, most = 0.0, np.inf
     for slope, shift in zip(u, v, strict=True):
         constant = (slope == 0.0) | limits.masked[:, None]
@@ -86,13 +79,7 @@ def exact(u: Columns, v: Columns, limits: Limits) -> float | None:
 
 
 def within_loss(problem: Problem, loss: float | None) -> tuple[float, Columns]:
-    """The largest gain within `loss`, or where that is None within the least that can be; its light.
-
-    Raises
-    ------
-    InputError
-        No gain is.
-    """
+    """The largest gain within `loss`, or where that is None within the least that can be; its light."""
     search = Search(problem)
     if loss is not None:
         return search.largest(loss)
@@ -105,11 +92,11 @@ class Search:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self.size = problem.norm(problem.desired)
+        self.size = float(problem.norms(problem.desired, 1)[0])
         if self.size == 0.0:
-            everywhere = not any(part.any() for part in problem.desired)
-            where = "everywhere" if everywhere else "wherever weights are above 0"
-            raise InputError(f"gain is 'auto', but desired is 0 {where}: no gain is too large for that")
+            raise InputError(
+                "gain is 'auto', but desired is 0 everywhere that weights count: no gain is too large"
+            )
         self.on_host = all(np.prod(system.A.shape) <= _ON_HOST for system in problem.systems)
         self.A: list[Any] = [system.A.to_dense() if self.on_host else system.A for system in problem.systems]
 
@@ -150,27 +137,24 @@ class Search:
     def closest(self, enough: float = 0.0) -> Trial:
         """The light with the least `sine`, to `TOLERANCE` of it, or one within `enough`.
 
-        In t = 1 / gain the least error is convex: the tangents of all trials bound it from below, and where
-        that bound is lowest is the next one. Gains below half of the least tried are not looked at.
+        In t = 1 / gain the least error is convex: the next trial is where the tangents of those before are
+        lowest, at most at twice the largest t.
         """
         first, light = self._from_above(0.0)
         enough = max(enough, _FLOOR)
         lines: list[tuple[float, float]] = []
-        t, farthest, bound, best = 1.0, 1.0, 0.0, None
+        t, farthest, bound, trials = 1.0, 1.0, 0.0, list[Trial]()
         for _ in range(_STEPS):
-            sine = 1.0 if best is None else best.sine
+            sine = min((trial.sine for trial in trials), default=1.0)
+            if trials and sine <= max(enough, (1.0 + TOLERANCE) * bound):
+                break
             accuracy = max(_COARSE * (sine - bound), TOLERANCE / 4 * max(sine, enough))
-            trial = self._nearest(first / t, light, accuracy)
-            light = trial.light
-            lines.append((trial.slope, (trial.least - trial.slope) / t))
-            if best is None or trial.sine < best.sine:
-                best = trial
+            trials.append(self._nearest(first / t, light, accuracy))
+            light = trials[-1].light
+            lines.append((trials[-1].slope, (trials[-1].least - trials[-1].slope) / t))
             farthest = max(farthest, t)
             t, bound = _lowest(lines, 2 * farthest)
-            if best.sine <= max(enough, (1.0 + TOLERANCE) * bound):
-                break
-        assert best is not None  # noqa: S101 - there are steps
-        return best
+        return min(trials, key=lambda trial: trial.sine)
 
     def _from_above(self, loss: float) -> tuple[float, Columns]:
         """A gain that none with h <= 0 exceeds, and the light in whose picture the most of W d is found.
@@ -187,8 +171,8 @@ class Search:
             reach += float(np.sum(use * best) + np.sum(dark * wwd))
         if reach <= 0.0:
             raise InputError(
-                "gain is 'auto', but no light within the bounds looks more like desired than none does; "
-                "is desired negative, or T?"
+                "gain is 'auto', but no light within the bounds brings the picture nearer to desired than "
+                "darkness does: desired or T is negative"
             )
         return reach / ((1.0 - loss) * self.size**2), light
 
@@ -197,20 +181,21 @@ class Search:
         problem = self.problem
         solves = [self._solve(which, gain, start, accuracy) for which, start in enumerate(light)]
         light = [p for p, *_ in solves]
-        wanted = problem.weighted(problem.desired)
-        missing = problem.weighted(self._residual(gain, light))
+        parts = zip(problem.target(gain), self.A, problem.systems, light, strict=True)
+        missing = problem.weighted([b - A @ (system.scale[:, None] * p) for b, A, system, p in parts])
+        Wd = problem.weighted(problem.desired)
         error = float(np.sqrt(_inner(missing, missing)))
         # Each column has a bound and a slope of its own; these add up with the weights error / norm.
         above = sum(float(np.sum(errors * (errors - least))) for _, errors, least, _ in solves)
-        seen = [gain * part - rest for part, rest in zip(wanted, missing, strict=True)]
-        norm, along = float(np.sqrt(_inner(seen, seen))), _inner(seen, wanted) / self.size**2
-        across = [part - along * whole for part, whole in zip(seen, wanted, strict=True)]
+        Wc = [gain * d - r for d, r in zip(Wd, missing, strict=True)]
+        norm, along = float(np.sqrt(_inner(Wc, Wc))), _inner(Wc, Wd) / self.size**2
+        across = [c - along * d for c, d in zip(Wc, Wd, strict=True)]
         return Trial(
             gain=gain,
             light=light,
             error=error / (gain * self.size),
             least=(error - above / (error or 1.0)) / (gain * self.size),
-            slope=_inner(missing, wanted) / ((error or 1.0) * self.size),
+            slope=_inner(missing, Wd) / ((error or 1.0) * self.size),
             cosine=along * self.size / (norm or 1.0),
             sine=float(np.sqrt(_inner(across, across))) / (norm or 1.0) if along > 0.0 else 1.0,
             size=norm / self.size,
@@ -224,16 +209,11 @@ class Search:
         problem = self.problem
         if self.on_host:
             return *_active_sets(problem, which, gain, self.A[which]), True
-        columns = sum(part.shape[1] for part in problem.desired)
+        columns = sum(d.shape[1] for d in problem.desired)
         rules = {"rtol": 0.0, "atol": accuracy * gain * self.size / np.sqrt(columns), "maxiter": _MAXITER}
-        light, found = problem.nearest(which, gain, start, **rules)
-        settled = found.status is not Status.CONVERGED or not np.any(found.errors)
-        return light, found.errors / problem.unit, found.least / problem.unit, settled
-
-    def _residual(self, gain: float, light: Columns) -> Columns:
-        """gain * desired - dark - T p."""
-        x = [system.to_x(p) for system, p in zip(self.problem.systems, light, strict=True)]
-        return [b - A @ part for b, A, part in zip(self.problem.target(gain), self.A, x, strict=True)]
+        light, solution = problem.nearest(which, gain, start, **rules)
+        settled = solution.status is not Status.CONVERGED or not np.any(solution.errors)
+        return light, solution.errors / problem.unit, solution.least / problem.unit, settled
 
 
 def _active_sets(

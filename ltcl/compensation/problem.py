@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compensation as least squares: min ||w (A x - b)||, x = scale * p within the projector's bounds.
 
-Arguments of `compensate` are checked here before anything is uploaded; pictures become (M, k) a channel.
-Where T = S F, A is S and the scale F, the first bounce: columns near 1, so that few products are needed.
-Elsewhere the columns of T are brought to norm 1. Colour channels are one system each, or all of them one
-where T couples them: then (3 N, k) arrays hold channel below channel, as `Transport.join` puts them.
+Where T = S F, A is S and the scale F: columns near 1, so that few products are needed. Elsewhere the columns
+of T are brought to norm 1. Colour channels are one system each, or all of them one where T couples them: then
+(3 N, k) arrays hold channel below channel, as `Transport.join` puts them.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import logging
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -23,9 +22,8 @@ from ltcl import checks, layout
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator, ScaledColumns, as_operator
-from ltcl.solvers import monte_carlo
 from ltcl.solvers.bounded import Bounded, minimise
-from ltcl.solvers.solve import KINDS, METHODS, SAMPLED
+from ltcl.solvers.solve import KINDS, METHODS
 from ltcl.transport import Transport
 
 logger = logging.getLogger(__name__)
@@ -34,27 +32,17 @@ _OWN = ("bounds", "background", "gain", "loss", "weights", "exact", "inverse", "
 _OPTIONS = ("atol", "maxiter", "callback", "throw")  # of `ltcl.solve`, that a solve within bounds has, too
 _LEAST_LOSS = 1e-6  # a relative error that float32 resolves
 _FAR = 4.0  # times the brightest pixel that was reached: the units of desired are not those of T
-_UNITS = "it is taken as linear radiance in the units of T: use ltcl.images.read, or divide"
+_PICTURES = 1e-30, 1e38  # brightest pixels; from 1e-38 on float32 has all digits, and some devices any
 _PROBES = 16  # of the norms of columns that cannot be read: within a factor of 2, which is enough
 _SLACK = 1e-6  # of the width of the bounds: rounding beyond a bound counts as inside
 Columns = list[np.ndarray]  # (M, k) or (N, k) of each system
 
 
-@dataclass(frozen=True, eq=False)
-class System:
-    """A, (M, N), and the scale (N,) float64 of its unknowns; 0 where a projector pixel lights nothing."""
+class System(NamedTuple):
+    """A, (M, N), of the unknowns x = scale * light; scale, (N,), is 0 where a pixel lights nothing."""
 
     A: Operator
     scale: np.ndarray
-
-    def to_x(self, light: np.ndarray) -> np.ndarray:
-        """x of projector light, (N, k)."""
-        return self.scale[:, None] * light
-
-    def to_light(self, x: np.ndarray) -> np.ndarray:
-        """Projector light of x, (N, k) float64; 0 where it lights nothing."""
-        scale = self.scale[:, None]
-        return np.divide(x, scale, out=np.zeros(x.shape), where=scale > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +59,7 @@ class Limits:
         low, high = (np.float32(bound) for bound in bounds)
         low = np.nextafter(low, np.float32(np.inf)) if float(low) < bounds[0] else low
         high = np.nextafter(high, np.float32(-np.inf)) if float(high) > bounds[1] else high
-        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        if not -np.inf < low < high < np.inf:
             raise InputError(f"bounds is {bounds}; there must be two numbers of float32 within")
         return cls(float(low), float(high), masked)
 
@@ -81,10 +69,6 @@ class Limits:
             light = np.clip(light.astype(np.float32), np.float32(self.low), np.float32(self.high))
         light[self.masked] = 0.0
         return light
-
-    def touched(self, light: np.ndarray) -> np.ndarray:
-        """Where light within the bounds is at one of them."""
-        return (light <= self.low) | (light >= self.high)
 
     def exceeded(self, light: np.ndarray) -> np.ndarray | None:
         """Where light is outside by more than rounding; None where it is nowhere."""
@@ -112,48 +96,43 @@ class Problem:
     @cached_property
     def is_dark(self) -> bool:
         """Whether there is no light but the projector's; one number for all pixels is looked at once."""
-        return not any(part[: 1 if part.strides[0] == 0 else None].any() for part in self.dark)
+        return not any(dark[: 1 if dark.strides[0] == 0 else None].any() for dark in self.dark)
 
-    def weighted(self, parts: Columns) -> Columns:
-        """w times each part."""
-        return parts if self.weights is None else [w * p for w, p in zip(self.weights, parts, strict=True)]
+    def weighted(self, pictures: Columns) -> Columns:
+        """w times each picture."""
+        if self.weights is None:
+            return pictures
+        return [w * c for w, c in zip(self.weights, pictures, strict=True)]
 
-    def norm(self, parts: Columns) -> float:
-        """Of all parts together, weighted."""
-        return float(np.linalg.norm(self.norms(parts, 1)))
-
-    def norms(self, parts: Columns, frames: int) -> np.ndarray:
-        """The same of each frame, (frames,); its columns, one a colour, stand side by side."""
+    def norms(self, pictures: Columns, frames: int) -> np.ndarray:
+        """Of all channels of each frame together, weighted, (frames,); frames side by side."""
         squares = np.zeros(frames)
-        for part in self.weighted(parts):
-            values = part.reshape(len(part), frames, -1)  # (M, frames, colours)
+        for picture in self.weighted(pictures):
+            values = picture.reshape(len(picture), frames, -1)  # (M, frames, colours)
             squares += np.einsum("mfc,mfc->f", values, values, dtype=np.float64)
         return np.sqrt(squares)
 
     def scaled(self, gain: float) -> Columns:
         """gain * desired."""
-        return self.desired if gain == 1.0 else [gain * part for part in self.desired]
+        return self.desired if gain == 1.0 else [gain * d for d in self.desired]
 
     def target(self, gain: float) -> Columns:
         """gain * desired - dark: what the projector has to add."""
         if self.is_dark:
             return self.scaled(gain)
-        return [wanted - dark for wanted, dark in zip(self.scaled(gain), self.dark, strict=True)]
+        return [d - dark for d, dark in zip(self.scaled(gain), self.dark, strict=True)]
 
     def nearest(self, which: int, gain: float, start: np.ndarray, **rules: Any) -> tuple[np.ndarray, Bounded]:
-        """The light (N, k) of one system within the limits that comes nearest to the target.
-
-        Where a gain is searched for, the solve counts the products of all before it.
-        """
-        system, limits = self.systems[which], self.limits
-        scale = np.where(limits.masked, 0.0, system.scale)
-        lower, upper = ((scale * bound).astype(np.float32) for bound in (limits.low, limits.high))
+        """The light (N, k) of one system within the limits nearest to the target; products add up."""
+        (A, scale), limits = self.systems[which], self.limits
+        free = np.where(limits.masked, 0.0, scale)[:, None]
+        lower, upper = ((free * bound).astype(np.float32) for bound in (limits.low, limits.high))
         solution = minimise(
-            system.A,
+            A,
             self.target(gain)[which],
-            lower,
-            upper,
-            system.to_x(start),
+            lower[:, 0],
+            upper[:, 0],
+            scale[:, None] * start,
             weights=None if self.weights is None else self.weights[which],
             **{**self.rules, **rules},
         )
@@ -164,9 +143,11 @@ class Problem:
             errors=solution.errors * self.unit,
             least=solution.least * self.unit,
         )
-        light = system.to_light(solution.x)  # rounded; what is at a bound is to stay there
-        light = np.where(solution.x <= lower[:, None], limits.low, light)
-        light = np.where(solution.x >= upper[:, None], np.where(scale > 0, limits.high, 0.0)[:, None], light)
+        x = solution.x
+        light = np.divide(x, free, out=np.zeros(x.shape), where=free > 0)
+        # Rounded: what is at a bound is to stay there.
+        light = np.where(x <= lower, limits.low, light)
+        light = np.where(x >= upper, np.where(free > 0, limits.high, 0.0), light)
         return limits.clip(light), solution
 
 
@@ -174,22 +155,15 @@ def systems(T: Transport) -> tuple[System, ...]:
     """The systems of T, uploaded here if they were not yet."""
     if T.is_square and not T.couples:
         F = np.atleast_2d(T.first_bounce)
-        return tuple(System(S, f) for S, f in zip(T.systems, F, strict=True))
-    if not T.couples:
-        pairs = zip(T.matrices, T.operators, strict=True)
-        return tuple(_normalised(A, _squared_columns(matrix, A.device)) for matrix, A in pairs)
-    (A,) = T.operators
-    if T.blocks is not None:
-        squares = [[_squared_columns(block, A.device) for block in row] for row in T.blocks]
-        return (_normalised(A, np.sum(squares, axis=0).ravel()),)
-    squares = np.stack([_squared_columns(matrix, A.device) for matrix in T.matrices])
-    mixing = np.eye(3) if T.mixing is None else T.mixing
-    return (_normalised(A, (np.square(mixing).T @ squares).ravel()),)
-
-
-def _normalised(A: Operator, squares: np.ndarray) -> System:
-    norms = np.sqrt(squares)
-    return System(ScaledColumns(A, np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0)), norms)
+        return tuple(map(System, T.systems, F))
+    rows = [T.matrices] if T.blocks is None else T.blocks
+    squares = np.sum([[_squared_columns(matrix, T.device) for matrix in row] for row in rows], axis=0)
+    if T.mixing is not None:
+        squares = np.square(T.mixing).T @ squares
+    norms = np.sqrt(squares.reshape(len(T.operators), -1))  # of one system where colours mix
+    inverses = np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0)
+    scaled = map(ScaledColumns, T.operators, inverses)
+    return tuple(map(System, scaled, norms))
 
 
 def _squared_columns(matrix: Any, device: Device) -> np.ndarray:
@@ -208,85 +182,65 @@ def _squared_columns(matrix: Any, device: Device) -> np.ndarray:
     return np.mean(np.square(A.T @ signs, dtype=np.float64), axis=1)
 
 
-def bounds(value: Any) -> tuple[float, float]:
-    """(low, high), finite and in this order."""
-    try:
-        low, high = value
-    except (TypeError, ValueError):
-        raise InputError(f"bounds is {_shown(value)}; it must be (low, high)") from None
-    for place, bound in enumerate((low, high)):
-        if np.ndim(bound):
-            raise InputError(
-                f"bounds[{place}] is {_shown(bound)}; it must be one number, the same for all pixels"
-            )
-    low = checks.number("bounds[0]", low)
-    return low, checks.number("bounds[1]", high, above=low)
-
-
 def gain(value: Any, loss: Any) -> float | None:
     """The gain, None of "auto"; a loss is checked, too."""
-    if isinstance(value, str) and value == "auto":
-        if loss is not None and checks.number("loss", loss, above=0.0, below=1.0) < _LEAST_LOSS:
-            raise InputError(f"loss is {loss!r}; in float32 it must be at least {_LEAST_LOSS:g}")
-        return None
-    try:
-        number = None if np.ndim(value) else checks.number("gain", value, above=0.0)
-    except InputError:
-        number = None
-    if number is None:
-        raise InputError(f"gain is {_shown(value)}; it must be 'auto' or a finite number above 0")
+    if not isinstance(value, str):
+        number = checks.number("gain", value, above=0.0)
+        if loss is not None:
+            raise InputError(f"loss is {loss!r}, but gain is {value!r}; a loss belongs to gain='auto' only")
+        return number
+    if value != "auto":
+        raise InputError(f"gain is {value!r}; it must be 'auto' or a finite number above 0")
     if loss is not None:
-        raise InputError(f"loss is {loss!r}, but gain is {value!r}; a loss belongs to gain='auto' only")
-    return number
+        checks.number("loss", loss, least=_LEAST_LOSS, below=1.0)
+    return None
 
 
-def clamp(value: Any, T: Transport) -> None:
-    """Refuse what is no yes or no, and a T whose light is found by a solve within the bounds only."""
-    if not isinstance(value, bool):
-        raise InputTypeError(f"clamp is {_shown(value)}; it must be True or False")
-    if value and not T.is_square:
-        raise InputError("clamp is True, but this T has no S; its light is found within the bounds only")
-
-
-def desired(value: Any, T: Transport) -> tuple[Columns, layout.Layout]:
-    """Of every channel; a warning where it looks like a picture that was not decoded."""
-    array = checks.real("desired", value)
-    if array.dtype.kind in "iu" and array.size and array.max() > 1:
-        logger.warning("desired holds %s, up to %d; %s", array.dtype, array.max(), _UNITS)
-    if array.dtype not in (np.float32, np.float64):
-        array = array.astype(np.float64)
-    return layout.unpack("desired", array, T.camera_grid, T.channels)
+def check_range(problem: Problem, gain: float) -> None:
+    """Refuse pictures that float32 does not resolve, or does not hold."""
+    light = max(abs(problem.limits.low), abs(problem.limits.high))
+    column = max(float(scale.max()) for _, scale in problem.systems)
+    pictures = {
+        "T reaches": column,
+        "desired reaches": gain * max(float(np.abs(d).max()) for d in problem.desired),
+        f"light of {light:.3g}, as bounds allow it, makes": light * column,
+    }
+    least, most = _PICTURES
+    for what, brightest in pictures.items():
+        if 0.0 < brightest < least or brightest > most:
+            raise InputError(
+                f"{what} {brightest:.3g}; it must be from {least:g} to {most:g}: scale T, desired or bounds"
+            )
 
 
 def warn_of_units(value: Any, target: float, appearance: float) -> None:
     """A warning where the largest value of the target is far beyond that of the best appearance."""
     if target > _FAR * appearance and np.asarray(value).dtype.kind == "f":
-        logger.warning("desired reaches %.3g, the scene %.3g at most; %s", target, appearance, _UNITS)
+        units = layout.UNITS % 255
+        logger.warning("desired reaches %.3g, the scene %.3g at most; %s", target, appearance, units)
 
 
 def background(value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Columns:
     """Of every channel: none, one number, one for all frames, or one per frame."""
     if value is None or np.ndim(value) == 0:
         level = np.float32(0) if value is None else checks.number("background", value)
-        return [np.broadcast_to(level, part.shape) for part in like]
+        return [np.broadcast_to(level, d.shape) for d in like]
     return _alike("background", value, T, shape, like)
 
 
 def weights(value: Any, T: Transport, shape: layout.Layout, like: Columns) -> tuple[Columns | None, float]:
-    """Of every channel, in units of a power of two near the largest; no weights where all pixels count alike.
-
-    In these units their squares stay far inside float64.
-    """
+    """Of every channel, in a unit that keeps their squares inside float64; None where all are alike."""
     if value is None:
         if not T.masked.any():
             return None, 1.0
-        return [np.broadcast_to(~T.masked[:, None], part.shape).astype(np.float64) for part in like], 1.0
-    counts = _alike("weights", value, T, shape, like)
-    least, most = min(float(part.min()) for part in counts), max(float(part.max()) for part in counts)
+        return [np.broadcast_to(~T.masked[:, None], d.shape).astype(np.float64) for d in like], 1.0
+    value = checks.real("weights", value).astype(np.float64, copy=False)
+    channels = _alike("weights", value, T, shape, like)
+    least, most = min(float(w.min()) for w in channels), max(float(w.max()) for w in channels)
     if least < 0.0 or most == 0.0:
         raise InputError(f"weights range from {least:.3g} to {most:.3g}; they must be at least 0, not all 0")
     unit = float(np.ldexp(1.0, int(np.frexp(most)[1]) - 1))
-    return [part / unit for part in counts], unit
+    return [w / unit for w in channels], unit
 
 
 def rules(T: Transport, method: str, rtol: float, options: dict[str, Any]) -> dict[str, Any]:
@@ -294,31 +248,26 @@ def rules(T: Transport, method: str, rtol: float, options: dict[str, Any]) -> di
     checks.one_of("method", method, METHODS)
     if not T.is_square and method != "auto":
         raise InputError(f"method is {method!r}, but this T has no S for it to solve; it must be 'auto'")
-    if options:
-        monte_carlo.check_whole(options)
-        monte_carlo.check_method(method, options, SAMPLED)
-    known = list(_OPTIONS)
-    if T.is_square:
-        kind = KINDS.get(method)
-        known += ["x0", *(field.name for field in (dataclasses.fields(kind) if kind else ()))]
+    own = dataclasses.fields(KINDS[method]) if method != "auto" else ()
+    known = [*_OPTIONS, *(["x0"] if T.is_square else []), *(field.name for field in own)]
     for name in options:
-        if name not in known:
-            raise InputTypeError(f"unknown option {name!r}; compensate has {', '.join([*_OWN, *known])}")
+        if name in known and name != "pixels":  # a picture needs all of them
+            continue
+        others = [key for key, kind in KINDS.items() if name in (f.name for f in dataclasses.fields(kind))]
+        if others and name != "pixels":
+            others = " and ".join(map(repr, others))
+            raise InputTypeError(f"{name} is an option of method={others}, but method is {method!r}")
+        has = ", ".join([*_OWN, *known])
+        raise InputTypeError(f"unknown option {name!r}; compensate with method {method!r} has {has}")
     rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
     atol = checks.number("atol", options.get("atol", 0.0), least=0.0)
     if rtol == 0.0 and atol == 0.0:
-        raise InputError("rtol and atol are both 0; one of them must be positive")
+        also = " where atol is 0" if "atol" in options else ""
+        raise InputError(f"rtol is 0; it must be above 0 and below 1{also}")
     checked = {"rtol": rtol, "atol": atol, "callback": options.get("callback")}
     if options.get("maxiter") is not None:
         checked["maxiter"] = checks.count("maxiter", options["maxiter"])
     return checked
-
-
-def _shown(value: Any) -> str:
-    """A value in one line; of arrays the shape."""
-    if isinstance(value, (tuple, list)) and any(np.ndim(part) for part in value):
-        return f"a {type(value).__name__} of {len(value)} arrays"
-    return f"an array of shape {np.shape(value)}" if isinstance(value, np.ndarray) else repr(value)
 
 
 def _alike(name: str, value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Columns:

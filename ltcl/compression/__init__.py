@@ -4,18 +4,15 @@
 from __future__ import annotations
 
 from ltcl.compression.bases import INVERSE_NAMES
-from ltcl.compression.compress import compress
+from ltcl.compression.compress import ChannelCompression, Compression, Trial, compress
 from ltcl.compression.invert import invert
 from ltcl.compression.norms import inverse_norm
-from ltcl.compression.result import ChannelCompression, Compression, Trial
-from ltcl.compression.sources import RowSource
 from ltcl.compression.sparse_inverse import SparseInverse, invert_coefficients
 
 __all__ = [
     "INVERSE_NAMES",
     "ChannelCompression",
     "Compression",
-    "RowSource",
     "SparseInverse",
     "Trial",
     "compress",

@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is compressed: R of every channel, by its rows, a block at a time, and by products on a device.
-
-Rows come from arrays and memory-mapped files, sparse matrices, whatever is sliced as HDF5 and zarr arrays
-are, operators (by transposed products), and anything that has `shape` and `rows(start, stop)`. The whole
-matrix need never be in memory.
-"""
+"""What is compressed: R of every channel by its rows, a block at a time, and by products on a device."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -29,32 +25,12 @@ _BLOCK = 1 << 27  # bytes of a block unless `memory` says otherwise
 _MOST = 512  # rows at once: more do not help
 
 
-@runtime_checkable
-class RowSource(Protocol):
-    """A matrix (M, N) that gives its rows start .. stop - 1 as (stop - start, N) real numbers."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(M, N)."""
-        ...
-
-    def rows(self, start: int, stop: int) -> np.ndarray:
-        """Rows start .. stop - 1, (stop - start, N)."""
-        ...
-
-
 class Rows(scipy.sparse.linalg.LinearOperator):
     """A matrix (M, N) by a function that reads its rows; products read all of them, on the host."""
 
-    def __init__(
-        self, shape: tuple[int, int], read: Callable[[int, int], np.ndarray], memory: int | None
-    ) -> None:
+    def __init__(self, shape: tuple[int, int], rows: Callable[..., np.ndarray], memory: int | None) -> None:
         super().__init__(np.float64, shape)
-        self._read, self.memory = read, memory
-
-    def rows(self, start: int, stop: int) -> np.ndarray:
-        """Rows start .. stop - 1."""
-        return self._read(start, stop)
+        self.rows, self.memory = rows, memory
 
     def blocks(self, dtype: type = np.float32) -> Iterator[tuple[slice, np.ndarray]]:
         """All rows in blocks that fit into `memory`."""
@@ -77,40 +53,40 @@ class Rows(scipy.sparse.linalg.LinearOperator):
 
 
 def source(name: str, matrix: Any, memory: int | None = None) -> Rows:
-    """`matrix` by its rows, in blocks of `memory` bytes, which are checked as they are read."""
+    """`matrix` by its rows, in blocks of `memory` bytes, which are checked as they are read.
+
+    It is sparse, sliced as arrays, memory-mapped files, HDF5 and zarr arrays are, has ``rows(start, stop)``,
+    or is an operator, by products with its transpose.
+    """
     if np.size(getattr(matrix, "shape", (0, 0))) != 2:
         raise InputError(f"{name} has shape {matrix.shape}; it must be (M, N)")
-    if scipy.sparse.issparse(matrix):
-        csr: Any = checks.csr(name, matrix)
-        read = lambda start, stop: csr[start:stop].toarray()  # noqa: E731
-    elif isinstance(matrix, RowSource):
-        read = matrix.rows
-    elif hasattr(matrix, "matvec"):
-        read = lambda start, stop: _by_products(name, matrix, start, stop)  # noqa: E731
-    elif hasattr(matrix, "shape") and hasattr(matrix, "__getitem__"):
-        read = lambda start, stop: matrix[start:stop]  # noqa: E731
-    else:
-        raise InputTypeError(
-            f"{name} is a {type(matrix).__name__}; it must be an array, sparse, an operator, or have "
-            "shape and rows(start, stop)"
-        )
-    rows, columns = matrix.shape
+    csr: Any = checks.csr(name, matrix) if scipy.sparse.issparse(matrix) else None
+
+    def read(start: int, stop: int) -> Any:
+        if csr is not None:
+            return csr[start:stop].toarray()
+        if hasattr(matrix, "rows"):
+            return matrix.rows(start, stop)
+        if not hasattr(matrix, "matvec"):
+            return matrix[start:stop]
+        units = np.zeros((matrix.shape[0], stop - start), np.float32)
+        units[np.arange(start, stop), np.arange(stop - start)] = 1.0
+        try:
+            return np.ascontiguousarray(matrix.rmatmat(units).T)
+        except (NotImplementedError, TypeError) as error:  # what SciPy raises, by its version
+            raise InputError(f"{name} is a {type(matrix).__name__} without rmatvec or rows") from error
 
     def validated(start: int, stop: int) -> np.ndarray:
         block = checks.real(f"{name} in rows {start} to {stop - 1}", read(start, stop))
         return checks.shape(f"{name} in rows {start} to {stop - 1}", block, (stop - start, columns))
 
+    if not hasattr(matrix, "shape") or not any(hasattr(matrix, a) for a in ("__getitem__", "rows", "matvec")):
+        raise InputTypeError(
+            f"{name} is a {type(matrix).__name__}; it must be an array, sparse, an operator, or have "
+            "shape and rows(start, stop)"
+        )
+    rows, columns = matrix.shape
     return Rows((rows, columns), validated, memory)
-
-
-def _by_products(name: str, operator: Any, start: int, stop: int) -> np.ndarray:
-    units = np.zeros((operator.shape[0], stop - start), np.float32)
-    units[np.arange(start, stop), np.arange(stop - start)] = 1.0
-    try:
-        return np.ascontiguousarray(operator.rmatmat(units).T)
-    except (NotImplementedError, TypeError) as error:  # what SciPy raises, by its version
-        kind = type(operator).__name__
-        raise InputError(f"{name} is a {kind} without rmatvec; its rows cannot be had") from error
 
 
 def interreflection(T: Rows, F: np.ndarray) -> Rows:
@@ -135,22 +111,15 @@ class Problem:
     operator: Operator
     grid: tuple[int, int]
 
-    @property
-    def pixels(self) -> int:
-        """N."""
-        return self.R.shape[0]
-
     def window(self) -> Problem:
         """R between the pixels in the middle of the picture; itself where these are all."""
         h, w = window_of(self.grid)
-        if h * w == self.pixels:
+        if h * w == self.R.shape[0]:
             return self
         top, left = (self.grid[0] - h) // 2, (self.grid[1] - w) // 2
         firsts = np.arange(top, top + h) * self.grid[1] + left  # of each row of the window
         pixels = np.add.outer(firsts, np.arange(w)).ravel()
-        R = np.empty((h * w, h * w), np.float32)
-        for row, first in enumerate(firsts.tolist()):
-            R[row * w : (row + 1) * w] = self.R.rows(first, first + w)[:, pixels]
+        R = np.concatenate([self.R.rows(first, first + w)[:, pixels] for first in firsts.tolist()])
         return Problem(source("R", R, self.R.memory), Dense(self.operator.device, R), (h, w))
 
 
@@ -183,53 +152,47 @@ def validate_inputs(
         for name, value in {"grid": grid, "first_bounce": first_bounce, "device": device}.items():
             if value is not None:
                 raise InputError(f"{name} is given, but T is a Transport, which has its own; leave it out")
-        return _of_transport(T, memory)
-    parts = list(T) if isinstance(T, (list, tuple)) else [T]
-    if len(parts) not in (1, 3):
-        raise InputError(f"T has {len(parts)} channels; it must be one, or three for RGB")
+        require(T)
+        if T.error > 0.0:
+            raise InputError(f"T is compressed already, with an error of {T.error:.2g}; compress its origin")
+        return of_transport(T, memory)
+    matrices = list(T) if isinstance(T, (list, tuple)) else [T]
+    if len(matrices) not in (1, 3):
+        raise InputError(f"T has {len(matrices)} channels; it must be one, or three for RGB")
     if grid is None:
         raise InputError("grid is None, but T is no Transport; it must be (h, w), the projector's pixels")
-    if all(hasattr(part, "matvec") and not isinstance(part, RowSource) for part in parts):
+    if all(hasattr(matrix, "matvec") and not hasattr(matrix, "rows") for matrix in matrices):
         F = "diagonal" if first_bounce is None else first_bounce
-        return _of_transport(Transport(T, grid, F, device=device), memory)
-    rows = [source("T", part, memory) for part in parts]
+        return validate_inputs(Transport(T, grid, F, device=device), memory=memory)
+    rows = [source("T", matrix, memory) for matrix in matrices]
     n = rows[0].shape[0]
-    for part in rows:
-        if part.shape != (n, n):
-            raise InputError(f"T has shape {part.shape}; it must be square, (N, N), to have an S")
-        part.rows(0, 1)  # of rows that end with the matrix nobody sees that one too many was given
+    for channel in rows:
+        if channel.shape != (n, n):
+            raise InputError(f"T has shape {channel.shape}; it must be square, (N, N), to have an S")
+        channel.rows(0, 1)  # of rows that end with the matrix nobody sees that one too many was given
     grid, F = checks.grid("grid", grid, n), _first_bounce(rows, first_bounce)
     device = device if isinstance(device, Device) else open_device(device)
-    R = [interreflection(part, f) for part, f in zip(rows, F, strict=True)]
-    return Inputs([Problem(one, Host(device, one), grid) for one in R], F, grid, _dense(F))
+    R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
+    return Inputs([Problem(one, Host(device, one), grid) for one in R], F, grid, _dense_nbytes(F))
 
 
-def from_products(T: Transport, memory: int | None = None) -> Inputs:
-    """A transport of which products are at hand, compressed in another form already."""
-    problems = [Problem(source("R of T", S.R, memory), S.R, T.grid) for S in T.systems]
-    return Inputs(problems, np.atleast_2d(T.first_bounce), T.grid, T.nbytes, bool(T.masked.any()), T.mixing)
-
-
-def _of_transport(T: Transport, memory: int | None) -> Inputs:
-    require(T)
-    if T.error > 0.0:
-        raise InputError(
-            f"T is compressed already, with an error of {T.error:.2g}; compress what it came from"
-        )
-    if T.is_compressed:  # but exact, as of an adaptive scan
-        return from_products(T, memory)
+def of_transport(T: Transport, memory: int | None = None) -> Inputs:
+    """Rows of R of a square transport: read from T, or products where it is compressed."""
     F = np.atleast_2d(T.first_bounce)
-    R = [interreflection(source("T", part, memory), f) for part, f in zip(T.matrices, F, strict=True)]
+    if T.is_compressed:
+        R = [source("R of T", S.R, memory) for S in T.systems]
+    else:
+        R = [interreflection(source("T", matrix, memory), f) for matrix, f in zip(T.matrices, F, strict=True)]
     try:
-        operators, nbytes = [S.R for S in T.systems], T.nbytes or _dense(F)
-    except MemoryLimitError:  # of the device
-        operators, nbytes = [Host(T.device, one) for one in R], _dense(F)
+        operators, nbytes = [S.R for S in T.systems], T.nbytes or _dense_nbytes(F)
+    except MemoryError:  # of the device, or of the host
+        operators, nbytes = [Host(T.device, one) for one in R], _dense_nbytes(F)
     problems = [Problem(one, product, T.grid) for one, product in zip(R, operators, strict=True)]
     return Inputs(problems, F, T.grid, nbytes, bool(T.masked.any()), T.mixing)
 
 
-def _dense(F: np.ndarray) -> int:
-    """Bytes of T in float32, of its first bounces (channels, N)."""
+def _dense_nbytes(F: np.ndarray) -> int:
+    """Of T in float32, of its first bounces (channels, N)."""
     return 4 * F.size * F.shape[1]
 
 
@@ -237,9 +200,7 @@ def _first_bounce(rows: list[Rows], first_bounce: Any) -> np.ndarray:
     """(channels, N) float64."""
     n = rows[0].shape[0]
     if first_bounce is None:
-        F = np.stack([part.diagonal() for part in rows])
-    elif isinstance(first_bounce, str):
-        raise InputTypeError(f"first_bounce is {first_bounce!r}; of rows it must be an array (N,), or None")
+        F = np.stack([channel.diagonal() for channel in rows])
     else:
         F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce)).astype(np.float64)
         F = np.broadcast_to(checks.shape("first_bounce", F, (n,), (len(rows), n)), (len(rows), n))
@@ -258,10 +219,25 @@ def rows_at_once(values: int, memory: int | None = None) -> int:
     count = min(room // (_PER_VALUE * max(values, 1)), _MOST) // COLUMNS * COLUMNS
     if count == 0:
         raise MemoryLimitError(
-            f"memory is {checks.size(room)}; blocks of {COLUMNS} rows of {values} values need "
-            f"{checks.size(COLUMNS * values * _PER_VALUE)}"
+            f"memory is {checks.size(room)}; it must be at least "
+            f"{checks.size(COLUMNS * values * _PER_VALUE)}, for {COLUMNS} rows of {values} numbers"
         )
     return count
+
+
+@contextlib.contextmanager
+def memory_errors(command: str, T: Any) -> Iterator[None]:
+    """NumPy's MemoryError as one that says what all of R, and as many coefficients, need."""
+    try:
+        yield
+    except MemoryLimitError:
+        raise
+    except MemoryError as error:
+        pixels = getattr(T, "shape", (0, 0))[-1]
+        raise MemoryLimitError(
+            f"{command} needs up to {checks.size(8 * pixels**2)} for {pixels} pixels, more than the host "
+            f"gives: {error}"
+        ) from error
 
 
 def cut(count: int, size: int) -> Iterator[tuple[int, int]]:

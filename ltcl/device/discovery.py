@@ -14,25 +14,23 @@ import sys
 import threading
 import weakref
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from ltcl.device import failures
+from ltcl.device import kernels
 from ltcl.device.device import Device
 from ltcl.errors import DeviceError, InputTypeError
 
 KINDS = ("gpu", "accelerator", "cpu", "simulator")  # the best first
 _FIXES = {
-    "linux": "pip install 'pyopencl[pocl]' (any x86-64 CPU), apt install pocl-opencl-icd (any CPU), "
-    "or your GPU vendor's OpenCL driver",
+    "linux": "pip install 'pyopencl[pocl]' (any x86-64 CPU), apt install pocl-opencl-icd (any CPU), or your "
+    "GPU vendor's OpenCL driver; PoCL needs a folder that it can write, which POCL_CACHE_DIR names",
     "darwin": "macOS brings OpenCL; on newer machines: conda install -c conda-forge pocl",
     "win32": "install the GPU vendor's driver, or Intel's CPU Runtime for OpenCL Applications",
 }
-_HIDING = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")
+_HIDING = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")  # may hide every driver
 
 _opened: weakref.WeakValueDictionary[str, Device] = weakref.WeakValueDictionary()
 _opening = threading.Lock()
-_process: list[int] = []  # the one that first asked OpenCL
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,6 @@ class Description:
     index: str
     name: str
     kind: str
-    platform: str
     driver: str
     compute_units: int
     memory: int
@@ -65,27 +62,23 @@ def list_devices() -> list[Description]:
     >>> all(":" in device.index for device in ltcl.list_devices())
     True
     """
-    if not _process:
-        _process.append(os.getpid())
-    failures.refuse_forked(_process[0])
+    kernels.refuse_forked()
     import pyopencl as cl
 
     # Its caches hold pickles, and where they cannot be written no kernel starts.
     cl._PYOPENCL_NO_CACHE = True
-    kinds = {cl.device_type.GPU: "gpu", cl.device_type.CPU: "cpu"}
-    devices = []
+    kinds, devices = {cl.device_type.GPU: "gpu", cl.device_type.CPU: "cpu"}, []
     with contextlib.suppress(cl.Error):  # the loader calls "no platform" an error
         for p, platform in enumerate(cl.get_platforms()):
+            brand = platform.name.strip()
             with contextlib.suppress(cl.Error):  # DEVICE_NOT_FOUND
                 for d, handle in enumerate(platform.get_devices()):
                     kind = next((name for flag, name in kinds.items() if handle.type & flag), "accelerator")
-                    brand = platform.name.strip()
                     devices.append(
                         Description(
                             index=f"{p}:{d}",
                             name=handle.name.strip(),
                             kind="simulator" if "oclgrind" in brand.lower() else kind,
-                            platform=brand,
                             driver=f"{brand} {handle.driver_version.strip()}",
                             compute_units=handle.max_compute_units,
                             memory=handle.global_mem_size,
@@ -103,7 +96,7 @@ def open_device(select: str | Device | None = None) -> Device:
     ----------
     select : str or Device, optional
         "gpu", "cpu" or "accelerator"; an index "platform:device" as `ltcl devices` prints it; or a part of
-        the name of device, platform or driver. Without it, ``LTCL_DEVICE`` says so, else the best is taken.
+        the name of device or driver. Without it, ``LTCL_DEVICE`` says so, else the best is taken.
 
     Raises
     ------
@@ -120,45 +113,28 @@ def open_device(select: str | Device | None = None) -> Device:
         return select
     if not isinstance(select, str | None):
         raise InputTypeError(f"device is {select!r}; it must be a Device, a name or an index like '0:1'")
-    description = choose(list_devices(), select or os.environ.get("LTCL_DEVICE") or None)
+    description = choose(list_devices(), select or os.environ.get("LTCL_DEVICE"))
     with _opening:
-        device = _opened.get(description.index)
-        if device is None:
-            device = _opened[description.index] = Device(description)
-        return device
+        device = _opened.get(description.index) or Device(description)
+        return _opened.setdefault(description.index, device)
 
 
 def choose(devices: list[Description], select: str | None) -> Description:
     """The one of `devices`, best first, that `select` means."""
     fix = f"install a driver: {_FIXES.get(sys.platform, _FIXES['linux'])}"
     if not devices:
-        unset = f"unset {' and '.join(suspects())}, or " if suspects() else ""
-        raise DeviceError(f"no OpenCL device was found; {unset}{_pocl_advice()}{fix}")
+        set_by_user = [f"{name}={os.environ[name]}" for name in _HIDING if os.environ.get(name)]
+        unset = f"unset {' and '.join(set_by_user)}, or " if set_by_user else ""
+        raise DeviceError(f"no OpenCL device was found; {unset}{fix}")
     known = "; ".join(f"{device.index} {device.name} ({device.kind})" for device in devices)
+    if not select and devices[0].kind == "simulator":
+        raise DeviceError(f"only a simulator was found, {known}; name it, or {fix}")
     if not select:
-        if devices[0].kind == "simulator":
-            raise DeviceError(f"only a simulator was found, {known}; name it, or {fix}")
         return devices[0]
-    wanted = select.strip().lower()
+    name = select.strip().lower()
     for device in devices:
-        names = f"{device.name}\n{device.platform}\n{device.driver}".lower()
-        if wanted == device.kind or wanted == device.index or (wanted not in KINDS and wanted in names):
+        names = f"{device.name}\n{device.driver}".lower()
+        if name in (device.kind, device.index) or (name not in KINDS and name in names):
             return device
-    raise DeviceError(
-        f"device is {select!r}; it must be gpu, cpu, accelerator, an index or part of a name of: {known}"
-    )
-
-
-def suspects() -> list[str]:
-    """Variables set by the user that can hide every driver, as NAME=value."""
-    return [f"{name}={os.environ[name]}" for name in _HIDING if os.environ.get(name)]
-
-
-def _pocl_advice() -> str:
-    """PoCL offers no device at all where it cannot write its kernel cache."""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.environ.get("HOME") or "/", ".cache"))
-    cache = Path(os.environ.get("POCL_CACHE_DIR") or home)
-    place = next(folder for folder in (cache, *cache.parents) if folder.exists())
-    if place.is_dir() and os.access(place, os.W_OK):
-        return ""
-    return f"set POCL_CACHE_DIR to a folder that can be written, as PoCL cannot write {place}, or "
+    kind = {"gpu": "GPU", "cpu": "CPU"}.get(name, name) if name in KINDS else "device of this index or name"
+    raise DeviceError(f"device is {select!r}, but there is no {kind} here; the devices are: {known}")

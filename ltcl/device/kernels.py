@@ -1,28 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One way to run a kernel: find the source, build it once per device and defines, launch it.
 
-A `.cl` file compiles as it stands with the kernels folder on the include path. ltcl expands the includes
-itself, with `#line` marks, so that messages of every driver point at the file a person edits. Binaries are
-left to the cache of the driver: that of pyopencl is bypassed, since it reads and writes pickles.
+Includes are expanded here, with `#line` marks: messages of every driver point at the file a person edits.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
-import hashlib
 import math
+import os
 import re
 import struct
-import threading
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ltcl.device import failures
-from ltcl.errors import DeviceError
+from ltcl.errors import DeviceError, LtclError, MemoryLimitError
 
 if TYPE_CHECKING:
     from ltcl.device.device import Device
@@ -30,17 +26,21 @@ if TYPE_CHECKING:
 # Exact float32: no fast-math (it deletes NaN tests), contraction of a * b + c is left to the driver.
 _OPTIONS = ["-cl-std=CL1.2", "-cl-kernel-arg-info"]
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
-_KERNEL = re.compile(r"\bkernel\s+void\s+(\w+)\s*\(")
+_PRIVATE = 0x119E  # CL_KERNEL_ARG_ADDRESS_PRIVATE: numbers
+_PACKERS: dict[str, Any] = {  # a Python number as bytes; reals beyond float32 are infinite, as in a kernel
+    "real": ctypes.c_float,
+    "float": ctypes.c_float,
+    "int": struct.Struct("i").pack,
+    "uint": struct.Struct("I").pack,
+    "ulong": struct.Struct("Q").pack,
+}
 _Size = int | tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Source:
-    """One kernel file, ready for the compiler: its text, the digest of that, the names of its kernels."""
-
-    text: str
-    digest: str
-    kernels: tuple[str, ...]
+_MEMORY = {"MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE"}
+_ADVICE = {
+    "DEVICE_NOT_AVAILABLE": "the device is in use by another process or was unplugged; try LTCL_DEVICE=cpu",
+    "COMPILER_NOT_AVAILABLE": "this driver cannot compile kernels; choose another device (ltcl devices)",
+}
+_process: list[int] = []  # the first one that asked OpenCL
 
 
 def folder() -> Path:
@@ -53,14 +53,9 @@ def folder() -> Path:
 
 
 @functools.cache
-def load(name: str) -> Source:
-    """Read `kernels/<name>.cl` with its includes.
-
-    >>> load("vector").kernels[0]
-    'vector_fill'
-    """
-    text = _expand(f"{name}.cl", folder(), set())
-    return Source(text, hashlib.sha256(text.encode()).hexdigest(), tuple(_KERNEL.findall(text)))
+def load(name: str) -> str:
+    """The text of `kernels/<name>.cl` with its includes, ready for the compiler."""
+    return _expand(f"{name}.cl", folder(), set())
 
 
 def _expand(relative: str, root: Path, seen: set[str]) -> str:
@@ -82,7 +77,7 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", device.cl.CompilerWarning)  # Intel's compiler reports every success
         try:
-            return device.cl.Program(device.context, load(file).text).build(options)
+            return device.cl.Program(device.context, load(file)).build(options)
         except device.cl.Error as error:
             log_text = str(error).split("(options:")[0].strip()  # pyopencl adds options and source
             raise DeviceError(
@@ -94,89 +89,64 @@ def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
 class Kernel:
     """A compiled kernel of one device.
 
-    Call it with the number of work-items, the work-group size (None: the driver's choice) and the
-    arguments: Python numbers, `Array`, or local memory. Items are rounded up to whole groups; groups are
-    clamped to what kernel and device allow (`group`).
+    Call it with the number of work-items, the work-group size and the arguments: Python numbers, `Array`, or
+    local memory. Items are rounded up to whole groups, which are clamped to what is allowed (`group`).
     """
 
     def __init__(self, device: Device, program: Any, name: str) -> None:
-        self.device, self.name = device, name
-        self._program = program
+        self.device, self.name, self._program = device, name, program
         self.idle: list[Any] = []  # cl_kernels of launches that are gone: making one costs 0.1 ms
-        self._handle = handle = self.take()
-        info = device.cl.kernel_work_group_info.WORK_GROUP_SIZE
-        with failures.translated(f"asking for {name} on {device.name}"):
-            self._most: int = min(handle.get_work_group_info(info, device.handle), device.max_group)
-            self._packers = tuple(_packer(device, handle, index) for index in range(handle.num_args))
-        self._groups: dict[_Size, _Size] = {}
-        # Arguments live in the cl_kernel until the launch: one thread at a time.
-        self._lock = threading.Lock()
+        self._limits: list[int] = device.handle.max_work_item_sizes
+        info = device.cl.kernel_arg_info
+        handle = self.take()
+        with translated(f"asking for {name} on {device.name}"):
+            work_group = device.cl.kernel_work_group_info.WORK_GROUP_SIZE
+            largest = handle.get_work_group_info(work_group, device.handle)
+            self._largest: int = min(largest, device.max_group)
+            # How a number becomes argument `index`; None of buffers and local memory.
+            self.packers = tuple(
+                _PACKERS[handle.get_arg_info(index, info.TYPE_NAME).replace("unsigned ", "u")]
+                if handle.get_arg_info(index, info.ADDRESS_QUALIFIER) == _PRIVATE
+                else None
+                for index in range(handle.num_args)
+            )
+        self.idle.append(handle)
 
-    def __call__(self, items: _Size, group: _Size | None, *arguments: Any) -> None:
+    def __call__(self, items: _Size, group: _Size, *arguments: Any) -> None:
         """Queue a launch over `items` rounded up to whole groups; returns at once."""
-        size, local = self.shape(items, group)
-        if 0 in size:
-            return
-        with self._lock:
-            for index, (_, argument) in enumerate(zip(self._packers, arguments, strict=True)):
-                self.set(self._handle, index, argument)
-            self.device.launch(self.name, self._handle, size, local)
+        Launch(self, items, group, arguments)()
 
-    def bind(self, items: _Size, group: _Size | None, *arguments: Any) -> Launch:
+    def bind(self, items: _Size, group: _Size, *arguments: Any) -> Launch:
         """The launch that calling the kernel would queue, to be queued again and again."""
         return Launch(self, items, group, arguments)
 
-    def group(self, wanted: Any) -> Any:
-        """The work-group that a launch with `wanted` has: halved until kernel and device allow it."""
-        if wanted not in self._groups:
-            sizes = list(wanted) if isinstance(wanted, tuple) else [wanted]
-            for axis in range(len(sizes)):
-                while sizes[axis] > self.device.handle.max_work_item_sizes[axis]:
-                    sizes[axis] //= 2
-            while math.prod(sizes) > self._most:
-                sizes[sizes.index(max(sizes))] //= 2
-            self._groups[wanted] = tuple(sizes) if isinstance(wanted, tuple) else sizes[0]
-        return self._groups[wanted]
-
-    def shape(self, items: _Size, group: _Size | None) -> tuple[tuple[int, ...], tuple[int, ...] | None]:
-        """What OpenCL is asked for: the items in whole groups, and the clamped group."""
-        size = items if isinstance(items, tuple) else (items,)
-        if group is None:
-            return size, None
-        local = self.group(group if isinstance(group, tuple) else (group,))
-        return tuple(-(-n // g) * g for n, g in zip(size, local, strict=True)), local
-
-    def set(self, handle: Any, index: int, value: Any) -> None:
-        """Set argument `index` of one of the kernel's cl_kernels, a number by its type in the source."""
-        packer = self._packers[index]
-        try:
-            if packer is None:
-                handle.set_arg(index, getattr(value, "buffer", value))
-            else:  # `set_arg` would do as well, but tries all else before bytes: 6 us instead of 0.1
-                handle._set_arg_buf(index, packer(value))
-        except self.device.cl.Error as error:
-            raise failures.explain(f"argument {index} of {self.name}", error) from error
+    def group(self, size: Any) -> Any:
+        """The work-group of a launch that asks for one of `size`: halved until kernel and device allow it."""
+        if isinstance(size, int):
+            return self.group((size,))[0]
+        sizes = list(map(min, size, self._limits))
+        while math.prod(sizes) > self._largest:
+            sizes[sizes.index(max(sizes))] //= 2
+        return tuple(sizes)
 
     def take(self) -> Any:
         """A cl_kernel for one user, who puts it back into `idle`."""
         with contextlib.suppress(IndexError):
             return self.idle.pop()
-        with failures.translated(f"no kernel {self.name} for {self.device.name}"):
+        with translated(f"no kernel {self.name} for {self.device.name}"):
             return self.device.cl.Kernel(self._program, self.name)
 
 
 class Launch:
-    """A kernel with its items and arguments, which are set once; call it to queue it again.
+    """A kernel with its items and arguments, which it keeps alive: to be queued by one thread at a time."""
 
-    One thread at a time: the arguments are its state. It keeps its arrays alive.
-    """
-
-    def __init__(self, kernel: Kernel, items: _Size, group: _Size | None, arguments: tuple) -> None:
+    def __init__(self, kernel: Kernel, items: _Size, group: _Size, arguments: tuple) -> None:
         self._kernel = kernel
-        self._size, self._group = kernel.shape(items, group)
+        self._group = kernel.group(group if isinstance(group, tuple) else (group,))
+        self.resize(items)
         self._handle = kernel.take()
-        self._arguments = dict(enumerate(arguments))
-        for index, argument in self._arguments.items():
+        self._arguments = [None] * len(kernel.packers)
+        for index, (_, argument) in enumerate(zip(kernel.packers, arguments, strict=True)):
             self.set(index, argument)
 
     def __call__(self) -> None:
@@ -185,40 +155,59 @@ class Launch:
             self._kernel.device.launch(self._kernel.name, self._handle, self._size, self._group)
 
     def set(self, index: int, value: Any) -> None:
-        """Change argument `index` for the launches that follow."""
-        self._kernel.set(self._handle, index, value)
+        """Change argument `index` for the launches that follow, a number by its type in the source."""
+        packer = self._kernel.packers[index]
+        try:
+            if packer is None:
+                self._handle.set_arg(index, getattr(value, "buffer", value))
+            else:  # `set_arg` would do as well, but tries all else before bytes: 6 us instead of 0.1
+                self._handle._set_arg_buf(index, packer(value))
+        except self._kernel.device.cl.Error as error:
+            raise explain(f"argument {index} of {self._kernel.name}", error) from error
         self._arguments[index] = value
 
     def resize(self, items: _Size) -> None:
-        """Change the number of work-items for the launches that follow; the work-group stays."""
-        self._size, _ = self._kernel.shape(items, self._group)
+        """Change the number of work-items, rounded up to whole groups, for the launches that follow."""
+        size = items if isinstance(items, tuple) else (items,)
+        self._size = tuple(-(-n // g) * g for n, g in zip(size, self._group, strict=True))
 
     def __del__(self) -> None:
         if hasattr(self, "_handle"):
             self._kernel.idle.append(self._handle)
 
 
-def _packer(device: Device, handle: Any, index: int) -> Callable[[Any], bytes] | None:
-    """How a Python number becomes argument `index`; None of buffers and local memory."""
-    info = device.cl.kernel_arg_info
-    if handle.get_arg_info(index, info.ADDRESS_QUALIFIER) != _PRIVATE:
-        return None
-    return _PACKERS[handle.get_arg_info(index, info.TYPE_NAME).replace("unsigned ", "u")]
+def refuse_forked() -> None:
+    """Raise in a process forked from one that had used OpenCL: drivers hang there."""
+    if not _process:
+        _process.append(os.getpid())
+    if os.getpid() != _process[0]:
+        raise DeviceError(
+            "this process was forked from one that had used OpenCL, whose drivers do not survive that; start "
+            'workers by multiprocessing.get_context("spawn") or "forkserver", and open the device in each'
+        )
 
 
-def _pack_real(value: float) -> bytes:
+@contextlib.contextmanager
+def translated(doing: str) -> Iterator[None]:
+    """Raise an ltcl error that names what was being done where pyopencl raises its own; not after a fork."""
+    refuse_forked()
+    import pyopencl as cl
+
     try:
-        return _REAL(value)
-    except OverflowError:  # as in a kernel: beyond float32 is infinite
-        return _REAL(math.copysign(math.inf, value))
+        yield
+    except cl.Error as error:
+        raise explain(doing, error) from error
 
 
-_PRIVATE = 0x119E  # CL_KERNEL_ARG_ADDRESS_PRIVATE: numbers
-_REAL = struct.Struct("f").pack
-_PACKERS: dict[str, Callable[[Any], bytes]] = {
-    "real": _pack_real,
-    "float": _pack_real,
-    "int": struct.Struct("i").pack,
-    "uint": struct.Struct("I").pack,
-    "ulong": struct.Struct("Q").pack,
-}
+def explain(doing: str, error: Exception) -> LtclError:
+    """The ltcl error for a pyopencl `error` raised while `doing` something."""
+    import pyopencl as cl
+
+    code = getattr(error, "code", None)
+    status = str(error).partition("\n")[0] if code is None else cl.status_code.to_string(code, f"{code}")
+    if status in _MEMORY:
+        return MemoryLimitError(
+            f"{doing}: the device ran out of memory ({status}); compress the matrix, free other buffers, "
+            "or choose a device with more memory (ltcl devices)"
+        )
+    return DeviceError(f"{doing}: OpenCL answered {status}; {_ADVICE.get(status, 'see ltcl doctor')}")

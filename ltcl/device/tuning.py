@@ -1,24 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What is timed once per device and then remembered: the fastest of several kernel variants, machine speeds.
 
-`LTCL_TUNE=0` turns timing off: the first variant named is taken, speeds are the constants below, and results
-repeat across machines of one kind. Variants agree to rounding, not to the bit.
-
-The memory is a small JSON file in a private folder (mode 0700) of the user's cache, or in the folder that
-`LTCL_CACHE` names. It can be lost at any time: then things are measured again, which is no error.
+`LTCL_TUNE=0` turns timing off: the first variant is taken, speeds are constants. Variants agree to rounding.
+The memory is a JSON file in the user's cache, or where `LTCL_CACHE` says; it may be deleted.
 """
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import json
 import logging
 import math
 import os
 import platform
-import tempfile
 import time
+import timeit
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,16 +24,15 @@ import platformdirs
 import scipy
 import scipy.linalg
 
-from ltcl.device import kernels
-from ltcl.device.kernels import Launch
-from ltcl.errors import DeviceError, MemoryLimitError
+from ltcl import files
+from ltcl.device import kernels, vectors
+from ltcl.errors import DeviceError, FileError, MemoryLimitError
 
 if TYPE_CHECKING:
     from ltcl.device.device import Device
 
-SECONDS = 20e-6  # under LTCL_TUNE=0, of a launch
-BANDWIDTH = {True: 2e10, False: 2e12}  # bytes a second, of a CPU or not
-FLOPS = 5e10  # a second, of a factorization
+# Under LTCL_TUNE=0: of a launch; bytes a second, of a CPU or not; a second, of a factorization.
+SECONDS, BANDWIDTH, FLOPS = 20e-6, {True: 2e10, False: 2e12}, 5e10
 
 log = logging.getLogger(__name__)
 _REPEATS = 5
@@ -46,94 +41,76 @@ _FACTORIZED = 768  # rows
 
 
 def choose(device: Device, file: str, problem: str, variants: Mapping[str, Callable[[], None]]) -> str:
-    """Name of the fastest of `variants`, each of which queues a launch, for this class of `problem`.
-
-    `problem` names what is alike enough to share an answer, for instance "k=8 width=512"; a change of the
-    kernel `file` asks for a new measurement. Under ``LTCL_TUNE=0`` the first variant is taken, untimed.
-    """
+    """The fastest of `variants`, each of which queues a launch; remembered for all of this `problem`."""
     names = list(variants)
-    if len(names) == 1 or _off():
+    if len(names) == 1 or os.environ.get("LTCL_TUNE") == "0":
         return names[0]
-    key = _key(device, kernels.load(file).digest[:16], problem, ",".join(names))
-    if recall(key) in names:
-        return recall(key)
-    times = {name: _time(launch, device.finish) for name, launch in variants.items()}
-    best = min(times, key=times.__getitem__)
-    if times[best] == math.inf:
+    version = f"{file} {zlib.crc32(kernels.load(file).encode()):08x}"
+    key = "|".join((device.name, device.driver, version, problem, ",".join(names)))
+    if (known := recall(key)) in names:
+        return known
+    times = {}
+    for name, launch in variants.items():
+        try:
+            times[name] = _time(launch, device.finish)
+        except (DeviceError, MemoryLimitError) as error:  # the latter where a group needs too many registers
+            log.info("%s of %s fails and is left out: %s", name, file, error)
+    if not times:
         raise DeviceError(f"no variant of kernels/{file}.cl runs on {device.name} ({device.driver})")
+    best = min(times, key=times.__getitem__)
     log.info("%s on %s, %s: %s of %s", file, device.name, problem, best, times)
     remember(key, best)
     return best
 
 
-def seconds(device: Device, key: str, launch: Callable[[], object], default: float = SECONDS) -> float:
-    """Seconds that `launch` takes on `device`, waiting included; measured once and remembered as `key`.
-
-    Under ``LTCL_TUNE=0``, and on a simulator, the answer is `default`.
-    """
-    if device.kind == "simulator":
-        return default
-    return _measured(_key(device, key), lambda: _time(launch, device.finish), default)
+def seconds(device: Device, key: str, launch: Callable[[], object]) -> float:
+    """Seconds that `launch` takes on `device`, waiting included."""
+    return _measured((device.name, device.driver, key), SECONDS, lambda: _time(launch, device.finish))
 
 
 def bandwidth(device: Device) -> float:
-    """Bytes a second that the device moves at best, by our own triad a = s b + c: two reads, one write."""
+    """Bytes a second that the device moves at best, by a triad a b + c y: two reads, one write."""
     nbytes = min(_TRIAD_BYTES, device.max_allocation // 4)
 
-    @functools.cache
-    def triad() -> Launch:
-        arrays = (device.empty(nbytes // 4) for _ in range(3))
-        return device.kernel("vector", "vector_triad").bind(nbytes // 32, 64, nbytes // 32, 0.5, *arrays)
+    def measure() -> float:
+        b, c, out = (vectors.fill(device.empty(nbytes // 4), 1.0) for _ in range(3))
+        return 3 * nbytes / _time(lambda: vectors.axpby(0.5, b, 1.0, c, out), device.finish)
 
-    default = 3 * nbytes / BANDWIDTH[device.is_cpu]
-    return 3 * nbytes / seconds(device, f"triad of {nbytes} bytes", lambda: triad()(), default)
+    key = (device.name, device.driver, f"bandwidth by {nbytes} bytes")
+    return _measured(key, BANDWIDTH[device.is_cpu], measure)
 
 
 def factorization_flops() -> float:
-    """Operations a second of this host's LAPACK, in an LU factorization in float64."""
-    matrix = np.random.default_rng(0).standard_normal((_FACTORIZED, _FACTORIZED))
-    work = 2 / 3 * _FACTORIZED**3
-    key = f"{platform.node()}|{os.cpu_count()} cores|scipy {scipy.__version__}|factorization"
-    return work / _measured(key, lambda: _time(lambda: scipy.linalg.lu_factor(matrix)), work / FLOPS)
+    """Operations a second of a float64 LU factorization on this host."""
+
+    def measure() -> float:
+        matrix = np.random.default_rng(0).standard_normal((_FACTORIZED, _FACTORIZED))
+        return 2 / 3 * _FACTORIZED**3 / _time(lambda: scipy.linalg.lu_factor(matrix), lambda: None)
+
+    key = (platform.node(), f"{os.cpu_count()} cores", f"scipy {scipy.__version__}", "factorization")
+    return _measured(key, FLOPS, measure)
 
 
-def _key(device: Device, *what: str) -> str:
-    return "|".join((device.name, device.driver, *what))
-
-
-def _off() -> bool:
-    return os.environ.get("LTCL_TUNE") == "0"
-
-
-def _measured(key: str, measure: Callable[[], float], default: float) -> float:
+def _measured(key: tuple[str, ...], default: float, measure: Callable[[], float]) -> float:
     """What is remembered as `key`, else measured now; `default` where timing is off."""
-    if _off():
+    if os.environ.get("LTCL_TUNE") == "0":
         return default
-    known = recall(key)
-    if isinstance(known, float) and 0 < known < math.inf:
-        return known
-    measured = measure()
-    if not measured < math.inf:
-        raise DeviceError(f"{key}: nothing to measure, it does not run")
-    remember(key, measured)
-    return measured
+    value = recall("|".join(key))
+    if not (isinstance(value, float) and 0 < value < math.inf):
+        value = measure()
+        remember("|".join(key), value)
+    return value
 
 
-def _time(run: Callable[[], object], wait: Callable[[], object] = lambda: None) -> float:
-    """Best of a few runs: the minimum is what the code can do, the rest is the machine's noise."""
-    try:
-        run()  # builds
+def _time(run: Callable[[], object], wait: Callable[[], object]) -> float:
+    """Best of a few runs."""
+
+    def once() -> None:
+        run()
         wait()
-        best = math.inf
-        for _ in range(_REPEATS):
-            start = time.perf_counter()
-            run()
-            wait()
-            best = min(best, time.perf_counter() - start)
-        return best
-    except (DeviceError, MemoryLimitError) as error:  # the latter where a group asks for too many registers
-        log.info("a variant failed and is left out: %s", error)
-        return math.inf
+
+    once()  # builds
+    return min(timeit.repeat(once, number=1, repeat=_REPEATS, timer=time.perf_counter))
 
 
 def folder() -> Path:
@@ -156,16 +133,12 @@ def recall(key: str) -> Any:
 
 def remember(key: str, value: Any) -> None:
     """Remember `value` (plain JSON) as `key`, in a file replaced whole; an unwritable folder forgets it."""
-    content, aside = json.dumps({**_memory(), key: value}, indent=1, sort_keys=True), ""
+    content = json.dumps({**_memory(), key: value}, indent=1, sort_keys=True)
     try:
-        handle, aside = tempfile.mkstemp(dir=make_folder(), prefix=".tuning.json.")
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(content)
-        os.replace(aside, folder() / "tuning.json")
-    except OSError as error:
+        with files.replace_file(make_folder() / "tuning.json") as temporary:
+            temporary.write_text(content, encoding="utf-8")
+    except (OSError, FileError) as error:
         log.debug("%s is not remembered: %s", key, error)
-        with contextlib.suppress(OSError):
-            os.unlink(aside)
 
 
 def _memory() -> dict[str, Any]:

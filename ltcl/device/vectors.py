@@ -1,20 +1,117 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a solver does between two products: fill, axpby, axpby column by column, scaling, dot, norm.
+"""Arrays on a device, and what a solver does between two products: fill, axpby, scaling, dot, norm.
 
-Everything is queued and returns at once; only `dot` and `norm` give numbers to the host and so wait.
-Sums are trees over a fixed number of slices: the same bits at every call on a given device.
+An array is (N,) for one right-hand side or (N, k) for several, row-major. Only what gives numbers to the host
+waits: `get`, `dot`, `norm`, `norms`. Sums are trees over fixed slices: the same bits at every call.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ltcl.device.array import Array
-from ltcl.device.kernels import Kernel
-from ltcl.errors import InputError
+import numpy as np
+
+from ltcl import checks
+from ltcl.errors import InputError, MemoryLimitError
+
+if TYPE_CHECKING:
+    from ltcl.device.device import Device
+    from ltcl.device.kernels import Kernel
 
 _VALUES = {True: 128, False: 8}  # of an item of a CPU or not, before a reduction takes another group
+
+
+@dataclass(frozen=True, eq=False)
+class Array:
+    """A buffer with a shape and a type; values move only when asked to."""
+
+    device: Device
+    buffer: Any
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return math.prod(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the values."""
+        return self.size * self.dtype.itemsize
+
+    @property
+    def columns(self) -> int:
+        """Number of right-hand sides: k of (N, k), 1 of (N,)."""
+        return 1 if len(self.shape) == 1 else self.shape[1]
+
+    def get(self) -> np.ndarray:
+        """The values on the host, once everything queued before has run."""
+        try:
+            host = np.empty(self.shape, self.dtype)
+        except MemoryError as error:
+            raise MemoryLimitError(
+                f"the host has no room for {checks.size(self.nbytes)} to copy to"
+            ) from error
+        if host.size:
+            self.device.copy(host, self.buffer)
+        return host
+
+    def set(self, values: np.ndarray) -> Array:
+        """Overwrite with host values of the same shape; returns the array."""
+        if values.shape != self.shape:
+            raise InputError(f"values have shape {values.shape}; the array on the device has {self.shape}")
+        host = rounded(values, self.dtype)
+        if host.size:
+            self.device.copy(self.buffer, host)
+        return self
+
+    def rows(self, first: int, count: int) -> Array:
+        """A copy of `count` rows from `first` on."""
+        if not 0 <= first <= first + count <= self.shape[0]:
+            raise InputError(f"rows {first} to {first + count} are not among {self.shape[0]}")
+        block = self.device.empty((count, *self.shape[1:]), self.dtype)
+        if block.size:
+            offset = first * self.columns * self.dtype.itemsize
+            self.device.copy(block.buffer, self.buffer, byte_count=block.nbytes, src_offset=offset)
+        return block
+
+    def set_rows(self, first: int, block: Array) -> Array:
+        """Overwrite the rows from `first` on with another array of the device; returns this one."""
+        if block.shape[1:] != self.shape[1:] or not 0 <= first <= self.shape[0] - block.shape[0]:
+            raise InputError(f"rows {first} on of an array of shape {self.shape} cannot hold {block.shape}")
+        if block.size:
+            offset = first * self.columns * self.dtype.itemsize
+            self.device.copy(self.buffer, block.buffer, byte_count=block.nbytes, dst_offset=offset)
+        return self
+
+    def copy_from(self, other: Array) -> Array:
+        """Overwrite with the values of another array of the same shape; returns this one."""
+        return self.set_rows(0, other)
+
+    def copy(self) -> Array:
+        """Another array with the same values."""
+        return self.rows(0, self.shape[0])
+
+    def like(self) -> Array:
+        """An uninitialised array of the same shape and type."""
+        return self.device.empty(self.shape, self.dtype)
+
+
+def rounded(values: Any, dtype: Any) -> np.ndarray:
+    """`values` as a contiguous array of `dtype`; numbers beyond its range are refused, not made infinite."""
+    array, dtype = checks.real("values", values), np.dtype(dtype)
+    try:
+        with np.errstate(over="raise"):
+            return np.ascontiguousarray(array, dtype)
+    except FloatingPointError as error:
+        most = f"{np.finfo(dtype).max:.3g}; scale T, its first bounce or the picture"
+        raise InputError(f"a value is beyond {dtype.name}, {most}") from error
+    except MemoryError as error:
+        nbytes = checks.size(array.size * dtype.itemsize)
+        raise MemoryLimitError(f"the host has no room for {nbytes} to copy from as {dtype.name}") from error
 
 
 def fill(x: Array, value: float) -> Array:
@@ -33,17 +130,6 @@ def axpy(a: float, x: Array, y: Array) -> Array:
     return axpby(a, x, 1.0, y, y)
 
 
-def axpby_columns(a: ArrayLike, x: Array, b: ArrayLike, y: Array, out: Array) -> Array:
-    """out = a_c x_c + b_c y_c in every column c; `out` may be `x` or `y`. Waits for the device.
-
-    `a` and `b` are numbers or (k,) on the host. An operand whose coefficient is 0 does not count, not even
-    its NaN: with (0, 1) a column of y stays as it is, whatever became of x.
-    """
-    _same_shape(x, y, out)
-    ab = out.device.upload([np.broadcast_to(c, out.columns) for c in (a, b)])
-    return _elementwise(out, "vector_axpby_columns", out.columns, ab, x, y)
-
-
 def scale_rows(d: Array, x: Array, out: Array) -> Array:
     """out = diag(d) x with d (N,) and x (N,) or (N, k); `out` may be `x`."""
     _same_shape(x, out)
@@ -55,9 +141,8 @@ def scale_rows(d: Array, x: Array, out: Array) -> Array:
 def dot(x: Array, y: Array) -> np.ndarray:
     """<x_c, y_c> of every column c, as (k,) float64; waits for the device."""
     _same_shape(x, y)
-    reduction = _reduction("vector_dot", x)
-    sums = x.device.empty((reduction.groups, x.columns))
-    reduction.queue(x, y, sums, 0)
+    sums = x.device.empty((_plan("vector_dot", x).groups, x.columns))
+    _reduce("vector_dot", x, x, y, sums, 0)
     return sums.get().sum(axis=0, dtype=np.float64)
 
 
@@ -77,81 +162,70 @@ def norms(*xs: Array) -> np.ndarray:
 def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
     """Row `slot` of `out` (slots, k) = <x_c, y_c> of every column c; does not wait."""
     _same_shape(x, y)
-    reduction = _reduction("vector_dot", x)
-    if reduction.groups == 1:
-        reduction.queue(x, y, out, slot * x.columns)
-        return
-    sums = x.device.empty((1, reduction.groups, x.columns))
-    reduction.queue(x, y, sums, 0)
-    _queue_sums(sums, 1, out, slot)
+    if (groups := _plan("vector_dot", x).groups) == 1:
+        _reduce("vector_dot", x, x, y, out, slot * x.columns)
+    else:
+        sums = x.device.empty((1, groups, x.columns))
+        _reduce("vector_dot", x, x, y, sums, 0)
+        queue_sum_partials(sums, 1, out, slot)
 
 
 def queue_step(
     p: Array, x: Array, r: Array, d: Array, keep: float, gain: float, partials: Array, slot: int
 ) -> None:
-    """x += d, r -= p, d = keep d + gain r, in one launch, where p = S d; does not wait.
+    """x += d, r -= p = S d, d = keep d + gain r, in one launch; does not wait.
 
-    The squares of the new r are added up column by column into row `slot` of `partials`, which is
-    (slots, step_groups(x), k).
+    The squares of the new r go, added up, to row `slot` of `partials` (slots, step_groups(x), k).
     """
     _same_shape(p, x, r, d)
-    reduction = _reduction("vector_step", x)
-    row = (reduction.groups, x.columns)
-    if partials.shape[1:] != row:
-        raise InputError(f"partials are {partials.shape}; they must be (slots, {row[0]}, {row[1]})")
-    reduction.queue(keep, gain, slot * row[0] * row[1], p, x, r, d, partials)
+    _reduce("vector_step", x, keep, gain, slot * step_groups(x) * x.columns, p, x, r, d, partials)
 
 
 def step_groups(x: Array) -> int:
     """Into how many partial sums a column `queue_step` adds up the squares of a vector like `x`."""
-    return _reduction("vector_step", x).groups
+    return _plan("vector_step", x).groups
 
 
-def queue_sum_partials(partials: Array, slots: int, out: Array) -> None:
-    """First `slots` rows of `out` (slots, k) = those of `partials` (slots, groups, k), added up."""
-    if partials.shape[2:] != out.shape[1:] or not slots <= min(partials.shape[0], out.shape[0]):
-        raise InputError(f"{slots} rows of partials {partials.shape} cannot be added up into {out.shape}")
-    _queue_sums(partials, slots, out, 0)
+def queue_sum_partials(partials: Array, slots: int, out: Array, slot: int = 0) -> None:
+    """Rows slot .. slot + slots - 1 of `out` = the first of `partials` (slots, groups, k), added up."""
+    _reduce("vector_sums", partials, partials, out, slot * out.columns, across=slots)
 
 
-def _queue_sums(partials: Array, slots: int, out: Array, slot: int) -> None:
-    kernel = _reduction("vector_sums", out, rows=partials.shape[1])
-    kernel.queue(partials, out, slot * out.columns, across=slots)
+class _Plan(NamedTuple):
+    """A kernel that sums over the rows of (rows, k) in `groups` work-groups of `group` items."""
+
+    kernel: Kernel
+    rows: int
+    k: int
+    groups: int
+    group: int
 
 
-class _Reduction:
-    """A kernel that sums over the rows of (rows, k) in `groups` work-groups, and how it is launched."""
-
-    def __init__(self, x: Array, name: str, rows: int, k: int) -> None:
-        device, self._sizes = x.device, (rows, k)
-        self._kernel = _kernel(x, name)
-        group = self._kernel.group((16 if k <= 16 else 64) if device.is_cpu else 256)
+def _plan(name: str, x: Array) -> _Plan:
+    """For vectors (rows,) or (rows, k), or for partial sums (slots, rows, k), made once for each size."""
+    device, (rows, k) = x.device, (*x.shape, 1)[:2] if len(x.shape) < 3 else x.shape[1:]
+    if (name, rows, k) not in device.reductions:
+        kernel = _kernel(device, name)
+        group = kernel.group((16 if k <= 16 else 64) if device.is_cpu else 256)
         most = max(64, 4 * device.compute_units)  # enough for a large GPU, few enough for one last group
-        wanted = 1 if name == "vector_sums" else -(-rows * k // (group * _VALUES[device.is_cpu]))
-        self.groups = max(1, min(wanted, most))
-        self._group, self._items, self._parts = (group, 1, 1), self.groups * group, -(-k // group)
-        self._local = device.local(group)
-
-    def queue(self, *arguments: float | Array, across: int = 1) -> None:
-        """Launch it with `arguments` between the sizes and the local memory."""
-        self._kernel((self._items, across, self._parts), self._group, *self._sizes, *arguments, self._local)
+        groups = 1 if name == "vector_sums" else -(-rows * k // (group * _VALUES[device.is_cpu]))
+        device.reductions[name, rows, k] = _Plan(kernel, rows, k, max(1, min(groups, most)), group)
+    return device.reductions[name, rows, k]
 
 
-def _reduction(name: str, x: Array, rows: int | None = None) -> _Reduction:
-    """That of vectors like `x`, made once, or of as many columns and `rows` rows."""
-    key = (name, x.shape[0] if rows is None else rows, x.columns)
-    if key not in x.device.reductions:
-        x.device.reductions[key] = _Reduction(x, *key)
-    return x.device.reductions[key]
-
-
-def _kernel(x: Array, name: str) -> Kernel:
-    return x.device.kernel("vector", name, **({} if x.device.is_cpu else {"ADJACENT": 0}))
+def _reduce(name: str, x: Array, *arguments: float | Array, across: int = 1) -> None:
+    kernel, rows, k, groups, group = _plan(name, x)
+    items = (groups * group, across, -(-k // group))
+    kernel(items, (group, 1, 1), rows, k, *arguments, x.device.local(group))
 
 
 def _elementwise(out: Array, name: str, *arguments: float | Array) -> Array:
-    _kernel(out, name)(out.size, 256, out.size, *arguments, out)
+    _kernel(out.device, name)(out.size, 256, out.size, *arguments, out)
     return out
+
+
+def _kernel(device: Device, name: str) -> Kernel:
+    return device.kernel("vector", name, **({} if device.is_cpu else {"ADJACENT": 0}))
 
 
 def _same_shape(*arrays: Array) -> None:

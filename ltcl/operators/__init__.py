@@ -9,21 +9,18 @@ import scipy.sparse
 
 from ltcl.device import Device, open_device
 from ltcl.operators.base import Epilogue, Norms, Operator
-from ltcl.operators.bases import Basis, Chained, SubsetBasis, multiresolution_order, restrict_to_support
-from ltcl.operators.composed import Compressed, Coupled, Host, IdentityPlus, ScaledColumns, Shifted, Sum
+from ltcl.operators.bases import Basis, Pyramid, SubsetBasis, multiresolution_order, restrict_to_support
+from ltcl.operators.composed import Compressed, Coupled, Host, IdentityPlus, ScaledColumns
 from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
 from ltcl.operators.interreflection import interreflections
-from ltcl.operators.packing import smallest
-from ltcl.operators.pyramid import Pyramid
 from ltcl.operators.stored import basis
-from ltcl.operators.tiles import Tiles
+from ltcl.operators.tiles import Tiles, smallest
 from ltcl.operators.wavelets import Wavelet
 
 __all__ = [
     "CSR",
     "Basis",
-    "Chained",
     "Compressed",
     "Coupled",
     "Dense",
@@ -35,9 +32,7 @@ __all__ = [
     "Pyramid",
     "RowBlocks",
     "ScaledColumns",
-    "Shifted",
     "SubsetBasis",
-    "Sum",
     "Tiles",
     "Wavelet",
     "as_operator",
@@ -54,8 +49,7 @@ def as_operator(matrix: Any, device: Device | None = None) -> Operator:
 
     Parameters
     ----------
-    matrix : Operator, (M, N) array, scipy.sparse matrix or array, or LinearOperator
-        An `Operator` is returned as it is.
+    matrix : Operator (returned as it is), (M, N) array, scipy.sparse matrix or array, or LinearOperator
     device : Device, optional
         The best one when not given.
 

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What every linear operator on a device promises.
 
-A subclass implements `_product`, which queues a product, or `_bound`, which prepares one that is queued again
-and again; either makes the other. `diagonal` is its own, too; everything else is made of these.
+A subclass implements `_product`, which queues a product, or `_bound`, which prepares one for many calls.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,15 +15,14 @@ import scipy.sparse.linalg
 
 from ltcl import checks
 from ltcl.device import Array, Device, vectors
-from ltcl.errors import InputError
+from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 
 WIDTHS = (8, 4, 3, 2, 1)  # right-hand sides one launch of a product kernel takes
 _BLOCK = 64  # columns of a product that makes entries
 
 
-@dataclass(frozen=True)
-class Norms:
-    """Largest column sum, largest row sum (both of absolute values), Frobenius norm, smallest entry or 0."""
+class Norms(NamedTuple):
+    """Norms of a matrix, and its smallest entry where one is negative, else 0."""
 
     one: float
     inf: float
@@ -34,10 +31,7 @@ class Norms:
 
 
 class Epilogue(NamedTuple):
-    """What becomes of a product: out = a (A x) + b y + c x, in the same launch.
-
-    y is not read where b is 0, and may be `out`; c needs a square A.
-    """
+    """out = a (A x) + b y + c x in one launch; y, which may be `out`, is not read where b is 0."""
 
     a: float = 1.0
     b: float = 0.0
@@ -55,17 +49,12 @@ PLAIN = Epilogue()  # out = A x
 class Operator(scipy.sparse.linalg.LinearOperator):
     """An (M, N) linear operator in float32 on an OpenCL device.
 
-    NumPy in, NumPy out, wherever SciPy takes a `LinearOperator`; device arrays in, device arrays out
-    through `apply`, with no host copy between products.
+    NumPy in, NumPy out, wherever SciPy takes a `LinearOperator`; `apply` takes and gives device arrays.
 
     Attributes
     ----------
     device : Device
-        Where it lives.
-    shape : tuple of int
-        (M, N).
-    nbytes : int
-        Bytes of its matrix on the device.
+    shape : (M, N)
     error : float
         Bound on the 2-norm of what a compressed operator dropped; 0 for exact ones.
     solution_error : float
@@ -85,6 +74,12 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         self._parts: tuple[Operator | Array | None, ...] = parts  # what it is made of
         self._row_sums: np.ndarray | None = None
 
+    def __getstate__(self) -> Any:
+        raise InputTypeError(
+            f"{type(self).__name__} lies on a device and cannot be pickled; pickle its Transport or "
+            "Inverse, or what to_dense() gives"
+        )
+
     @property
     def nbytes(self) -> int:
         """Bytes on the device; what several parts share counts once."""
@@ -92,8 +87,8 @@ class Operator(scipy.sparse.linalg.LinearOperator):
 
     def arrays(self) -> set[Array]:
         """All that it keeps on the device."""
-        own = {part for part in self._parts if isinstance(part, Array)}
-        return own.union(*(part.arrays() for part in self._parts if isinstance(part, Operator)))
+        parts = (part for part in self._parts if part is not None)
+        return set[Array]().union(*({part} if isinstance(part, Array) else part.arrays() for part in parts))
 
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         """Queue ``out = a (A x) + b y + c x``, or with A^T. `out` is never `x`."""
@@ -121,22 +116,15 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         add_scale: float = 1.0,
         shift: float = 0.0,
     ) -> Array:
-        """Queue ``out = scale (A x) + add_scale add + shift x`` on the device.
+        """Queue ``out = scale (A x) + add_scale add + shift x``; returns `out`.
 
         Parameters
         ----------
         x : Array, (N,) or (N, k)
-        out : Array, (M,) or (M, k), optional
-            Made when not given; must not be `x`.
+        out, add : Array, (M,) or (M, k), optional
+            `out` is made when not given; it must not be `x`, but may be `add`.
         scale, add_scale, shift : float
             `shift` needs a square operator.
-        add : Array like `out`, optional
-            May be `out` itself, which is then added to.
-
-        Returns
-        -------
-        Array
-            `out`. A residual is ``S.apply(x, r, scale=-1, add=b)``: one launch, no extra pass.
 
         Raises
         ------
@@ -149,33 +137,22 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         return out
 
     def apply_transpose(self, x: Array, out: Array | None = None, **epilogue: Any) -> Array:
-        """Queue ``out = scale (A^T x) + add_scale add + shift x``; see `apply`, also for keywords."""
+        """Queue ``out = scale (A^T x) + add_scale add + shift x``; keywords are those of `apply`."""
         return self.T.apply(x, out, **epilogue)
 
     def bind(
         self, x: Array, out: Array, epilogue: Epilogue = PLAIN, *, transpose: bool = False
     ) -> Callable[[], object]:
-        """A product of fixed arrays: each call of what is returned queues it, in microseconds.
-
-        ``out = a (A x) + b y + c x`` with what the arrays hold by then; refuses what `apply` refuses.
-        """
+        """A function that queues ``out = a (A x) + b y + c x`` in microseconds; refuses what `apply` does."""
         A = self.T if transpose else self
         A._checked(x, out, epilogue)
         return A._bound(x, out, epilogue, False)
 
-    def stepper(self, x: Array, r: Array, slots: int = 8) -> Stepper:
-        """Steps of a stationary iteration on S x = b, whose residual is `r`; both are changed in place.
+    def stepper(self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0) -> Stepper:
+        """Steps of a stationary iteration on S x = b, S = a A + c I, which change `x` and its residual `r`.
 
-        Parameters
-        ----------
-        x, r : Array, (N,) or (N, k)
-        slots : int
-            Steps whose residual norms may wait on the device until they are read.
+        Norms of residuals of up to `slots` steps may wait on the device until they are read.
         """
-        return self._stepper(x, r, slots, 1.0, 0.0)
-
-    def _stepper(self, x: Array, r: Array, slots: int, a: float, c: float) -> Stepper:
-        """Steps of S = a A + c I."""
         return Stepper(self, x, r, slots, a, c)
 
     def row_sums(self) -> np.ndarray:
@@ -187,10 +164,19 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         return self._row_sums
 
     def to_dense(self) -> np.ndarray:
-        """The whole matrix as (M, N) float64 on the host, column block by column block."""
+        """The whole matrix as (M, N) float64 on the host; MemoryLimitError where that has no room for it."""
         rows, columns = self.shape
-        checks.fits_host(f"a dense {rows} x {columns} matrix", 8 * rows * columns)
-        return self.between(np.arange(rows), np.arange(columns))
+        what, nbytes = f"a dense {rows} x {columns} matrix", 8 * rows * columns
+        checks.fits_host(what, nbytes)
+        try:
+            return self._dense()
+        except MemoryLimitError:
+            raise
+        except MemoryError as error:  # a limit of the process, below what the host has
+            raise MemoryLimitError(f"{what} needs {checks.size(nbytes)}, more than the host gives") from error
+
+    def _dense(self) -> np.ndarray:
+        return self.between(*map(np.arange, self.shape))
 
     def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """The entries (rows, columns), both lists of indices, in float64: a product for each column."""
@@ -202,19 +188,25 @@ class Operator(scipy.sparse.linalg.LinearOperator):
             entries[:, start : start + _BLOCK] = self._matmat(unit)[rows]
         return entries
 
-    # What SciPy asks for: NumPy in, NumPy out.
+    def __reduce__(self) -> Any:
+        raise InputTypeError(
+            f"a {type(self).__name__} lies on a device and cannot be pickled; pickle the Transport, or "
+            "S.to_dense()"
+        )
+
+    # What SciPy asks for: NumPy in, NumPy out. It makes the other products of these.
+
+    def dot(self, x: Any) -> Any:
+        """A x, of an array or an operator; masked values, which SciPy would fill, are refused."""
+        checks.unmasked("x", x)
+        return super().dot(x)
+
+    def _rdot(self, x: Any) -> Any:
+        checks.unmasked("x", x)
+        return super()._rdot(x)
 
     def _matmat(self, X: np.ndarray) -> np.ndarray:
         return self.apply(self.device.upload(checks.real("x", X))).get()
-
-    def _rmatmat(self, X: np.ndarray) -> np.ndarray:
-        return self.apply_transpose(self.device.upload(checks.real("x", X))).get()
-
-    def _matvec(self, x: np.ndarray) -> np.ndarray:
-        return self._matmat(np.ravel(x))
-
-    def _rmatvec(self, x: np.ndarray) -> np.ndarray:
-        return self._rmatmat(np.ravel(x))
 
     def _transpose(self) -> Operator:  # pyright: ignore[reportIncompatibleMethodOverride]
         return Transposed(self)
@@ -254,12 +246,7 @@ class Stepper:
     """Steps of a stationary iteration: x += d; r -= S d; d = keep d + gain r.
 
     With keep = 0 they are Jacobi's (gain 1, eq. 20) or Richardson's; with the right numbers Chebyshev's.
-    Norms of residuals stay on the device until several are read at once.
-
-    Attributes
-    ----------
-    waiting : int
-        Steps since norms were read last.
+    `waiting` counts the steps whose norms were not read yet.
     """
 
     def __init__(self, A: Operator, x: Array, r: Array, slots: int, a: float, c: float) -> None:
@@ -270,7 +257,7 @@ class Stepper:
         self._prepare()
 
     def _prepare(self) -> None:
-        """Set up `_partials` (slots, groups, k) and whatever a step needs."""
+        # (slots, groups, k) squares of residuals
         self._partials = self.A.device.empty((self.slots, vectors.step_groups(self.x), self.x.columns))
         self._product = self.A.bind(self.d, self.other, Epilogue(self._a, c=self._c))
 
@@ -280,12 +267,9 @@ class Stepper:
 
     def step(self, keep: float, gain: float) -> None:
         """Queue one step: x moves along d, and the next d is keep d + gain r with the new r."""
-        self._queue(keep, gain)
-        self.waiting += 1
-
-    def _queue(self, keep: float, gain: float) -> None:
         self._product()
         vectors.queue_step(self.other, self.x, self.r, self.d, keep, gain, self._partials, self.waiting)
+        self.waiting += 1
 
     def norms(self) -> np.ndarray:
         """Norms (waiting, k) float64 of the residuals since the last call, newest last; waits once."""
@@ -316,7 +300,7 @@ class Transposed(Operator):
 
 
 def widths(columns: int) -> list[tuple[int, int]]:
-    """Cut k right-hand sides into launches: (offset, width) pairs.
+    """Launches of k right-hand sides, as (offset, width) pairs.
 
     >>> widths(11)
     [(0, 8), (8, 3)]

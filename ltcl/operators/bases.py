@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Bases: in which coefficients a picture is written. What they promise, and those made of others.
+"""Bases: in which coefficients a picture is written, and some of their coefficients as bases of their own.
 
-An operator between two of them is R = W_out^T C W_in: W takes pictures (N,) to coefficients (M,). Smooth
-light transport in wavelets leaves most rows and columns of C empty: the others are its support, and with P,
-(M, N), that picks them, C = P^T (P C P^T) P, so that vectors of M numbers will do where there were N.
+An operator between two bases is R = W_out^T C W_in. Smooth light transport in wavelets leaves most rows and
+columns of C empty; with P, (M, N), that picks the others, its support, C = P^T (P C P^T) P.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from ltcl.operators.base import PLAIN, WIDTHS, Epilogue, Operator
 
 _GROUP = 64  # work-items side by side
 _GROUPS = 1 << 14  # items along the second and third dimension, where kernels stride: GPUs take 65535 groups
+_SMALL = 4096  # cells of a level from which on one launch does all the rest
 _MOST = 0.5  # of the coefficients: where more are in the support, restricting to them gains little
 
 
@@ -32,27 +32,21 @@ class Basis(Operator):
     grid : (h, w)
         Of the pictures; N = h * w pixels, row-major.
     name : str
-        As `ltcl.operators.basis` takes it, where it can.
+        As `ltcl.operators.basis` takes it.
     orthonormal : bool
         Whether W W^T = W^T W = I, so that synthesis undoes analysis and keeps norms.
     isometric : bool
-        Whether W W^T = I at least, so that synthesis keeps norms: some coefficients of an orthonormal basis.
+        Whether W W^T = I at least, so that synthesis keeps norms.
     """
 
     orthonormal = True
     isometric = True
 
     def __init__(
-        self,
-        device: Device,
-        grid: tuple[int, int],
-        name: str,
-        coefficients: int | None = None,
-        *parts: Operator | Array,
+        self, device: Device, grid: Any, name: str, coefficients: int, *parts: Operator | Array | None
     ) -> None:
         self.grid, self.name = checks.grid("grid", grid), name
-        pixels = self.grid[0] * self.grid[1]
-        super().__init__(device, (pixels if coefficients is None else coefficients, pixels), *parts)
+        super().__init__(device, (coefficients, self.grid[0] * self.grid[1]), *parts)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """What `ltcl.operators.basis_of` makes it of again, as arrays that a file can hold."""
@@ -67,7 +61,7 @@ class Basis(Operator):
 
     def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
         """Queue ``out = a (W x) + b y``, or with W^T; y is an array in any case, not read where b is 0."""
-        raise TypeError(f"{type(self).__name__} does not implement _transform")
+        raise NotImplementedError
 
     def _kernel(self, file: str, name: str, k: int, **defines: Any) -> tuple[Kernel, int]:
         """A kernel for k right-hand sides, and in how many pieces it takes them."""
@@ -77,11 +71,8 @@ class Basis(Operator):
 
 def launch_grid(kernel: Kernel, pieces: int, rows: int, columns: int, *arguments: Any) -> None:
     """Queue a kernel that strides through rows and columns: an item a row on CPUs, one a place on GPUs."""
-    rows, columns = min(rows, _GROUPS), min(columns, _GROUPS)
-    if kernel.device.is_cpu:
-        kernel((pieces, 1, rows), (1, 1, 1), *arguments)
-    else:
-        kernel((pieces, columns, rows), (1, _GROUP, 1), *arguments)
+    across, group = (1, 1) if kernel.device.is_cpu else (min(columns, _GROUPS), _GROUP)
+    kernel((pieces, across, min(rows, _GROUPS)), (1, group, 1), *arguments)
 
 
 def launch_group(kernel: Kernel, pieces: int, *arguments: Any) -> None:
@@ -93,21 +84,16 @@ def launch_group(kernel: Kernel, pieces: int, *arguments: Any) -> None:
 class SubsetBasis(Basis):
     """P, (M, N): coefficient i is pixel ``places[i]``; those left out are 0 in P^T. Of all: a permutation.
 
-    Isometric, P P^T = I; orthonormal only where it names all pixels. After a basis,
-    ``Chained(SubsetBasis(...), W)``, it picks from the coefficients of W.
+    With `of` it is P W: some coefficients of W instead of pixels.
 
     Parameters
     ----------
     device : Device
     grid : (h, w)
     places : (M,) of int
-        Pixels, row-major; none twice.
-    name : str, optional
-
-    Raises
-    ------
-    InputError
-        No places, places outside the grid or named twice.
+        Pixels, row-major, or coefficients of W; InputError where there are none, or one twice.
+    of : Basis, optional
+        W, of the same device and grid. Of a subset: places among its coefficients.
 
     Examples
     --------
@@ -118,113 +104,107 @@ class SubsetBasis(Basis):
     ([4.0, 2.0], [0.0, 2.0, 0.0, 4.0])
     """
 
-    def __init__(self, device: Device, grid: tuple[int, int], places: Any, name: str = "subset") -> None:
+    def __init__(self, device: Device, grid: Any, places: Any, of: Basis | None = None) -> None:
         h, w = checks.grid("grid", grid)
-        self.places = _places(places, h * w)
-        inverse = np.full(h * w, -1)
+        if of is not None and (of.device is not device or of.grid != (h, w)):
+            raise InputError(f"of is for {of.grid} on {of.device}; it must be for {(h, w)} on {device}")
+        self.places = _places(places, h * w if of is None else of.shape[0])
+        if isinstance(of, SubsetBasis):
+            self.places, of = of.places[self.places], of.of
+        self.of, count = of, h * w if of is None else of.shape[0]
+        inverse = np.full(count, -1)
         inverse[self.places] = np.arange(len(self.places))
         self._orders = [device.upload(order, np.int32) for order in (self.places, inverse)]
-        super().__init__(device, (h, w), name, len(self.places), *self._orders)
-        self.orthonormal = self.shape[0] == self.shape[1]
-
-    def diagonal(self) -> np.ndarray:
-        """1 where a pixel keeps its place, (M,) float64."""
-        return (self.places == np.arange(len(self.places))).astype(np.float64)
+        name = "pixels" if of is None else of.name
+        super().__init__(device, (h, w), name, len(self.places), *self._orders, of)
+        self.orthonormal = len(self.places) == count and (of is None or of.orthonormal)
+        self.isometric = of is None or of.isometric
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Name, grid and places."""
-        return {**super().to_arrays(), "places": self.places}
+        """Those of W, or name and grid, and the places."""
+        own = super().to_arrays() if self.of is None else self.of.to_arrays()
+        return {**own, "places": self.places}
 
     def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
         order, k = self._orders[transpose], x.columns
         kernel, pieces = self._kernel("ordered", "gather", k)
-        items = pieces, min(order.size, _GROUPS)
-        kernel(items, (1, _GROUP), order.size, k, a, b, order, x, y, out)
+        items, group = (pieces, min(order.size, _GROUPS)), (1, _GROUP)
+        if self.of is None:
+            kernel(items, group, order.size, k, a, b, order, x, y, out)
+            return
+        coefficients = self.device.empty((self.of.shape[0], *x.shape[1:]))
+        if transpose:
+            kernel(items, group, order.size, k, 1.0, 0.0, order, x, x, coefficients)
+            self.of._product(coefficients, out, Epilogue(a, b, y), True)
+        else:
+            self.of._product(x, coefficients, PLAIN, False)
+            kernel(items, group, order.size, k, a, b, order, coefficients, y, out)
 
 
-class Chained(Basis):
-    """One basis after another: ``outer @ inner``, such as wavelets and some of their coefficients.
+class Pyramid(Basis):
+    """A quad-tree: sums over the cells of all levels, (M, N), the finest first (`kernels/pyramid.cl`).
 
-    Parameters
+    Level 0 is the pixels; a cell of each further level covers 2 x 2 of the one before, fewer at the edges,
+    until one cell is left: the basis of transports that were scanned adaptively. Not orthonormal.
+
+    Attributes
     ----------
-    outer : Basis, (L, M)
-        Takes the coefficients of `inner` for its pixels.
-    inner : Basis, (M, N)
+    cells : tuple of (rows, columns)
+        Of each level, ceil(h / 2^level) x ceil(w / 2^level), row-major one behind the other.
+
+    Examples
+    --------
+    >>> import ltcl, numpy
+    >>> from ltcl.operators import Pyramid
+    >>> W = Pyramid(ltcl.open_device(), (2, 3))
+    >>> (W @ numpy.arange(6.0)).tolist()  # pixels, then 0 + 1 + 3 + 4 and 2 + 5, then all
+    [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 8.0, 7.0, 15.0]
     """
 
-    def __init__(self, outer: Basis, inner: Basis) -> None:
-        if outer.shape[1] != inner.shape[0]:
-            raise InputError(
-                f"outer is for {outer.shape[1]} values; it must be for the {inner.shape[0]} of inner"
-            )
-        if outer.device is not inner.device:
-            raise InputError(f"outer is on {outer.device}; it must be on {inner.device}, as inner is")
-        name = f"{inner.name}, {outer.name}"
-        super().__init__(inner.device, inner.grid, name, outer.shape[0], outer, inner)
-        self.outer, self.inner = outer, inner
-        self.orthonormal = outer.orthonormal and inner.orthonormal
-        self.isometric = outer.isometric and inner.isometric
+    orthonormal = False
+    isometric = False
 
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Those of both, named ``outer.`` and ``inner.``."""
-        parts = {"outer": self.outer, "inner": self.inner}
-        return {f"{part}.{key}": value for part in parts for key, value in parts[part].to_arrays().items()}
+    def __init__(self, device: Device, grid: tuple[int, int]) -> None:
+        h, w = checks.grid("grid", grid)
+        levels = range((max(h, w) - 1).bit_length() + 1)
+        self.cells = tuple((-(-h // 2**level), -(-w // 2**level)) for level in levels)
+        super().__init__(device, grid, "pyramid", sum(h * w for h, w in self.cells))
 
     def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
-        first, second = (self.outer, self.inner) if transpose else (self.inner, self.outer)
-        between = self.device.empty((self.inner.shape[0], *x.shape[1:]))
-        first._product(x, between, PLAIN, transpose)
-        second._product(between, out, Epilogue(a, b, y), transpose)
+        k, levels = x.columns, len(self.cells)
+        kernel, pieces = self._kernel("pyramid", "spread" if transpose else "gather", k)
+        if transpose:
+            launch_grid(kernel, pieces, *self.grid, *self.grid, levels, k, a, b, x, y, out)
+            return
+        sums = self.device.empty((self.shape[0] + levels) * k)  # a spare cell a level
+        large = sum(h * w > _SMALL for h, w in self.cells)
+        for level in range(large):
+            arguments = (*self.grid, level, level + 1, k, a, b, x, sums, y, out)
+            launch_grid(kernel, pieces, *self.cells[level], *arguments)
+        launch_group(kernel, pieces, *self.grid, large, levels, k, a, b, x, sums, y, out)
 
 
-def support(core: Any) -> np.ndarray | None:
-    """The coefficients whose row or column of a square sparse `core` is not empty, where they are few.
+def restrict_to_support(core: Any, W: Basis) -> tuple[scipy.sparse.csr_array, Basis]:
+    """C and W with W^T C W as before, on the support of the square sparse C alone: rows or columns not empty.
 
-    None where they are more than half. There is always one at least.
-
-    >>> support(scipy.sparse.csr_array(([0.5], ([1], [3])), shape=(5, 5))).tolist()
-    [1, 3]
+    Where that is more than half of all coefficients, both come back as they were.
     """
     core = scipy.sparse.csr_array(core)
     used = np.diff(core.indptr) > 0
     used[core.indices] = True
     places = np.flatnonzero(used) if used.any() else np.arange(min(1, len(used)))
-    return places if len(places) <= _MOST * len(used) else None
-
-
-def restrict(W: Basis, places: np.ndarray) -> Basis:
-    """The coefficients `places` of W as a basis; a choice among coefficients becomes part of the new one."""
-    if isinstance(W, SubsetBasis):
-        return SubsetBasis(W.device, W.grid, W.places[places])
-    if isinstance(W, Chained) and isinstance(W.outer, SubsetBasis):
-        return restrict(W.inner, W.outer.places[places])
-    return Chained(SubsetBasis(W.device, (1, W.shape[0]), places), W)
-
-
-def restrict_to_support(core: Any, W: Basis) -> tuple[scipy.sparse.csr_array, Basis]:
-    """C and W with W^T C W as before, but on the support of C alone where that is small."""
-    core, places = scipy.sparse.csr_array(core), support(core)
-    if places is None:
+    if len(places) > _MOST * len(used):
         return core, W
-    return scipy.sparse.csr_array(core[places][:, places]), restrict(W, places)
+    return scipy.sparse.csr_array(core[places][:, places]), SubsetBasis(W.device, W.grid, places, W)
 
 
 def multiresolution_order(grid: Any, levels: int) -> np.ndarray:
     """An order of 2-D wavelet coefficients in which those of one place and size stand together, (N,) int64.
 
-    From coarse to fine; in each level along a Hilbert curve, the details of a place side by side. Rows of
-    W R W^T then have their large entries in runs, which `Tiles` hold under one column index each: with 30
-    numbers a row kept (diffuse dihedral, N = 4608, db2), 7.7 tiles of 8 instead of 9.7.
+    From coarse to fine, in each level row by row, the details of a place side by side: rows of W R W^T then
+    have their large entries in runs, which `Tiles` of 8 hold in a fifth fewer bytes (diffuse dihedral,
+    N = 4608, db2, 30 numbers a row). Coefficients are in the layout of a `Wavelet` of so many `levels`.
 
-    Parameters
-    ----------
-    grid : (h, w)
-        Coefficients in the layout of `Wavelet`; of a length n the approximation has ceil(n / 2).
-    levels : int
-        Of the transform, 0 or more.
-
-    Examples
-    --------
     >>> multiresolution_order((2, 4), 1).tolist()
     [0, 1, 2, 4, 6, 3, 5, 7]
     """
@@ -239,29 +219,15 @@ def multiresolution_order(grid: Any, levels: int) -> np.ndarray:
         band += 2 * down + right
         level[down | right] = levels - split
         h, w = rows, columns
-    return np.lexsort((band, _hilbert(y, x), level))
+    return np.lexsort((band, x, y, level))
 
 
-def _hilbert(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """How far along Hilbert's curve through the least square that holds them the places (y, x) stand."""
-    half = 1 << (int(max(y.max(), x.max())).bit_length())
-    distance = np.zeros_like(y)
-    while half := half >> 1:
-        below, right = (y & half) > 0, (x & half) > 0
-        distance += half * half * ((3 * right) ^ below)
-        y, x = y & (half - 1), x & (half - 1)
-        turned = right & ~below
-        y, x = np.where(turned, half - 1 - y, y), np.where(turned, half - 1 - x, x)
-        y, x = np.where(below, y, x), np.where(below, x, y)
-    return distance
-
-
-def _places(places: Any, pixels: int) -> np.ndarray:
+def _places(places: Any, count: int) -> np.ndarray:
     places = checks.real("places", places)
     if places.ndim != 1 or not len(places) or places.dtype.kind not in "iu":
         raise InputError(f"places has shape {places.shape} of {places.dtype}; it must be (M,) whole numbers")
-    if places.min() < 0 or places.max() >= pixels:
-        raise InputError(f"places reach from {places.min()} to {places.max()}; they must be among {pixels}")
-    if len(np.unique(places)) < len(places):
-        raise InputError(f"places name some of {pixels} pixels twice; they must be different")
+    if places.min() < 0 or places.max() >= count or len(np.unique(places)) < len(places):
+        raise InputError(
+            f"places are {places.min()} to {places.max()}; they must be different, below {count}"
+        )
     return places.astype(np.int64)

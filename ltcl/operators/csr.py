@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compressed sparse rows: float32 values, 32-bit column indices, y = A x by `kernels/csr.cl`.
 
-A transposed product uses A^T in the same format, built and uploaded at the first one: twice the memory,
-but the same speed and the same bits at every call, which scattered additions would not give.
-
-A matrix may come a block of rows at a time, as from a file. Then the host keeps row pointers alone: diagonal
-and norms have all blocks read again; a transposed product and the places of nonzeros keep them, too.
+A transposed product uses A^T in the same format, made at the first one: twice the memory, but the same bits
+at every call, which scattered additions would not give. Of a matrix that comes in blocks of rows the host
+keeps row pointers alone: diagonal and norms have all blocks read again.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -20,45 +18,47 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.device import Array, Device
-from ltcl.operators.rows import RowOperator, Slab, cut, largest
+from ltcl.operators.rows import RowOperator, Slab, cut
 
 Blocks = Callable[[], Iterator[tuple[int, Any]]]
 _SLAB = 1 << 26  # bytes: smaller blocks are joined, since each slab is a launch
 
 
+@dataclass(frozen=True, eq=False)
 class Pattern:
-    """Where the nonzeros are, on the device. Colour channels with one pattern store it once.
+    """Where the nonzeros are: pointers from 0 and columns of each slab, which channels may share."""
 
-    Made from a checked `csr_array`. Slabs are (start, stop) rows; each has pointers (rows + 1,) from 0 and
-    columns (nnz,).
-    """
+    device: Device
+    shape: tuple[int, int]
+    indptr: np.ndarray  # (M + 1,) int64
+    indices: np.ndarray | None  # (nnz,); None where the host does not keep them
+    cuts: list[tuple[int, int]]
+    slabs: list[tuple[Array, Array]]
 
-    def __init__(self, device: Device, matrix: Any) -> None:
-        self.device = device
-        self.shape: tuple[int, int] = matrix.shape
-        self.indptr = matrix.indptr.astype(np.int64)
-        self.indices = matrix.indices
-        row_bytes = np.maximum(4 * np.diff(self.indptr), 4)  # pointers weigh as much as one nonzero
-        # There is one pointer more than rows.
-        self.cuts = cut(row_bytes, largest(device) - 4, "the sparse matrix")
-        self.slabs = [self._upload(start, stop) for start, stop in self.cuts]
-
-    def _upload(self, start: int, stop: int) -> tuple[Array, Array]:
-        pointers = self.indptr[start : stop + 1] - self.indptr[start]
-        columns = self.indices[self.indptr[start] : self.indptr[stop]]
-        return self.device.upload(pointers, np.int32), self.device.upload(columns, np.int32)
-
-    def with_values(self, data: np.ndarray) -> list[Slab]:
-        """The slabs of a matrix of this pattern with values `data` (nnz,)."""
+    @classmethod
+    def of(cls, device: Device, matrix: Any) -> Pattern:
+        """That of a checked `csr_array`, uploaded."""
+        indptr, upload = matrix.indptr.astype(np.int64), device.upload
+        row_bytes = np.maximum(4 * np.diff(indptr), 4)  # pointers weigh as much as one nonzero
+        cuts = cut(device, row_bytes, "the sparse matrix")
         slabs = []
-        for (start, stop), (pointers, columns) in zip(self.cuts, self.slabs, strict=True):
+        for start, stop in cuts:
+            pointers = indptr[start : stop + 1]
+            columns = matrix.indices[pointers[0] : pointers[-1]]
+            slabs.append((upload(pointers - pointers[0], np.int32), upload(columns, np.int32)))
+        return cls(device, matrix.shape, indptr, matrix.indices, cuts, slabs)
+
+    def with_values(self, data: np.ndarray, first: int = 0) -> list[Slab]:
+        """The slabs of a matrix of this pattern with values `data` (nnz,), from row `first` on."""
+        slabs = []
+        for (start, stop), places in zip(self.cuts, self.slabs, strict=True):
             values = self.device.upload(data[self.indptr[start] : self.indptr[stop]])
-            slabs.append(Slab(start, stop - start, (pointers, columns, values)))
+            slabs.append(Slab(first + start, stop - start, (*places, values)))
         return slabs
 
     def matches(self, matrix: Any) -> bool:
-        """Whether `matrix` has its nonzeros in the same places."""
-        if self.shape != matrix.shape or len(self.indices) != matrix.nnz:
+        """Whether `matrix` has its nonzeros in the same places, as far as the host can tell."""
+        if self.indices is None or self.shape != matrix.shape or len(self.indices) != matrix.nnz:
             return False
         same = self.indices is matrix.indices or np.array_equal(self.indices, matrix.indices)
         return same and np.array_equal(self.indptr, matrix.indptr)
@@ -71,16 +71,9 @@ class CSR(RowOperator):
     ----------
     device : Device
     matrix : scipy.sparse matrix or array, (M, N)
-        Checked before anything is uploaded.
+        InputError where it is malformed or not finite, MemoryLimitError where the device has no room for it.
     pattern : Pattern, optional
-        That of another channel; used, and so stored once, where the nonzeros are in the same places.
-
-    Raises
-    ------
-    InputError
-        Column indices out of range, row pointers that fall, NaN or infinite values.
-    MemoryLimitError
-        More than the device holds; said before anything is allocated.
+        That of another channel; shared where the nonzeros are in the same places.
 
     Examples
     --------
@@ -98,18 +91,18 @@ class CSR(RowOperator):
         super().__init__(device, matrix.shape)
         shared = pattern is not None and pattern.device is device and pattern.matches(matrix)
         device.require(matrix.nnz * (4 if shared else 8), f"a sparse matrix of {matrix.nnz} nonzeros")
-        self.pattern = pattern if pattern is not None and shared else Pattern(device, matrix)
+        self.pattern = pattern if pattern is not None and shared else Pattern.of(device, matrix)
         self.slabs = self.pattern.with_values(matrix.data)
         self.nnz: int = matrix.nnz
         self._host = matrix
 
     @property
     def data(self) -> np.ndarray:
-        """The values on the host, (nnz,), in the order of `pattern`."""
+        """The values on the host, (nnz,)."""
         return self._host.data
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
-        """The matrix as it was given, in float64."""
+        """The whole matrix."""
         yield 0, self._host.astype(np.float64)
 
     def matrix(self) -> scipy.sparse.csr_array:
@@ -121,7 +114,7 @@ class CSR(RowOperator):
         return {
             "shape": np.array(self.shape, np.int64),
             "data": self.data.astype(np.float32),
-            "indices": self.pattern.indices.astype(np.int32),
+            "indices": self._host.indices.astype(np.int32),
             "indptr": self.pattern.indptr,
         }
 
@@ -140,23 +133,16 @@ class CSR(RowOperator):
 
 
 class RowBlocks(CSR):
-    """A sparse (M, N) matrix on the device, uploaded block by block.
+    """A sparse (M, N) matrix on the device, uploaded block by block; refuses what `CSR` refuses.
 
     Parameters
     ----------
     device : Device
     shape : (M, N)
     blocks : function
-        Gives (first row, csr_array) of all blocks, in order; each is gone from memory before the next comes.
+        Gives (first row, csr_array) of all blocks, in order.
     nnz : int
         Nonzeros there are at most.
-
-    Raises
-    ------
-    InputError
-        A block that is malformed or holds NaN.
-    MemoryLimitError
-        More than the device holds; said before anything is allocated.
 
     Examples
     --------
@@ -173,10 +159,11 @@ class RowBlocks(CSR):
         self._blocks = blocks
         self.slabs, pointers = [], [np.zeros(1, np.int64)]
         for first, block in self.blocks():
-            slabs = Pattern(device, block).with_values(block.data)
-            self.slabs += [dataclasses.replace(slab, first=first + slab.first) for slab in slabs]
+            self.slabs += Pattern.of(device, block).with_values(block.data, first)
             pointers.append(block.indptr[1:] + pointers[-1][-1])
-        self.pattern = _PatternOfBlocks(self, np.concatenate(pointers))
+        cuts = [(slab.first, slab.first + slab.rows) for slab in self.slabs]
+        places = [slab.arguments[:2] for slab in self.slabs]
+        self.pattern = Pattern(device, shape, np.concatenate(pointers), None, cuts, places)
         self.nnz = int(self.pattern.indptr[-1])
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
@@ -194,22 +181,6 @@ class RowBlocks(CSR):
     def _host(self) -> scipy.sparse.csr_array:
         checks.fits_host(f"a sparse matrix of {self.nnz} nonzeros", 24 * self.nnz)
         return _joined(0, [block for _, block in self._blocks()])
-
-
-class _PatternOfBlocks(Pattern):
-    """The pattern of all blocks; places of nonzeros are read again when they are asked for."""
-
-    def __init__(self, owner: RowBlocks, indptr: np.ndarray) -> None:
-        self.device, self.shape, self.indptr, self._owner = owner.device, owner.shape, indptr, owner
-        self.slabs = [slab.arguments[:2] for slab in owner.slabs]
-
-    @property
-    def indices(self) -> np.ndarray:
-        return self._owner._host.indices
-
-    def matches(self, matrix: Any) -> bool:
-        """Not asked: it would take all blocks in memory."""
-        return False
 
 
 def _joined(first: int, blocks: list[Any]) -> scipy.sparse.csr_array:

@@ -13,7 +13,7 @@ from ltcl import checks
 from ltcl.device import Array, Device
 from ltcl.errors import InputError
 from ltcl.operators.base import Epilogue, widths
-from ltcl.operators.rows import RowOperator, Slab, cut, largest
+from ltcl.operators.rows import RowOperator, Slab, cut
 
 _STRIP = 256  # columns of a work-item of a transposed product on a CPU, as in kernels/dense.cl
 _CHUNKS, _CHUNK_ROWS = 64, 32  # of a transposed product: enough groups for a large GPU, none too short
@@ -26,13 +26,7 @@ class Dense(RowOperator):
     ----------
     device : Device
     matrix : (M, N) array of real numbers
-
-    Raises
-    ------
-    InputError
-        Not two-dimensional, NaN or infinite values.
-    MemoryLimitError
-        More than the device holds; said before anything is allocated.
+        InputError where some are not finite, MemoryLimitError where the device has no room for it.
 
     Examples
     --------
@@ -44,6 +38,9 @@ class Dense(RowOperator):
     """
 
     file = "dense"
+    given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = (
+        None  # (A, d, e): it is A / d - diag(e), rounded to float32
+    )
 
     def __init__(self, device: Device, matrix: Any) -> None:
         host = checks.real("matrix", matrix)
@@ -54,7 +51,7 @@ class Dense(RowOperator):
         device.require(4 * host.size, f"a dense matrix {host.shape}")
         self.defines = {"LANES": 8 if device.is_cpu else 1}
         rows, width = host.shape
-        cuts = cut(np.full(rows, 4 * max(width, 1)), largest(device), "the dense matrix")
+        cuts = cut(device, np.full(rows, 4 * max(width, 1)), "the dense matrix")
         self.slabs = [Slab(a, b - a, (width, device.upload(host[a:b]))) for a, b in cuts]
 
     def blocks(self) -> Iterator[tuple[int, np.ndarray]]:
@@ -78,24 +75,21 @@ class Dense(RowOperator):
         return super()._bound(x, out, epilogue, False)
 
     def _transposed_product(self, x: Array, out: Array, epilogue: Epilogue) -> None:
-        for slab in self.slabs:
-            self._transposed_slab(slab, x, out, epilogue)
-            epilogue = Epilogue(epilogue.a, 1.0, out)  # the following slabs add to what the first has written
-
-    def _transposed_slab(self, slab: Slab, x: Array, out: Array, epilogue: Epilogue) -> None:
-        """The share of one slab, in chunks of rows where there are more work-items to feed than columns."""
+        """Slab by slab, in chunks of rows where there are more work-items to feed than columns."""
         lanes = self.defines["LANES"]
-        items, group = -(-self.shape[1] // _STRIP) if lanes > 1 else self.shape[1], 1 if lanes > 1 else 64
-        chunks = 1 if lanes > 1 else max(1, min(_CHUNKS, -(-slab.rows // _CHUNK_ROWS)))
-        a, b, y, c = epilogue
-        y = out if y is None else y
-        sums, numbers = out, (a, b, c)
-        if chunks > 1:
-            sums, numbers = self.device.empty((chunks, *out.shape)), (a, 0.0, 0.0)
-        for offset, width in widths(x.columns):
-            kernel = self.kernel("dense_rmatvec", width, x.columns)
-            place = (slab.rows, slab.first, x.columns, offset)
-            kernel((items, chunks), (group, 1), *place, *numbers, x, y, sums, *slab.arguments)
-        if chunks > 1:
-            kernel = self.kernel("dense_rmatvec_sum", 1, 1)
-            kernel(out.size, 256, out.size, chunks, b, c, x, y, out, sums)
+        items, group = (-(-self.shape[1] // _STRIP), 1) if lanes > 1 else (self.shape[1], 64)
+        for slab in self.slabs:
+            chunks = 1 if lanes > 1 else max(1, min(_CHUNKS, -(-slab.rows // _CHUNK_ROWS)))
+            a, b, y, c = epilogue
+            y = out if y is None else y
+            sums, numbers = out, (a, b, c)
+            if chunks > 1:
+                sums, numbers = self.device.empty((chunks, *out.shape)), (a, 0.0, 0.0)
+            for offset, width in widths(x.columns):
+                kernel = self.kernel("dense_rmatvec", width, x.columns)
+                place = (slab.rows, slab.first, x.columns, offset)
+                kernel((items, chunks), (group, 1), *place, *numbers, x, y, sums, *slab.arguments)
+            if chunks > 1:
+                kernel = self.kernel("dense_rmatvec_sum", 1, 1)
+                kernel(out.size, 256, out.size, chunks, b, c, x, y, out, sums)
+            epilogue = Epilogue(a, 1.0, out)  # the following slabs add to what the first has written

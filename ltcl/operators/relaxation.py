@@ -8,7 +8,6 @@ small blocks in one launch and substitutes row after row; a GPU takes two launch
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,23 +52,18 @@ class Rows:
 
     def inverse_blocks(self, size: int, omega: float | None, method: str) -> np.ndarray:
         """P_BB^-1 below each other, (N, size), of triangles with D / omega; of all of S_BB without omega."""
-        n = self.M.shape[0]
+        n, whole = self.M.shape[0], host(self.M)
         self.M.device.require(4 * n * size, f"method={method!r} with inverses of {-(-n // size)} blocks")
         if omega is not None:
             self.inverse_diagonal(method)
-        inverses, starts = np.zeros((n, size)), range(0, n, size)
-        for first, rows in self.M.blocks():  # which may begin and end within a block of S
-            for start in starts[first // size : -(-(first + rows.shape[0]) // size)]:
-                top, bottom = max(start - first, 0), min(start + size - first, rows.shape[0])
-                part = rows[top:bottom, start : start + size]
-                part = part if isinstance(part, np.ndarray) else part.toarray()
-                inverses[first + top : first + bottom, : part.shape[1]] = self.scale * part
-        for start in starts:
-            P = inverses[start : start + size, : min(size, n - start)]
-            P += self.shift * np.eye(len(P))
+        inverses = np.zeros((n, size))
+        for start in range(0, n, size):
+            B = slice(start, start + size)
+            P = whole[B, B] if isinstance(whole, np.ndarray) else whole[B, B].toarray()
+            P = self.shift * np.eye(len(P)) + self.scale * P.astype(np.float64)
             if omega is not None:
-                P[:] = np.tril(P, -1) + np.diag(P.diagonal() / omega)
-            P[:] = _inverse(P, f"method={method!r}", start)
+                P = np.tril(P, -1) + np.diag(P.diagonal() / omega)
+            inverses[B, : len(P)] = _inverse(P, method, start)
         return inverses
 
 
@@ -81,9 +75,14 @@ def _inverse(P: np.ndarray, method: str, start: int) -> np.ndarray:
     except np.linalg.LinAlgError:
         pass
     raise InputError(
-        f"{method} inverts blocks of S, and the one of rows {start} to {start + len(P) - 1} is singular; "
+        f"method={method!r} inverts blocks of S; that of rows {start} to {start + len(P) - 1} is singular: "
         "choose another block= or use method='direct'"
     )
+
+
+def host(M: CSR | Dense) -> Any:
+    """M on the host, float32 as on the device: a csr_array or an array."""
+    return M.matrix() if isinstance(M, CSR) else np.concatenate([slab.arguments[1].get() for slab in M.slabs])
 
 
 def entries(slab: Slab, unread: Array) -> tuple[Any, ...]:
@@ -112,16 +111,13 @@ class Relaxation:
             else:
                 weights = rows.inverse_diagonal(method)
             self.weights = device.upload(weights.astype(np.float32))
-        self.windows = [self._split(slab) for slab in M.slabs]
-
-    def _split(self, slab: Slab) -> Array:
-        """Where the kernels split the rows of a sparse slab."""
-        if isinstance(self.rows.M, Dense):
-            return self.weights  # not read
-        windows = self.rows.M.device.empty((slab.rows, 2), np.int32)
-        place = (slab.rows, slab.first, self.block, self.panel, int(self.inverses))
-        self.rows.kernel("relax", "relax_windows", K=1)(slab.rows, None, *place, *slab.arguments[:2], windows)
-        return windows
+        self.windows = [self.weights for _ in M.slabs]  # of a dense matrix they are not read
+        if isinstance(M, CSR):
+            self.windows = [device.empty((slab.rows, 2), np.int32) for slab in M.slabs]
+            kernel = rows.kernel("relax", "relax_windows", K=1)
+            for slab, windows in zip(M.slabs, self.windows, strict=True):
+                place = (slab.rows, slab.first, self.block, self.panel, int(self.inverses))
+                kernel(slab.rows, 64, *place, *slab.arguments[:2], windows)
 
 
 class Sweeps:
@@ -202,11 +198,10 @@ class Steps:
         """Queue one step; `r` learns of its picks at the next, or at one that picks nothing."""
         n, k, kernel = self.x.shape[0], self.x.columns, self.rows.kernel("southwell", "southwell_step")
         group, groups = kernel.group(self.group), min(self.groups, self.parts)
-        launch = functools.partial(kernel, (groups * group, k), (group, 1))
-        local = self.x.device.local(group)
-        vectors = (self._inverse, self.x, self.r, *self._picked, *self._next, local, local)
+        vectors = (self._inverse, self.x, self.r, *self._picked, *self._next, self.x.device.local(group))
         for slab in self._slabs:
             last = picks and slab is self._slabs[-1]
             place = (n, self.parts, self._pending, int(last), k, self.rows.shift, self.rows.scale)
-            launch(*place, slab.rows, slab.first, *entries(slab, self._inverse), *vectors)
+            arguments = (*place, slab.rows, slab.first, *entries(slab, self._inverse), *vectors)
+            kernel((groups * group, k), (group, 1), *arguments)
         self._picked, self._next, self._pending = self._next, self._picked, self.parts if picks else 0

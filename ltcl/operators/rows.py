@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Operators whose matrix lies on the device as slabs of rows: how their products and steps are launched.
 
-Kernels of such a format `f` come as `f_matvec`, `f_matvec_stream` and `f_matvec_group`, and take the
-arguments of `kernels/common/product.h`, those of a slab and local memory.
+Kernels are those of `kernels/common/product.h`: they take its arguments, a slab's and local memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import permutations
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -43,7 +41,7 @@ class Slab:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to run a kernel over rows: work-groups of `group` items, which share a row or have one each."""
+    """A kernel over rows: work-groups of `group` items, which share a row or have one each."""
 
     suffix: str
     group: int
@@ -59,12 +57,13 @@ class RowOperator(Operator):
     """An operator stored as slabs of rows. Subclasses set `file`, `defines`, `slabs`, and give `blocks`."""
 
     file: str  # stem of the kernel file
-    defines: Mapping[str, Any] = MappingProxyType({})
+    defines: dict[str, int]
     unit = 1.0  # of the numbers in the slabs
     slabs: list[Slab]
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         super().__init__(device, shape)
+        self.defines = {}
         self._fastest: dict[tuple[int, int], Variant] = {}
         self._transposed: RowOperator | None = None
         self.relaxations: dict[tuple[Any, ...], Any] = {}  # of relaxation.py: lives as long
@@ -77,7 +76,7 @@ class RowOperator(Operator):
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """(first row, rows on the host): float64 arrays or csr_arrays (rows, N) of what it stands for."""
-        raise TypeError(f"{type(self).__name__} does not implement blocks")
+        raise NotImplementedError
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64."""
@@ -99,9 +98,7 @@ class RowOperator(Operator):
             inf = max(inf, float(sizes.sum(axis=1).max(initial=0.0)))
         return Norms(float(columns.max(initial=0.0)), inf, squares**0.5, lowest)
 
-    def to_dense(self) -> np.ndarray:
-        """The whole matrix that it stands for, (M, N) float64, on the host."""
-        checks.fits_host(f"a dense matrix {self.shape}", 8 * self.shape[0] * self.shape[1])
+    def _dense(self) -> np.ndarray:
         dense = np.empty(self.shape)
         for first, rows in self.blocks():
             here = rows.toarray() if scipy.sparse.issparse(rows) else rows
@@ -115,10 +112,10 @@ class RowOperator(Operator):
         return self._transposed
 
     def _transposed_rows(self) -> RowOperator:
-        raise TypeError(f"{type(self).__name__} does not implement _transposed_rows")
+        raise NotImplementedError
 
     def variants(self) -> dict[str, Variant]:
-        """The ways to run a product here, the default first."""
+        """The kernels and work-groups that make a product here, the default first."""
         item = Variant("", 16 if self.device.is_cpu else 64, shared=False)
         if self.device.is_cpu:
             return {"stream": Variant("_stream", 16, shared=False), "item": item}
@@ -126,15 +123,14 @@ class RowOperator(Operator):
         return {**{f"group{size}": Variant("_group", size, shared=True) for size in groups}, "item": item}
 
     def fastest(self, x: Array, width: int) -> Variant:
-        """The way to run products with `width` of the right-hand sides `x`, timed at the first call."""
+        """The variant for products with `width` of the right-hand sides `x`, timed at the first call."""
         key = (width, x.columns)
         if key not in self._fastest:
             self._fastest[key] = self._measure(x, width)
         return self._fastest[key]
 
     def _measure(self, x: Array, width: int) -> Variant:
-        variants = self.variants()
-        slab = max(self.slabs, key=lambda slab: slab.nbytes)
+        variants, slab = self.variants(), max(self.slabs, key=lambda slab: slab.nbytes)
         if self.device.is_cpu and slab.nbytes < _WORTH_TIMING:
             return next(iter(variants.values()))
         # Timed on the real matrix, into an array nobody needs: `out` may be an operand.
@@ -172,12 +168,13 @@ class RowOperator(Operator):
         ]
         return launches[0] if len(launches) == 1 else lambda: [launch() for launch in launches]
 
-    def _stepper(self, x: Array, r: Array, slots: int, a: float, c: float) -> Stepper:
+    def stepper(self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0) -> Stepper:
+        """Steps of one launch each; see `Operator.stepper`."""
         return RowStepper(self, x, r, slots, a * self.unit, c)
 
 
 class RowStepper(Stepper):
-    """Steps of which each is one launch, or one a slab and eight right-hand sides."""
+    """Steps of one launch a slab and eight right-hand sides."""
 
     A: RowOperator
 
@@ -204,7 +201,8 @@ class RowStepper(Stepper):
                 arrays = (d, self.x, self.r, following, self._partials, *slab.arguments)
                 turn.append((kernel.bind(items, group, *numbers, *arrays, local), at))
 
-    def _queue(self, keep: float, gain: float) -> None:
+    def step(self, keep: float, gain: float) -> None:
+        """Queue one step; see `Stepper.step`."""
         for launch, at in self._turns[0]:
             launch.set(_KEEP, keep)
             launch.set(_GAIN, gain)
@@ -212,34 +210,22 @@ class RowStepper(Stepper):
             launch()
         self._turns.reverse()
         self.d, self.other = self.other, self.d
+        self.waiting += 1
 
 
-def cut(row_bytes: np.ndarray, limit: int, what: str) -> list[tuple[int, int]]:
-    """Row ranges (start, stop) of slabs, as few as possible, each of at most `limit` bytes.
-
-    `row_bytes` (M,) are those of each row in the largest of a slab's buffers; a single row beyond the limit
-    is refused, naming `what`.
-
-    >>> cut(np.array([4, 4, 4, 4, 4]), 8, "A")
-    [(0, 2), (2, 4), (4, 5)]
-    """
+def cut(device: Device, row_bytes: np.ndarray, what: str, itemsize: int = 4) -> list[tuple[int, int]]:
+    """Rows (start, stop) of as few slabs as possible whose buffer, of `row_bytes` (M,), the device takes."""
+    # Kernels count in 32 bits, also a work-group beyond the end of a row; pointers are rows + 1.
+    limit = min(device.max_allocation - SPARE_BYTES - 4, itemsize * ((1 << 31) - 4096))
     ends = np.concatenate([[0], np.cumsum(row_bytes, dtype=np.int64)])
     pieces, start = [], 0
     while start < len(row_bytes):
         stop = int(np.searchsorted(ends, ends[start] + limit, side="right")) - 1
         if stop == start:
+            row = checks.size(int(row_bytes[start]))
             raise MemoryLimitError(
-                f"row {start} of {what} has {checks.size(int(row_bytes[start]))}, "
-                f"the largest buffer of this device {checks.size(limit)}"
+                f"row {start} of {what} has {row}, the largest buffer of this device {checks.size(limit)}"
             )
         pieces.append((start, stop))
         start = stop
     return pieces or [(0, 0)]
-
-
-def largest(device: Device, itemsize: int = 4) -> int:
-    """Bytes of a slab's largest buffer, of so few values that 32 bits count them.
-
-    Kernels count on beyond the end of a row by a work-group or a stretch: room is left for that.
-    """
-    return min(device.max_allocation - SPARE_BYTES, itemsize * ((1 << 31) - 4096))

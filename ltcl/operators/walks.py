@@ -12,8 +12,8 @@ all p
 
 has the least sum of the second moments of a step, each in units of those that the channel has by itself.
 
-The seed, i and s determine the random numbers of sample s of pixel i: results are the same to the bit for any
-work-group size, device or split into launches, and whether other pixels are asked for or not.
+The seed, i and s determine the random numbers of sample s of pixel i: results are the same to the bit on
+every device, however launches are split, and whether other pixels are asked for or not.
 """
 
 from __future__ import annotations
@@ -31,10 +31,8 @@ from ltcl.errors import InputError
 from ltcl.operators.base import Operator, widths
 from ltcl.operators.csr import CSR
 from ltcl.operators.dense import Dense
-from ltcl.operators.relaxation import readable
+from ltcl.operators.relaxation import host, readable
 
-SAMPLERS = ("alias", "uniform")
-ESTIMATORS = ("endpoint", "collision")
 CHUNK = 64  # samples that are summed on the device
 _COLUMNS = 1 << 22  # that an entry of 64 bits can tell apart
 _HOST_BYTES = 64  # an entry, while linked tables are made
@@ -42,29 +40,28 @@ _CERTAIN = 1 << 22  # chances to go on, of as many
 _NEVER = 64  # walks of a length whose chance is below 2^-64 are cut: nobody will see one
 _UNITS = 1 << 18  # chunks of one launch at most
 _RECORDS = 1 << 22  # samples of one launch of the adjoint at most
-_STEPS = 1 << 23  # steps of one launch for each compute unit, in the mean: half a second
+_STEPS = 1 << 23  # mean steps of one launch for each compute unit: half a second, for who waits for progress
 
 
 class Tables:
     """What a walk over the rows of M needs, see `kernels/common/table.h`; made by `tables`, which keeps it.
 
-    Of the transpose of R, `of_columns`, there is room for one more row, of b; see `append`.
+    Of M^T, with `spare` entries, there is room for one more row, see `append`.
     """
 
     channels = 1
     links: Array | None = None
 
-    def __init__(self, M: CSR | Dense, of_columns: bool = False) -> None:
-        self.device, self.shape, self.of_columns = M.device, M.shape, of_columns
-        self.kept: dict[str, Any] = {}  # what `ltcl.theory.walks` finds out about these walks
+    def __init__(self, M: CSR | Dense, spare: int = 0) -> None:
+        self.device, self.shape, self.transposed = M.device, M.shape, spare > 0
+        self.moments: dict[str, Any] = {}  # of these walks, by `ltcl.theory.walks`
         rows, columns = M.shape
         if columns > _COLUMNS:
             raise InputError(f"R has {columns} columns; walks take at most {_COLUMNS}")
-        self._used = M.nnz if isinstance(M, CSR) else rows * columns
-        entries = self._used + columns * of_columns
-        self.device.require(8 * entries, f"tables of the {entries} entries of R")
-        self.records = self.device.empty((rows + of_columns, 4), np.uint32)
-        self.entries = self.device.empty((entries,), np.uint64)
+        self._used = _count(M)
+        self.device.require(8 * (self._used + spare), f"tables of the {self._used + spare} entries of R")
+        self.records = self.device.empty((rows + (spare > 0), 4), np.uint32)
+        self.entries = self.device.empty((self._used + spare,), np.uint64)
         for slab in M.slabs:
             if isinstance(M, CSR):
                 place, arrays = (int(M.pattern.indptr[slab.first]), 0), slab.arguments
@@ -72,11 +69,6 @@ class Tables:
                 place, arrays = (slab.first * columns, columns), (None, None, slab.arguments[1])
             self._build(slab.rows, slab.first, *place, *arrays)
         self._refuse_overflow("R", slice(rows))
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device."""
-        return self.records.nbytes + self.entries.nbytes + (self.links.nbytes if self.links else 0)
 
     def sums(self) -> np.ndarray:
         """|M_i| of each row, (rows,) float32."""
@@ -89,9 +81,9 @@ class Tables:
 
     def second_moments(self, R: CSR | Dense) -> list[Operator]:
         """Of each channel what a step makes of the second moments of weights: R_ij^2 / p(j | i), (N, N)."""
-        host = _host(R).T if self.of_columns else _host(R)
+        rows = host(R).T if self.transposed else host(R)
         sums = scipy.sparse.diags_array(self.sums()[: self.shape[0]].astype(np.float64))
-        return [_like(R, sums @ abs(host))]
+        return [_like(R, sums @ abs(rows))]
 
     def _build(self, *arguments: Any) -> None:
         kernel = self.device.kernel("alias", "alias_rows")
@@ -107,74 +99,68 @@ class Tables:
 
 
 class Linked(Tables):
-    """What a walk over one or three matrices needs, by chances of its own; 24 bytes an entry of any channel.
+    """What a walk over three matrices needs, by chances of its own; 24 bytes an entry of any channel.
 
     `links`, (entries, 4) uint32, hold the column of each entry and the bits of the factors R_cij / p(j | i);
-    `others` are all of Rs but the first, which keeps these tables. See `linked`.
+    `others` are the matrices but the first, which keeps these tables, found by the ids of all.
     """
 
-    def __init__(self, Rs: Sequence[CSR | Dense], signs: Sequence[float], sampler: str) -> None:
-        self.others, self.channels, device = tuple(Rs[1:]), len(Rs), Rs[0].device
-        most = max(R.nnz if isinstance(R, CSR) else R.shape[0] * R.shape[1] for R in Rs)
-        checks.fits_host("tables of walks that channels share", _HOST_BYTES * most)
-        parts: list[Any] = [scipy.sparse.csr_array(_host(R)).astype(np.float64) for R in Rs]
+    def __init__(self, Rs: Sequence[CSR | Dense], signs: Sequence[float]) -> None:
+        device = Rs[0].device
+        checks.fits_host("tables of walks that channels share", _HOST_BYTES * max(map(_count, Rs)))
+        channels: list[Any] = [scipy.sparse.csr_array(host(R)).astype(np.float64) for R in Rs]
         squares: Any = 0
-        for part in parts:
-            part.eliminate_zeros()
-            rows = abs(part).sum(axis=1)
-            share = scipy.sparse.diags_array(1.0 / np.where(rows > 0.0, rows, 1.0)) @ part
+        for R in channels:
+            R.eliminate_zeros()
+            sums = abs(R).sum(axis=1)
+            share = scipy.sparse.diags_array(1.0 / np.where(sums > 0.0, sums, 1.0)) @ R
             squares = squares + share * share
         P: Any = scipy.sparse.csr_array(squares)
         device.require(16 * P.nnz, f"links of the {P.nnz} entries of R")
-        self.links = device.empty((P.nnz, 4), np.uint32)
         row = np.repeat(np.arange(P.shape[0], dtype=np.int32), np.diff(P.indptr))
-        values = np.ones(P.nnz) if sampler == "uniform" else np.sqrt(P.data / len(parts))
+        values = np.sqrt(P.data / len(Rs))
         places = np.arange(P.nnz) - P.indptr[row]
         super().__init__(CSR(device, scipy.sparse.csr_array((values, places, P.indptr), shape=P.shape)))
-        self._indptr = P.indptr
+        self.others, self.channels, self._pattern = tuple(Rs[1:]), len(Rs), (P.indices, P.indptr)
         self._chances = values.astype(np.float32) / self.sums()[row].astype(np.float64)
-        host = np.zeros(self.links.shape, np.uint32)
-        host[:, 0] = P.indices
+        links = np.zeros((P.nnz, 4), np.uint32)
+        links[:, 0] = P.indices
         numbers = scipy.sparse.csr_array((np.arange(1, P.nnz + 1), P.indices, P.indptr), shape=P.shape)
-        for c, (sign, part) in enumerate(zip(signs, parts, strict=True)):
-            here = (numbers * (part != 0)).data - 1  # the entries of this channel among all
-            chances, factors = self._chances[here], np.zeros(part.nnz)
-            np.divide(sign * part.data, chances, out=factors, where=chances > 0.0)
+        for c, (sign, R) in enumerate(zip(signs, channels, strict=True)):
+            here = (numbers * (R != 0)).data - 1  # the entries of this channel among all
+            chances, factors = self._chances[here], np.zeros(R.nnz)
+            np.divide(sign * R.data, chances, out=factors, where=chances > 0.0)
             with np.errstate(over="ignore"):  # then second moments overflow, too, and are refused
-                host[here, 1 + c] = factors.astype(np.float32).view(np.uint32)
-        self.links.set(host)
+                links[here, 1 + c] = factors.astype(np.float32).view(np.uint32)
+        self.links = device.upload(links, np.uint32)
 
     def second_moments(self, R: CSR | Dense) -> list[Operator]:
         """Of each channel R_ij^2 / p(j | i), (N, N); R is not looked at."""
         assert self.links is not None  # noqa: S101 - made with the tables
-        columns, *bits = np.ascontiguousarray(self.links.get().T)
-        Qs = (self._chances * one.view(np.float32).astype(np.float64) ** 2 for one in bits[: self.channels])
-        place = (columns.astype(np.int32), self._indptr)
-        return [CSR(self.device, scipy.sparse.csr_array((Q, *place), shape=self.shape)) for Q in Qs]
+        factors = np.ascontiguousarray(self.links.get().T[1 : 1 + self.channels]).view(np.float32)
+        Qs = (self._chances * factor.astype(np.float64) ** 2 for factor in factors)
+        return [CSR(self.device, scipy.sparse.csr_array((Q, *self._pattern), shape=self.shape)) for Q in Qs]
 
 
 def tables(M: CSR | Dense) -> Tables:
     """The alias tables of M, made at the first call and kept with it."""
-    return _kept(M, "alias", lambda: Tables(M))
+    return kept(M, "alias", lambda: Tables(M))
 
 
 def tables_of_columns(M: CSR | Dense) -> Tables:
     """Alias tables of M^T, with room for one more row of as many entries as M has rows; kept with M."""
-    return _kept(M, "columns", lambda: Tables(_like(M, _host(M).T), of_columns=True))
+    return kept(M, "columns", lambda: Tables(_like(M, host(M).T), spare=M.shape[0]))
 
 
-def linked(Rs: Sequence[CSR | Dense], signs: Sequence[float], sampler: str = "alias") -> Linked:
-    """The tables of walks over sign R of one or three (N, N), made at the first call, kept with the first.
-
-    `sampler` is "alias", for P as above, or "uniform", where all entries of a row are alike.
-    """
-    key = f"linked {sampler} {tuple(signs)} {[id(R) for R in Rs]}"  # ids of what the tables keep alive
-    return _kept(Rs[0], key, lambda: Linked(Rs, signs, sampler))
+def linked(Rs: Sequence[CSR | Dense], signs: Sequence[float]) -> Linked:
+    """The tables of walks over sign R of three (N, N), made at the first call, kept with the first."""
+    key = f"linked {tuple(signs)} {[id(R) for R in Rs]}"
+    return kept(Rs[0], key, lambda: Linked(Rs, signs))
 
 
 def squares(M: CSR | Dense) -> CSR | Dense:
     """M_ij^2, which carry variances; made at the first call and kept with M, as much memory again."""
-    return _kept(M, "squares", lambda: _like(M, _host(M) * _host(M)))
+    return kept(M, "squares", lambda: _like(M, host(M) * host(M)))
 
 
 def rows_of_R(S: Operator, method: str) -> tuple[CSR | Dense, float]:
@@ -186,18 +172,18 @@ def rows_of_R(S: Operator, method: str) -> tuple[CSR | Dense, float]:
     M = rows.M
     if rows.shift == 1.0:
         return M, rows.scale
-    return _kept(M, "R", lambda: _like(M, _host(M) - scipy.sparse.eye_array(M.shape[0]))), 1.0
+    return kept(M, "R", lambda: _like(M, host(M) - scipy.sparse.eye_array(M.shape[0]))), 1.0
 
 
-def _kept(M: CSR | Dense, key: str, make: Callable[[], Any]) -> Any:
+def kept(M: CSR | Dense, key: str, make: Callable[[], Any]) -> Any:
+    """What `make` makes of M, at the first call with this key."""
     if key not in M.tables:
         M.tables[key] = make()
     return M.tables[key]
 
 
-def _host(M: CSR | Dense) -> Any:
-    """M on the host, float32 as on the device: a csr_array or an array."""
-    return M.matrix() if isinstance(M, CSR) else np.concatenate([part.arguments[1].get() for part in M.slabs])
+def _count(M: CSR | Dense) -> int:
+    return M.nnz if isinstance(M, CSR) else M.shape[0] * M.shape[1]
 
 
 def _like(M: CSR | Dense, host: Any) -> CSR | Dense:
@@ -210,8 +196,8 @@ class Lengths:
     """How long walks are, and what they estimate.
 
     `coefficients`, (L,) float64, are c_1 .. c_L: no walk has more than L steps. `go_on` is the chance q of
-    each other step to be followed by one more. Walks `from_b` have a step before, from the row of b to where
-    they start.
+    each other step to be followed by one more. Walks score at every step; those `from_b`, which have a step
+    before, from the row of b to where they start, score where they end (eq. 26), one record a walk.
     """
 
     coefficients: np.ndarray
@@ -228,27 +214,22 @@ class Lengths:
         q = max(1, round(q * _CERTAIN)) / _CERTAIN  # never 0, which would leave terms out
         return cls(sign ** np.arange(1, 2 + int(np.ceil(_NEVER / -np.log2(q)))), q, from_b)
 
-    def scores(self, estimator: str) -> tuple[np.ndarray, np.ndarray]:
+    def scores(self) -> tuple[np.ndarray, np.ndarray]:
         """Of each step (L,) what a score is multiplied by, c_k over its chance, and the chance to go on."""
         chances = np.full(len(self.coefficients), self.go_on)
         chances[-1] = 0.0  # the table of steps ends here
         scored = np.cumprod(np.append(1.0, chances[:-1]))
-        if estimator == "endpoint":
+        if self.from_b:
             scored = scored * (1.0 - chances)
         return np.divide(self.coefficients, scored, out=np.zeros_like(scored), where=scored > 0.0), chances
 
-    def steps(self, estimator: str) -> np.ndarray:
+    def steps(self) -> np.ndarray:
         """The steps of `kernels/walk.cl`, (L, 2) or (L + 1, 2) uint32."""
-        worth, chances = self.scores(estimator)
+        worth, chances = self.scores()
         if self.from_b:
             worth, chances = np.append(0.0, worth), np.append(1.0, chances)
         bits = worth.astype(np.float32).view(np.uint32)
         return np.stack([bits, np.round(chances * _CERTAIN).astype(np.uint32)], axis=1)
-
-    @property
-    def mean(self) -> float:
-        """Steps of a walk in the mean, where no row is empty."""
-        return float(np.sum(self.go_on ** np.arange(len(self.coefficients))))
 
 
 @dataclass(frozen=True)
@@ -276,19 +257,12 @@ class Sums:
 
 @dataclass(frozen=True)
 class Walker:
-    """Walks over the rows of a matrix.
-
-    `estimator`: "endpoint", the paper's, scores where a walk ends (eq. 26), "collision" at every step.
-    `watch` is called after each launch. `launching`: walks of a work-item and items of a work-group; changes
-    no result.
-    """
+    """Walks over the rows of a matrix; `watch` is called after each launch."""
 
     tables: Tables
     lengths: Lengths
-    estimator: str
     seed: int
     watch: Callable[[], object] = lambda: None
-    launching: tuple[int, int] | None = None
 
     def rows(self, b: Array, pixels: np.ndarray, samples: int, stream: int = 0) -> Sums:
         """`samples` samples of each of the `pixels`, (P,); those of another stream are independent of them.
@@ -296,50 +270,43 @@ class Walker:
         All right-hand sides b, (N,) or (N, k), share the walks. Of walks with three weights column j is of
         channel j % 3, and there are as many of each.
         """
-        device, channels = self.tables.device, self.tables.channels
-        steps = device.upload(self.lengths.steps(self.estimator), np.uint32)
-        total, squares = np.zeros((2, len(pixels), b.columns))
+        made, device, channels = self.tables, self.tables.device, self.tables.channels
+        steps = device.upload(self.lengths.steps(), np.uint32)
+        sums = np.zeros((len(pixels), b.columns, 2))
         chunks, units = -(-samples // CHUNK), max(1, min(_UNITS, self._walks() // CHUNK))
         for some in _pieces(len(pixels), max(1, units // chunks)):
             place = device.upload(pixels[some], np.uint32)
-            for part in _pieces(chunks, max(1, units // place.size)):
-                count = part.stop - part.start
-                bounds = count, CHUNK * part.start, min(CHUNK * part.stop, samples)
+            for piece in _pieces(chunks, max(1, units // place.size)):
+                count = piece.stop - piece.start
+                bounds = count, CHUNK * piece.start, min(CHUNK * piece.stop, samples)
                 for offset, width in widths(b.columns // channels):
                     here = slice(channels * offset, channels * (offset + width))
-                    out = device.empty((place.size * count, channels * width, 4))
+                    out = device.empty((place.size * count, channels * width, 2))
                     numbers = (*bounds, self.seed, stream, b.columns, here.start)
-                    arrays = (
-                        place,
-                        self.tables.records,
-                        self.tables.entries,
-                        self.tables.links,
-                        steps,
-                        b,
-                        out,
-                    )
+                    arrays = (place, made.records, made.entries, made.links, steps, b, out)
                     self._launch("walk_rows", place.size * count, channels * width, *numbers, *arrays)
-                    sums = out.get().reshape(place.size, count, -1, 4).astype(np.float64)
-                    total[some, here] = _added(total[some, here], sums[..., 0] + sums[..., 1])
-                    squares[some, here] = _added(squares[some, here], sums[..., 2] + sums[..., 3])
+                    found = out.get().reshape(place.size, count, -1, 2).astype(np.float64)
+                    # One chunk after the other, so that no split changes a bit.
+                    found = np.concatenate([sums[some, None, here], found], axis=1)
+                    sums[some, here] = np.add.accumulate(found, axis=1)[:, -1]
                     self.watch()
-        shape = (len(pixels), *b.shape[1:])
-        return Sums(samples, total.reshape(shape), squares.reshape(shape))
+        total, squares = np.moveaxis(sums, -1, 0).reshape(2, len(pixels), *b.shape[1:])
+        return Sums(samples, total, squares)
 
     def columns(self, samples: int, stream: int = 0) -> Sums:
         """Of `samples` walks from b, by `tables_of_columns`, which b was appended to, and lengths `from_b`.
 
         The sums are those of every pixel, (N,). A sample adds to one of them; it counts as 0 to the others.
         """
-        device, n = self.tables.device, self.tables.shape[0]
-        steps = device.upload(self.lengths.steps("endpoint"), np.uint32)
+        made, device, n = self.tables, self.tables.device, self.tables.shape[0]
+        steps = device.upload(self.lengths.steps(), np.uint32)
         total, squares = np.zeros((2, n))
         source = device.upload(np.array([n]), np.uint32)
-        for part in _pieces(samples, max(1, min(_RECORDS, self._walks()))):
-            count = part.stop - part.start
+        for piece in _pieces(samples, max(1, min(_RECORDS, self._walks()))):
+            count = piece.stop - piece.start
             ends, scores = device.empty((count,), np.uint32), device.empty((count,))
-            numbers = (part.start, part.stop, self.seed, stream)
-            arrays = (source, self.tables.records, self.tables.entries, steps, ends, scores)
+            numbers = (piece.start, piece.stop, self.seed, stream)
+            arrays = (source, made.records, made.entries, steps, ends, scores)
             self._launch("walk_columns", -(-count // CHUNK), 1, *numbers, *arrays)
             score = scores.get().astype(np.float64)
             where = np.where(score == 0.0, 0, ends.get())  # a walk that died may stand in the row of b
@@ -349,27 +316,19 @@ class Walker:
         return Sums(samples, total, squares)
 
     def _walks(self) -> int:
-        """Of one launch, so that none takes long: whoever waits wants to hear that there is progress."""
-        return int(_STEPS * self.tables.device.compute_units / self.lengths.mean)
+        steps = np.sum(self.lengths.go_on ** np.arange(len(self.lengths.coefficients)))  # of a walk, mean
+        return int(_STEPS * self.tables.device.compute_units / steps)
 
     def _launch(self, name: str, units: int, width: int, *arguments: object) -> None:
         """Many walks an item where few items run, so that their loads do not wait for each other."""
-        device = self.tables.device
-        walks, group = self.launching or (1, 64)
-        if device.is_cpu and self.launching is None:
+        device, walks, group = self.tables.device, 1, 64
+        if device.is_cpu:
             walks, group = (32 if units >= 128 * device.compute_units else 4), 1
-        defines = {
-            "COLLISION": int(self.estimator == "collision"),
-            "LINKED": int(self.tables.links is not None),
-            "PREFETCH": int(walks > 1 and device.kind != "simulator"),
-        }
-        defines |= {"CHANNELS": self.tables.channels, "CHUNK": CHUNK, "WALKS": walks, "K": width}
+        if device.kind == "simulator":  # does not know the prefetch of several walks
+            walks = 1
+        defines = {"CHANNELS": self.tables.channels, "CHUNK": CHUNK, "WALKS": walks, "K": width}
+        defines["LINKED"] = int(self.tables.links is not None)
         device.kernel("walk", name, **defines)(-(-units // walks), group, units, *arguments)
-
-
-def _added(start: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """start + all chunks, (pixels, chunks, width), one after the other, so that no split changes a bit."""
-    return np.add.accumulate(np.concatenate([start[:, None], parts], axis=1), axis=1)[:, -1]
 
 
 def _pieces(count: int, size: int) -> Iterator[slice]:

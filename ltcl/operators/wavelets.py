@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Orthonormal 2-D wavelets, periodized, of grids of any size (`kernels/wavelet.cl`).
 
-Coefficients stand as PyWavelets arranges them (`coeffs_to_array`), the approximation in the top left
-corner. Where all sides halve evenly they equal those of its ``wavedec2(..., mode="periodization")``. Where
-one does not, PyWavelets repeats the last sample, and has more coefficients than pixels. Here that sample,
-which then stands for fewer pixels than the others, is carried beside the filters into the approximation: as
-many coefficients as pixels, orthonormal, and a constant picture has one coefficient on every grid. A side
-of one sample is left alone while the other goes on.
+Coefficients stand as PyWavelets arranges them (`coeffs_to_array`), the approximation in the top left corner.
+Where all sides halve evenly they equal those of its ``wavedec2(..., mode="periodization")``. Where one does
+not, PyWavelets repeats the last sample; here it stands for fewer pixels than the others and passes by the
+filters into the approximation: as many coefficients as pixels, and one of a constant picture on every grid.
 """
 
 from __future__ import annotations
@@ -32,16 +30,11 @@ class Wavelet(Basis):
     ----------
     device : Device
     grid : (h, w)
-        Any, also of odd sides.
+        Of any sides.
     name : str
-        An orthonormal wavelet of PyWavelets: "haar", "db2" (the paper's), "sym8", "coif1", ...
+        An orthonormal wavelet of PyWavelets, "haar", "db2" (the paper's), "sym8", ...; InputError for others.
     levels : int, optional
         How often the approximation is split; until one pixel is left when not given.
-
-    Raises
-    ------
-    InputError
-        Wavelets that are unknown or not orthonormal; more levels than the grid has.
 
     Examples
     --------
@@ -56,12 +49,13 @@ class Wavelet(Basis):
         self, device: Device, grid: tuple[int, int], name: str = "db2", levels: int | None = None
     ) -> None:
         self._taps = device.upload(filters(name))
-        super().__init__(device, grid, name, None, self._taps)
+        h, w = checks.grid("grid", grid)
+        super().__init__(device, grid, name, h * w, self._taps)
         most = (max(self.grid) - 1).bit_length()
         self.levels = most if levels is None else checks.count("levels", levels, least=0, most=most)
-        self._large = sum(h * w > _SMALL for h, w in map(self.sides, range(self.levels)))
+        self._large = sum(h * w > _SMALL for h, w in map(self._sides, range(self.levels)))
         # Where the approximations of levels 1, 2, ... begin, a spare pixel between: wide loads reach there.
-        pixels = [h * w + 1 for h, w in map(self.sides, range(1, self.levels + 1))]
+        pixels = [h * w + 1 for h, w in map(self._sides, range(1, self.levels + 1))]
         self._starts = device.upload(np.cumsum([0, *pixels]), np.int32)
         self._room = sum(pixels)
 
@@ -69,8 +63,8 @@ class Wavelet(Basis):
         """Name, grid and levels."""
         return {**super().to_arrays(), "levels": np.array(self.levels)}
 
-    def sides(self, level: int) -> tuple[int, int]:
-        """Rows and columns of the approximation that is split `level` times already: (h, w) / 2^level, up."""
+    def _sides(self, level: int) -> tuple[int, int]:
+        """Rows and columns of the approximation after `level` splits."""
         h, w = self.grid
         return -(-h // 2**level), -(-w // 2**level)
 
@@ -87,42 +81,24 @@ class Wavelet(Basis):
         for first, last in reversed(launches) if transpose else launches:
             arguments = (*self.grid, first, last, levels, k, a, b, self._starts, self._taps, x, near, y, out)
             if last <= self._large:
-                launch_grid(kernel, pieces, *self.sides(last), *arguments)
+                launch_grid(kernel, pieces, *self._sides(last), *arguments)
             else:
                 launch_group(kernel, pieces, *arguments)
 
 
-def is_known(name: Any) -> bool:
-    """Whether PyWavelets knows a discrete wavelet of this name."""
-    return name in _pywt.wavelist(kind="discrete")
-
-
-def filters(name: str) -> np.ndarray:
+def filters(name: Any) -> np.ndarray:
     """Low-pass and high-pass filter of an orthonormal wavelet, (2, taps) float64, in the order of samples.
 
     >>> filters("haar").round(4).tolist()
     [[0.7071, 0.7071], [0.7071, -0.7071]]
     """
-    if not is_known(name):
-        raise InputError(f"wavelet is {name!r}; it must be one of {families()}")
+    offered = "an orthonormal wavelet of PyWavelets, such as haar, db2, sym8 or coif1"
+    if name not in _pywt.wavelist(kind="discrete"):
+        raise InputError(f"wavelet is {name!r}; it must be {offered}")
     wavelet = _pywt.Wavelet(name)
     taps = np.array([wavelet.rec_lo, wavelet.rec_hi])
-    if not _orthonormal(taps):
-        raise InputError(f"wavelet {name} is not orthonormal; it must be one of {families()}")
-    return taps
-
-
-def _orthonormal(taps: np.ndarray) -> bool:
-    """Whether shifts by two are orthonormal to float32; "dmey" is to 2e-3 only."""
     length = taps.shape[1]
-    errors = [taps[:, s:] @ taps[:, : length - s].T - np.eye(2) * (s == 0) for s in range(0, length, 2)]
-    return bool(np.max(np.abs(errors)) < 1e-7)
-
-
-def families() -> str:
-    """The orthonormal wavelets that PyWavelets knows: haar, db1 to db38, ..."""
-    names = [n for n in _pywt.wavelist(kind="discrete") if n != "dmey" and _pywt.Wavelet(n).orthogonal]
-    numbers = {n.rstrip("0123456789"): [] for n in names}
-    for n in names:
-        numbers[n.rstrip("0123456789")].append(int("0" + n.lstrip("abcdefghijklmnopqrstuvwxyz")))
-    return ", ".join(f"{f}{min(n)} to {f}{max(n)}" if any(n) else f for f, n in numbers.items())
+    shifted = [taps[:, s:] @ taps[:, : length - s].T - np.eye(2) * (s == 0) for s in range(0, length, 2)]
+    if not np.max(np.abs(shifted)) < 1e-7:  # that of dmey is 2e-3
+        raise InputError(f"wavelet {name} is not orthonormal; it must be {offered}")
+    return taps

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Solvers of S x = b: one algorithm per file, one stopping rule, one result."""
+"""Solvers of S x = b: one family of methods per file, one stopping rule, one result."""
 
 from __future__ import annotations
 
 from ltcl.solvers.bounded import Bounded
 from ltcl.solvers.inverse import Inverse
-from ltcl.solvers.matrix_series import matrix_iteration, matrix_series
+from ltcl.solvers.matrix_series import matrix_series
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.solve import METHODS, solve, solve_each
 
@@ -15,7 +15,6 @@ __all__ = [
     "Inverse",
     "Solution",
     "Status",
-    "matrix_iteration",
     "matrix_series",
     "solve",
     "solve_each",

@@ -14,12 +14,14 @@ Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed.,
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from ltcl.device import Array, vectors
+from ltcl.device.kernels import Launch
 from ltcl.errors import InputError, MemoryLimitError
 from ltcl.solvers.columns import STATE, Columns
 from ltcl.solvers.result import Status
@@ -29,7 +31,7 @@ _STEP = 3  # argument of both updates
 _TWO = 0b0101_0001  # <a, b> and <b, b>, of arrays a, b; the left operand in the lower bits
 _FIVE = 0b0101_0010_0110_0000_0100  # <t, s>, <t, t>, <r*, s>, <r*, t> and <s, s>, of arrays t, s, r*
 _RHO, _DOES, _SHADOW, _AGAINST = (0, 4), (1, 5), 9, 10  # rows of the state; two of even and of odd steps
-_GOES, _FRESH, _WAITS, _BROKEN, _RESTS = range(5)
+_FRESH, _WAITS, _BROKEN, _RESTS = 1.0, 2.0, 3.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -40,91 +42,74 @@ class BiCGStab:
 
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
-        if monitor.check(x, r):
-            return
-        run = _Recurrences(system, x, r)
-        does = np.full(r.columns, float(_WAITS))
+        S, columns = system.S, Columns(r, "krylov", "krylov_pairs", "krylov_half", "krylov_bicgstab")
+        shadow, p, g, v, half, t = (r.like() for _ in range(6))
+        state, two, five, slices = columns.state(), columns.sums(2), columns.sums(5), columns.slices
+        of_g = columns.bind("krylov_pairs", _TWO, 0, r, g, p, p, two, across=2)
+        of_v = columns.bind("krylov_pairs", _TWO, 0, r, shadow, v, v, two, across=2)
+        of_t = columns.bind("krylov_pairs", _FIVE, 0, r, t, half, shadow, five, across=5)
+        to_half = columns.bind("krylov_half", slices, 0, two, state, r, v, half, extra=2)
+        moves = (slices, 0, five, state, two, g, half, t, v, p, x, r)
+        to_next = columns.bind("krylov_bicgstab", *moves, extra=5)
+        queued = [S.bind(p, v), to_half, S.bind(half, t), of_t, to_next]  # 4. to 9.
+        numbers, does, step, transposes = np.zeros((STATE, r.columns)), np.full(r.columns, _WAITS), 0, True
         while True:
-            run.start(does, monitor)
-            for _ in range(monitor.steps_ahead()):
-                run.step()
-            does, norms = run.read()
-            if monitor.check(x, r, norms, recursive=True):
+            anew = monitor.unsolved & ((does == _WAITS) | (does == _RESTS))
+            changed, now = numbers.copy(), step % 2
+            rests = ~monitor.unsolved & (does != _BROKEN)
+            changed[_DOES[now]] = np.where(anew, _FRESH, np.where(rests, _RESTS, does))
+            if anew.any():
+                _start_anew((shadow, p), r, anew if step else None)  # 1., 2.
+                for row in (_RHO[now], _SHADOW):
+                    changed[row] = np.where(anew, monitor.norms**2, changed[row])
+                changed[_AGAINST] = changed[_SHADOW]
+                squares = _squares_of_g(system, shadow, g) if transposes else None
+                if squares is not None:
+                    changed[_AGAINST] = squares
+                elif transposes:
+                    transposes = False
+                    queued.insert(1, of_v)
+            if not np.array_equal(changed, numbers):
+                state.set_rows(0, r.device.upload(changed))
+            if anew.any() and transposes:
+                of_g()
+            steps = range(step, step + monitor.steps_ahead())
+            _queue(queued, (to_half, to_next), steps)
+            system.products += 2 * len(steps)
+            step = steps.stop
+            numbers, norms = columns.read(state, steps.start, step)
+            does = numbers[_DOES[step % 2]]
+            if monitor.check(x, r, norms, np.inf):
                 return
             if (does == _BROKEN).any() and (does[monitor.unsolved] == _BROKEN).all():
-                monitor.give_up(Status.NO_STEP)
+                monitor.status = Status.NO_STEP
                 return
             if not np.array_equal(monitor.norms, norms[-1]):  # r is the true residual now, p is not of it
                 does = np.where(does == _BROKEN, does, _WAITS)
 
 
-class _Recurrences:
-    """The vectors of the method, and what one step leaves to the next."""
+def _start_anew(vectors: Sequence[Array], r: Array, columns: np.ndarray | None) -> None:
+    """r* = p = r in these columns, (k,) bool, or in all."""
+    for vector in vectors:
+        if columns is None:
+            vector.copy_from(r)
+        else:
+            vector.set(np.where(columns, r.get(), vector.get()))
 
-    def __init__(self, system: System, x: Array, r: Array) -> None:
-        self._system, self._r = system, r
-        self._shadow, self._p = r.copy(), r.copy()
-        self._g, v, half, t = (r.like() for _ in range(4))
-        self._columns = columns = Columns(r, "krylov", "krylov_pairs", "krylov_half", "krylov_bicgstab")
-        self._state, two, five = columns.state(), columns.sums(2), columns.sums(5)
-        self._numbers, self._transposes = np.zeros((STATE, r.columns)), True
-        self._steps = self._first = 0
-        state, slices, shadow, p, g = self._state, columns.slices, self._shadow, self._p, self._g
-        to_half, to_next = (slices, 0, two, state, r, v, half), (slices, 0, five, state, two)
-        self._of_g, self._of_v, products = (
-            columns.bind("krylov_pairs", codes, 0, r, *arrays, sums, across=count)
-            for codes, arrays, sums, count in (
-                (_TWO, (g, p, p), two, 2),
-                (_TWO, (shadow, v, v), two, 2),
-                (_FIVE, (t, half, shadow), five, 5),
-            )
-        )
-        self._updates = [
-            columns.bind("krylov_half", *to_half, extra=2),
-            columns.bind("krylov_bicgstab", *to_next, g, half, t, v, p, x, r, extra=5),
-        ]
-        S, (half_step, next_step) = system.S, self._updates
-        self._queued = [S.bind(p, v), half_step, S.bind(half, t), products, next_step]  # 4. to 9.
 
-    def start(self, does: np.ndarray, monitor: Monitor) -> None:
-        """Start the unsolved columns that wait for it anew, with r* = p = r; those that are solved rest."""
-        anew = monitor.unsolved & ((does == _WAITS) | (does == _RESTS))
-        does = np.where(anew, _FRESH, np.where(monitor.unsolved | (does == _BROKEN), does, _RESTS))
-        numbers, now = self._numbers.copy(), self._steps % 2
-        numbers[_DOES[now]] = does
-        if anew.any():
-            for vector in (self._shadow, self._p):
-                vectors.axpby_columns(anew, self._r, ~anew, vector, vector)  # 1., 2.
-            numbers[_RHO[now]] = np.where(anew, monitor.norms**2, numbers[_RHO[now]])
-            numbers[_SHADOW] = np.where(anew, monitor.norms**2, numbers[_SHADOW])
-            numbers[_AGAINST] = self._squares_of_g() if self._transposes else numbers[_SHADOW]
-        if not np.array_equal(numbers, self._numbers):
-            self._state.set_rows(0, self._r.device.upload(numbers))
-        if anew.any() and self._transposes:
-            self._of_g()
-
-    def _squares_of_g(self) -> np.ndarray:
-        """The squared norms of g = S^T r*; those of r* where S has no transpose, or no memory for it."""
-        try:
-            self._system.S.apply_transpose(self._shadow, self._g)
-        except (InputError, MemoryLimitError):
-            self._transposes = False
-            self._queued.insert(1, self._of_v)
-            return vectors.dot(self._shadow, self._shadow)
-        self._system.products += 1
-        return vectors.dot(self._g, self._g)
-
-    def step(self) -> None:
-        """One step of all columns that do not rest."""
-        for update in self._updates:
-            update.set(_STEP, self._steps)
-        for launch in self._queued:
+def _queue(launches: Sequence[Callable[[], object]], updates: Sequence[Launch], steps: range) -> None:
+    for step in steps:
+        for update in updates:
+            update.set(_STEP, step)
+        for launch in launches:
             launch()
-        self._steps += 1
-        self._system.products += 2
 
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """What each column does, and the norms of the residuals since the last reading; the wait."""
-        self._numbers, norms = self._columns.read(self._state, self._first, self._steps)
-        self._first = self._steps
-        return self._numbers[_DOES[self._steps % 2]], norms
+
+def _squares_of_g(system: System, shadow: Array, g: Array) -> np.ndarray | None:
+    """The squared norms of g = S^T r*; None where S has no transpose, or no memory for it."""
+    try:
+        system.S.apply_transpose(shadow, g)
+    except (InputError, MemoryLimitError):
+        return None
+    system.products += 1
+    return vectors.dot(g, g)

@@ -7,20 +7,18 @@ a step is
     p = z + beta d,   d' = clip(x + alpha p) - x,   x' = x + lambda d'
 
 with beta that makes p conjugate to the last d, alpha the step of Barzilai and Borwein, and lambda exact along
-d' or as far as the bounds allow. On a face of the box these are conjugate gradients, which need few products
-because R has few large eigenvalues; clipping changes many active bounds at once, as projected gradients do
-(Moré and Toraldo, SIAM J. Optimization 1, 1991, take the two in turns). Where the last lambda was
-short, or 0 as p did not descend, p = z. Every step takes two products: in closed boxes of rho(R) = 0.8
-and 4, with 5 to 50 % of the pixels at a bound, 14 and 36 of them to a certificate of 0.1 %, where FISTA with
-restarts takes 22 and 50 and MPRGP (Dostál) 26 and 50.
+d' or as far as the bounds allow. On a face of the box these are conjugate gradients; clipping changes many
+active bounds at once, as projected gradients do (Moré and Toraldo, SIAM J. Optimization 1, 1991, take the two
+in turns). Where the last lambda was short, or 0 as p did not descend, p = z. A step is six launches and two
+products: fewer than FISTA with restarts and MPRGP (Dostál) take.
 
 A certificate comes with the gradient. For all y in the box g.(y - x) >= -gap with the Frank-Wolfe gap
 sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)); hence of the least error ||r*||, by Cauchy and Schwarz,
 
     ||r*|| >= r.r* / ||r|| >= ||r|| - gap / ||r||,
 
-and the largest of these bounds so far is kept. Done when the error is within the tolerance, of 0 or of that.
-An iteration is six launches, and one wait for the few sums of this certificate.
+and the largest of these bounds so far is kept. Done when the error is within the tolerance, of 0 or of that,
+with what rounding of A x may hide: of S = I + R, whose columns may be far below 1, at least that of x itself.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ Box = tuple[np.ndarray, np.ndarray]  # lower, upper (N,)
 _PATIENCE = 50  # steps without a better certificate: rounding has the say
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Bounded(Solution):
     """Result of `minimise`: a `Solution` with its certificate; errors in the units of w b.
 
@@ -64,11 +62,11 @@ class Bounded(Solution):
     gap: float
 
     def __str__(self) -> str:
-        advice = "" if self.converged else f": {self.status.value}"
         return (
             f"bounded: {self.status.name.lower()} after {self.iterations} iterations, "
             f"{self.products} products, relative error {self.residuals[-1]:.2g}, "
-            f"at most {self.gap:.2g} above the least{advice}"
+            f"at most {self.gap:.2g} above the least"
+            f"{'' if self.converged else f': {self.status.value}'}"
         )
 
 
@@ -102,43 +100,32 @@ def minimise(
         ``max(rtol ||w b||, atol)`` in every column. Where b = 0, rtol is of the error at the start.
     maxiter : int
     callback : callable(iteration, relative gap), optional
-
-    Examples
-    --------
-    >>> import ltcl
-    >>> from ltcl.operators import Dense
-    >>> A = Dense(ltcl.open_device(), [[1.0, 0.5], [0.5, 1.0]])
-    >>> s = minimise(A, np.array([[1.0], [0.0]]), np.zeros(2), np.ones(2), np.zeros((2, 1)), rtol=1e-4)
-    >>> print(s.x.ravel().round(2), s.held.ravel())  # without bounds 4/3 and -2/3
-    [0.8 0. ] [False  True]
     """
     start = time.perf_counter()
     largest = float(np.max(np.abs(b)))
-    unit = _power(largest or max(float(np.max(np.abs(part))) for part in (lower, upper)))
+    unit = _power(largest or float(np.max(np.abs([lower, upper]))))
     unit_w = 1.0 if weights is None else _power(float(np.max(weights)))
-    box = inwards(*(np.clip(np.asarray(part, np.float64) / unit, -_FAR, _FAR) for part in (lower, upper)))
-    first = np.clip((x0 / unit).astype(np.float32), *(part[:, None] for part in box))
+    box = inwards(*(np.clip(np.asarray(bound, np.float64) / unit, -_FAR, _FAR) for bound in (lower, upper)))
+    first = np.clip((x0 / unit).astype(np.float32), *(bound[:, None] for bound in box))
     descent = _Descent(A, b / unit, None if weights is None else weights / unit_w, box, first)
     initial, _ = descent.read()
     scale = np.where(descent.scale > 0.0, descent.scale, np.where(initial > 0.0, initial, 1.0))
     tolerance, least = np.maximum(rtol * scale, atol / (unit * unit_w)), np.zeros_like(scale)
-
-    def excess(errors: np.ndarray) -> np.ndarray:  # over the least, at most, (k,)
-        return np.where(np.isfinite(errors), np.maximum(errors - least, _ROUNDING * scale), np.inf)
-
     residuals: list[float] = []
-    lowest, lowest_at, status = np.inf, 0, None
+    lowest, lowest_at, hidden = np.inf, 0, descent.rounding()
     while True:
         errors, gap = descent.read()
         least = np.fmax(least, np.minimum(errors - ratio(gap, errors, errors > 0.0), errors))
-        unsolved, steps = excess(errors) > tolerance, len(residuals)
+        excess = np.maximum(errors - least + 2.0 * hidden, _ROUNDING * scale)  # over the least
+        excess = np.where(np.isfinite(errors), excess, np.inf)
+        unsolved, steps, above = excess > tolerance, len(residuals), float(np.max(excess / scale))
         status = Status.STAGNATED if steps - lowest_at > _PATIENCE else None
         status = Status.MAXITER if steps >= maxiter else status
         status = status if unsolved.any() else Status.CONVERGED
         if status is not None and not descent.true:  # to be said only of a true residual
             descent.refresh()
+            hidden = descent.rounding()
             continue
-        above = float(np.max(excess(errors) / scale))
         if above < lowest:
             lowest, lowest_at = above, steps
         if callback is not None:
@@ -149,9 +136,10 @@ def minimise(
         descent.step(unsolved)
     x, worse = descent.x.get(), ~(errors <= initial)  # rounding alone can do that
     errors, held = np.where(worse, initial, errors), np.where(worse, False, descent.held(x))
+    excess = np.where(worse, np.maximum(initial - least + 2.0 * hidden, _ROUNDING * scale), excess)
     x = (np.where(worse, first, x) * unit).astype(np.float32)
     return Bounded(
-        x=np.clip(x, *(part[:, None] for part in inwards(lower, upper))),
+        x=np.clip(x, *(bound[:, None] for bound in inwards(lower, upper))),
         status=status,
         iterations=len(residuals) - 1,
         products=descent.products,
@@ -159,9 +147,9 @@ def minimise(
         seconds=time.perf_counter() - start,
         method="bounded",
         errors=errors * unit * unit_w,
-        least=least * unit * unit_w,
+        least=np.maximum(least - hidden, 0.0) * unit * unit_w,
         held=held,
-        gap=float(np.max(excess(errors) / scale)),
+        gap=float(np.max(excess / scale)),
     )
 
 
@@ -183,10 +171,10 @@ class _Descent:
     """The iterate and, on the device, r = w (b - A x), g = -A^T w r, d, and h = A^T w^2 A d."""
 
     def __init__(self, A: Operator, b: np.ndarray, w: np.ndarray | None, box: Box, x: np.ndarray) -> None:
-        device, (lower, upper) = A.device, box
-        self.A, self.products, self._box = A, 0, box
+        device, self.A, self.products, self._box = A.device, A, 0, box
         self.scale = np.linalg.norm(b if w is None else w * b, axis=0)
-        self.b, self.x, lower, upper = (device.upload(part) for part in (b, x, lower, upper))
+        self._largest_weight = 1.0 if w is None else float(np.max(w))
+        self.b, self.x, *bounds = (device.upload(values) for values in (b, x, *box))
         columns = Columns(self.x, "bounded", *_KERNELS)
         k, slices, weighted = columns.k, columns.slices, int(w is not None)
         self._slices, self._resting = slices, np.zeros(k, bool)
@@ -199,24 +187,18 @@ class _Descent:
         self._u = self.r.like() if weighted else self.r  # w r
         W = self.r if w is None else device.upload(w)
         self.g, self._q, d, h = (vectors.fill(self.x.like(), 0.0) for _ in range(4))
-        bounds, rows = (lower, upper, self.x), b.shape[0]
-        weigh_Ad, self._weigh_r = (
-            columns.bind(_KERNELS[1], how, W, v, self._u, found, rows=rows)
-            for how, v, found in ((weighted, Ad, curvatures), (2 * weighted, self.r, self._norms))
-        )
-        look, self._look_anew = (
-            columns.bind(_KERNELS[3], anew, *bounds, self._q, self.g, h, numbers) for anew in (0, 1)
-        )
-        direction = (slices, self._rest, numbers, *bounds, self.g, d, sums, shares)
-        sizes, found = (rows, slices, weighted), (sums, shares, curvatures)
-        move = (*sizes, numbers, *found, lower, upper, d, self.x, W, Ad, self.r, self._u)
+        around, rows, (direction, weigh, move, look) = (*bounds, self.x), b.shape[0], _KERNELS
+        self._weigh_r = columns.bind(weigh, 2 * weighted, W, self.r, self._u, self._norms, rows=rows)
+        self._look_anew = columns.bind(look, 1, *around, self._q, self.g, h, numbers)
+        to_d = (slices, self._rest, numbers, *around, self.g, d, sums, shares)
+        to_x = (rows, slices, weighted, numbers, sums, shares, curvatures, *bounds, d, self.x, W, Ad, self.r)
         self._queued = (
-            columns.bind(_KERNELS[0], *direction, extra=2),
+            columns.bind(direction, *to_d, extra=2),
             A.bind(d, Ad),
-            weigh_Ad,
-            columns.bind(_KERNELS[2], *move, extra=4),
+            columns.bind(weigh, weighted, W, Ad, self._u, curvatures, rows=rows),
+            columns.bind(move, *to_x, self._u, extra=4),
             A.bind(self._u, self._q, transpose=True),
-            look,
+            columns.bind(look, 0, *around, self._q, self.g, h, numbers),
         )
         self.refresh()
 
@@ -242,14 +224,18 @@ class _Descent:
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """The error and the Frank-Wolfe gap of every column; the wait."""
-        found = self._numbers.get().astype(np.float64)
-        self._alpha = found[0]
-        looks, squares = found[4 : 4 + 2 * self._slices], found[4 + 2 * self._slices :]
+        numbers = self._numbers.get().astype(np.float64)
+        self._alpha = numbers[0]
+        looks, squares = numbers[4 : 4 + 2 * self._slices], numbers[4 + 2 * self._slices :]
         return np.sqrt(squares.sum(axis=0)), looks[::2].sum(axis=0)
+
+    def rounding(self) -> np.ndarray:
+        """What rounding of w A x hides of the errors, where columns of A are of size 1 at most."""
+        return _ROUNDING * self._largest_weight * np.asarray(vectors.norm(self.x))
 
     def held(self, x: np.ndarray) -> np.ndarray:
         """Entries that a step along -g takes beyond a bound; some come close to it without touching."""
-        lower, upper = (part[:, None] for part in self._box)
+        lower, upper = (bound[:, None] for bound in self._box)
         beyond = x - self._alpha * self.g.get()
         return (lower < upper) & ((beyond < lower) | (beyond > upper))
 

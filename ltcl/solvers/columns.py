@@ -21,9 +21,6 @@ def ratio(numerator: np.ndarray, denominator: np.ndarray, where: np.ndarray) -> 
     """numerator / denominator in the columns `where` a step is taken, 0 in those that rest.
 
     A denominator beyond float32 gives NaN, not a step of 0 that would be repeated for ever.
-
-    >>> ratio(np.array([1.0, 0.0]), np.array([2.0, 0.0]), np.array([True, False])).tolist()
-    [0.5, 0.0]
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # the monitor sees what comes of it
         return np.where(where, numerator / np.where(np.isfinite(denominator), denominator, np.nan), 0.0)
@@ -66,6 +63,6 @@ class Columns:
 
     def read(self, state: Array, first: int, step: int) -> tuple[np.ndarray, np.ndarray]:
         """The numbers of a state (STATE, k), and the residual norms of steps `first` to `step` (steps, k)."""
-        found = state.get().astype(np.float64)
-        squares = found[STATE:].reshape(SLOTS, self.slices, self.k)[np.arange(first, step) % SLOTS]
-        return found[:STATE], np.sqrt(squares.sum(axis=1))
+        numbers = state.get().astype(np.float64)
+        squares = numbers[STATE:].reshape(SLOTS, self.slices, self.k)[np.arange(first, step) % SLOTS]
+        return numbers[:STATE], np.sqrt(squares.sum(axis=1))

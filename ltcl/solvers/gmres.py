@@ -5,11 +5,12 @@ Of all x in x_0 + span(r, S r, ..., S^(m-1) r) it takes the one with the smalles
 never grow. It needs no bounds, but memory for m + 1 directions and, at step j, 2 j + 1 inner products, read
 back in one go: where products are cheap Chebyshev takes less time, in a few products more.
 
-Each right-hand side has a space of its own and rests once it is solved. The residual is known before the
-iterate is, so that x is formed only at the end of a cycle; the true residual is computed there.
+Each right-hand side has a space of its own and rests once it is solved. Norms of residuals are known before
+x is, which is formed only at the end of a cycle, and with it its residual V (beta e_1 - H y).
 
-Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithms 6.9 and 6.11;
-section 6.5.3 of the rotations.
+Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., algorithms 6.2 in blocks, 6.9
+and 6.11; section 6.5.3 of the rotations. Gram-Schmidt is done twice, which is enough for orthogonality to
+rounding (Giraud, Langou, Rozloznik, Comput. Math. Appl. 50, 2005).
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Array
-from ltcl.solvers.arnoldi import Arnoldi
-from ltcl.solvers.columns import ratio
+from ltcl.operators import Operator
+from ltcl.solvers.columns import Columns, ratio
 from ltcl.solvers.result import Status
 from ltcl.solvers.stopping import Monitor, System
 
+_COUNT = 2  # argument of krylov_subtract
 _FALL = 2.0**-20  # of the first residual: below, a float32 cycle has to start again from the true one
-_SINGULAR = 2.0**-20  # of its length: what the rotations left of a column is the rounding of products
+_SINGULAR = 2.0**-20  # of its length: what the rotations left of a column, and of H, is rounding of products
 
 
 @dataclass(frozen=True)
@@ -42,87 +44,118 @@ class GMRES:
 
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
-        complete = np.zeros(r.columns, bool)
-        while not monitor.check(x, r):
-            if monitor.unsolved.any() and complete[monitor.unsolved].all():
-                monitor.give_up(Status.BREAKDOWN)
-                return
-            complete, _ = cycle(system, x, r, monitor, self.restart)
+        while monitor.status is None:
+            complete = cycle(system, x, r, monitor, self.restart).complete
+            unsolved = monitor.unsolved
+            if monitor.status is None and unsolved.any() and complete[unsolved].all():
+                monitor.status = Status.BREAKDOWN
 
 
-class Hessenberg:
-    """The small problems min ||beta e_1 - H y||, one for each right-hand side, on the host in float64.
+class KrylovSpace:
+    """An orthonormal basis v_0, v_1, ... of what products with S reach from r (N, k), S V = V H, by columns.
 
-    H (m + 1, m) is upper Hessenberg and grows by a column a step. The unit vector q with q^T H = 0, the last
-    row of all Givens rotations so far, tells the norms of the residuals, |q_1| beta, before y is known.
-
-    Attributes
-    ----------
-    residuals : (k,)
+    V is (steps + 1, N k) on the device, H (k, steps + 1, steps) float64; `residuals` (k,) are those of min
+    ||beta e_1 - H y|| so far, beta being the norms of r; `complete` are the columns whose space holds all of
+    S and no solution. Of `steps` that there is room for, perhaps fewer than asked for, `count` are made.
     """
 
-    def __init__(self, beta: np.ndarray) -> None:
-        self._beta = self.residuals = np.array(beta, np.float64)
-        self._q = np.ones((len(beta), 1))
-        self._columns: list[np.ndarray] = []  # of H
-        self._steps: list[np.ndarray] = []  # (k,) bool
+    def __init__(self, S: Operator, r: Array, beta: np.ndarray, steps: int) -> None:
+        device, self.count = r.device, -1
+        self._columns = columns = Columns(r, "krylov", "krylov_pairs", "krylov_subtract")
+        self.steps = min(steps, columns.room - 3)  # whose coefficients a work-group holds
+        rows = self.steps + 1
+        device.require(rows * r.nbytes, f"restart={steps}, {rows} directions of {r.size} values each,")
+        self.V, self.H = device.empty((rows, r.size)), np.zeros((r.columns, rows, rows - 1))
+        self.residuals = self._beta = np.asarray(beta, np.float64)
+        self.complete = np.zeros(r.columns, bool)
+        self._is_step = np.zeros((r.columns, rows - 1), bool)
+        self._q = np.ones((r.columns, 1))  # q^T H = 0, the last row of all Givens rotations
+        v, w = r.like(), r.copy()
+        sums, self._h = columns.sums(rows + 1), [device.empty((rows + 1, columns.k)) for _ in range(2)]
+        self._product = S.bind(v, w)
+        self._dots = columns.bind("krylov_pairs", 0, 0, w, self.V, w, w, sums)
+        self._subtract = [
+            columns.bind(
+                *("krylov_subtract", 0, columns.slices, again, again, sums, self._h[0], h, self.V, w, out),
+                extra=rows + 2,
+            )
+            for again, h, out in ((0, self._h[0], w), (1, self._h[1], v))
+        ]
+        self._orthogonalize()
 
-    def extend(self, h: np.ndarray) -> np.ndarray:
-        """Append the columns h (k, j + 1); returns where they are a step, that is not 0 once rotated.
+    def extend(self, active: np.ndarray | bool = True) -> np.ndarray:
+        """One step of the `active` columns, (k,) bool; where S v lies in the space but for rounding.
 
-        A column that is 0 leaves its problem as it was: the right-hand side rests, or S is singular.
+        There the next direction is 0. A column of H that is 0 once rotated leaves its problem as it was.
         """
+        j = self.count
+        self._product()  # 3.
+        self._orthogonalize()
+        h = np.where(active, self._h[1].get()[: j + 2].astype(np.float64), 0.0).T
         turned, below = np.einsum("kj,kj->k", self._q, h[:, :-1]), h[:, -1]
         length = np.hypot(turned, below)
         step = ~(length <= _SINGULAR * np.linalg.norm(h, axis=1))  # NaN is a step; the residual will tell
         s = np.where(step, ratio(below, length, step), 1.0)
         self._q = np.column_stack([s[:, None] * self._q, -ratio(turned, length, step)])
         self.residuals = self._beta * np.abs(self._q[:, 0])
-        self._columns.append(h)
-        self._steps.append(step)
-        return step
+        self.H[:, : j + 2, j], self._is_step[:, j] = h, step
+        return active & (below == 0.0)
 
-    def solve(self) -> np.ndarray:
-        """y (k, m), 0 in unknowns that were no step."""
-        steps = np.stack(self._steps, axis=1)
-        k, m = steps.shape
-        H = np.zeros((k, 2 * m + 1, m))  # and a row for each unknown, which is its own where it was no step
-        for j, h in enumerate(self._columns):
-            H[:, : j + 2, j] = np.where(steps[:, j, None], h, 0.0)
-            H[:, m + 1 + j, j] = ~steps[:, j]
-        Q, triangle = np.linalg.qr(H)
-        return np.linalg.solve(triangle, (self._beta[:, None] * Q[:, 0])[..., None])[..., 0]
+    def improve(self, x: Array, r: Array) -> np.ndarray:
+        """Move x to the least residual in the space, and r with it; the lengths (k,) of the way."""
+        H, e_1 = self.H[:, : self.count + 1, : self.count], np.eye(self.count + 1, 1)
+        used = H * self._is_step[:, None, : self.count]
+        finite = np.all(np.isfinite(H), axis=(1, 2), keepdims=True)
+        right = self._beta[:, None, None] * e_1
+        y = np.where(finite, np.linalg.pinv(np.where(finite, used, 0.0), rcond=_SINGULAR) @ right, np.nan)
+        left = right - used @ y
+        self.residuals = np.linalg.norm(left[..., 0], axis=1)
+        self._add(x, y[..., 0])  # 12.
+        self._add(r, (left - right)[..., 0])
+        return np.linalg.norm(y[..., 0], axis=1)
 
     def ritz_values(self) -> np.ndarray:
         """Eigenvalues of the square parts of all H, complex: estimates of those of S."""
-        found = []
-        for c in range(len(self.residuals)):
-            steps = next((j for j, h in enumerate(self._columns) if not h[c].any()), len(self._columns))
-            H = np.zeros((steps, steps))
-            for j in range(steps):
-                H[: j + 2, j] = self._columns[j][c, : min(j + 2, steps)]
-            found.append(np.linalg.eigvals(H) if np.isfinite(H).all() else np.zeros(0))
-        return np.concatenate(found)
+        values: list[np.ndarray] = [np.zeros(0)]
+        for H in self.H:
+            steps = int(np.argmin([*np.any(H[:, : self.count], axis=0), False]))  # before a column of 0
+            if np.isfinite(H).all():
+                values.append(np.linalg.eigvals(H[:steps, :steps]))
+        return np.concatenate(values)
+
+    def _add(self, x: Array, y: np.ndarray) -> None:
+        """x = x + sum_j y_j v_j with y (k, j)."""
+        count = y.shape[1]
+        minus_y = x.device.upload(np.pad(-y.T, ((0, 1), (0, 0))))  # as sums of one slice, <w, w> among them
+        arguments = (count, 1, 0, 0, minus_y, *self._h, self.V, x, x)
+        self._columns.bind("krylov_subtract", *arguments, extra=count + 2)()
+
+    def _orthogonalize(self) -> None:
+        """What a product left becomes the next direction."""
+        self.count += 1
+        self._dots.resize(self._columns.items(self.count + 1))
+        for subtract in self._subtract[0 if self.count else 1 :]:
+            self._dots()  # 4.
+            subtract.set(_COUNT, self.count)
+            subtract()  # 5. to 8.
 
 
-def cycle(system: System, x: Array, r: Array, monitor: Monitor, steps: int) -> tuple[np.ndarray, Hessenberg]:
-    """Improve `x` and its residual `r`, whose `norms` the monitor holds, by up to so many steps.
-
-    Returns the columns (k,) whose space holds all of S and no solution, and what was learnt of S.
-    """
-    beta, step = monitor.norms, monitor.unsolved
-    complete = np.zeros_like(step)
+def cycle(system: System, x: Array, r: Array, monitor: Monitor, steps: int) -> KrylovSpace:
+    """Improve `x` and its residual `r`, whose `norms` the monitor holds, by up to so many steps."""
+    beta, active = monitor.norms, monitor.unsolved
     steps = max(1, min(steps, r.shape[0], monitor.rule.maxiter - monitor.iterations))
-    space, problem = Arnoldi(system.S, r, steps), Hessenberg(beta)  # 1.
-    for j in range(space.steps):  # 2.
-        h = np.where(step[:, None], space.extend(), 0.0)  # 3. to 10.
-        problem.extend(h)
-        above = monitor.above(problem.residuals)
-        complete |= step & above & (h[:, -1] == 0.0)
-        step = step & ~complete & above & ~(problem.residuals <= _FALL * beta)
-        if j + 1 == space.steps or not step.any() or monitor.due(problem.residuals):
+    space = KrylovSpace(system.S, r, beta, steps)  # 1.
+    while True:
+        ended = space.extend(active)
+        above = monitor.above(space.residuals)
+        space.complete |= ended & above
+        active = active & ~space.complete & above & ~(space.residuals <= _FALL * beta)
+        if space.count == space.steps or not active.any() or monitor.due(space.residuals):
             break
     system.products += space.count
-    space.add_to(x, problem.solve())  # 12.
-    system.residual(x, r)
-    return complete, problem
+    travelled = space.improve(x, r)
+    if np.all(_FALL * travelled <= beta):
+        monitor.check(x, r, space.residuals[None], travelled)
+    else:  # S is so nearly singular, or so small, that float32 may have lost r on the way
+        monitor.check(x, r, system.residual(x, r)[None])
+    return space

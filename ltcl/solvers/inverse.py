@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """S^-1 = I - A, kept: a solution is one product, x = b - A b, and its error was bounded when A was made.
 
-A is one physical bounce of the scene (eq. 4 and 6), sparser than R = A + A^2 + ... that T tells. Found once,
+A is one physical bounce of the scene (eq. 4 and 6), sparser than R = A + A^2 + ... that T tells. Made once,
 by `ltcl.invert`, it takes the place of a solve for every further frame.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from ltcl.operators.interreflection import nbytes
 from ltcl.solvers.bounded import inwards
 from ltcl.solvers.result import Solution, Status
 from ltcl.solvers.solve import scale_rhs, unscale
+
+_ARRAYS = ("grid", "first_bounce", "errors", "confidence")
 
 
 class Inverse:
@@ -63,6 +66,7 @@ class Inverse:
         if len(bounces) not in (1, 3) or len(errors) != len(bounces):
             raise InputError(f"an inverse has {len(bounces)} A and {len(errors)} errors; both must be 1 or 3")
         self.systems = tuple(IdentityPlus(A, sign=-1) for A in bounces)
+        self._arrays, self._index = dict[str, np.ndarray](), ""  # of an unpickled one
         n = bounces[0].shape[0]
         self.grid = checks.grid("grid", grid, n)
         self.errors = tuple(checks.number("error", error, least=0.0) for error in errors)
@@ -73,13 +77,25 @@ class Inverse:
 
     def __repr__(self) -> str:
         (h, w), kind, size = self.grid, {1: "grey", 3: "colour"}[self.channels], checks.size(self.nbytes)
-        what = f"{h * w} x {h * w}, {kind}, grid {h} x {w}, {size} with an error of {self.error:.2g}"
-        return f"<ltcl Inverse {what}>"
+        shape = f"{h * w} x {h * w}, {kind}, grid {h} x {w}"
+        return f"<ltcl Inverse {shape}, {size} with an error of {self.error:.2g}>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For `pickle` and `copy.deepcopy`: numbers, and the index of the device."""
+        state = dict(vars(self))
+        if systems := state.pop("systems", None):
+            state |= {"_arrays": stored.to_arrays(systems), "_index": self.device.description.index}
+        return state
+
+    @cached_property
+    def systems(self) -> tuple[IdentityPlus, ...]:
+        """I - A of each channel; of an unpickled inverse uploaded at the first use."""
+        return tuple(stored.from_arrays(open_device(self._index), self._arrays))
 
     @property
     def channels(self) -> int:
         """1 for grey, 3 for colour."""
-        return len(self.systems)
+        return len(self.errors)
 
     @property
     def device(self) -> Device:
@@ -89,8 +105,8 @@ class Inverse:
     @property
     def A(self) -> Operator | tuple[Operator, ...]:
         """One bounce: the operator itself, or three of them in colour."""
-        found = tuple(X.R for X in self.systems)
-        return found[0] if self.channels == 1 else found
+        bounces = tuple(X.R for X in self.systems)
+        return bounces[0] if self.channels == 1 else bounces
 
     @property
     def error(self) -> float:
@@ -108,20 +124,10 @@ class Inverse:
         return nbytes(self.systems)
 
     def solve(self, b: Any, channel: int = 0, *, rtol: float | None = None) -> Solution:
-        """x = b - A b, by one product; no residual is computed.
+        """x = b - A b of b, (N,) or (N, k), by one product; no residual is computed.
 
-        Parameters
-        ----------
-        b : (N,) or (N, k)
-        channel : int
-            0, or 0 to 2 in colour.
-        rtol : float, optional
-            Relative error of x that is allowed; InputError where that of the inverse is above.
-
-        Returns
-        -------
-        Solution
-            Its status is PRECOMPUTED, `error` the bound, and there are no residuals.
+        `rtol` is the relative error of x that is allowed: an InputError where that of the inverse is above.
+        The status is PRECOMPUTED, `error` the bound.
         """
         start = time.perf_counter()
         self.refuse_beyond(rtol)
@@ -146,19 +152,12 @@ class Inverse:
     ) -> np.ndarray:
         """The projector pattern for a picture or frames of a video, by one product a channel.
 
-        l_in = F^-1 (b - A b) of b = gain * desired - background, clamped to the bounds.
+        l_in = F^-1 (b - A b) of b = gain * desired - background, float32, clamped to the bounds. What that
+        takes from one pixel is not made up for by others: for single pictures use `ltcl.compensate` with
+        ``inverse=``.
 
-        Parameters
-        ----------
-        desired : (h, w), (h, w, 3), or frames of these
-        bounds, background, gain
-            As in `ltcl.compensate`; the background is one number.
-
-        Returns
-        -------
-        array like `desired`, float32
-            What clamping takes from one pixel is not made up for by others, and nothing tells how far off the
-            scene will be: for single pictures use `ltcl.compensate` with ``inverse=``.
+        `desired` is (h, w), (h, w, 3), or frames of these; `bounds`, `background`, one number, and `gain` are
+        those of `ltcl.compensate`.
 
         Examples
         --------
@@ -167,37 +166,25 @@ class Inverse:
         >>> ltcl.invert(T).pattern(numpy.array([[0.3, 0.3]])).round(2).tolist()
         [[0.5, 0.5]]
         """
-        try:
-            low, high = bounds
-        except (TypeError, ValueError):
-            raise InputError(f"bounds is {bounds!r}; it must be (low, high)") from None
-        low = checks.number("bounds[0]", low)
-        high = checks.number("bounds[1]", high, above=low)
+        low, high = checks.interval("bounds", bounds)
         gain, dark = checks.number("gain", gain, above=0.0), checks.number("background", background)
         columns, shape = layout.unpack("desired", desired, self.grid, self.channels)
         solved = [self.solve(gain * b - dark, channel).x for channel, b in enumerate(columns)]
         light = layout.to_light(solved, self._F, self.mixing)
-        limited = [
-            np.where(f[:, None] > 0.0, np.clip(p.astype(np.float32), *inwards(low, high)), np.float32(0.0))
-            for p, f in zip(light, self._F, strict=True)
-        ]
-        return shape.pack(limited, self.grid)
+        limited = [np.clip(p.astype(np.float32), *inwards(low, high)) for p in light]
+        lit = [np.where(f[:, None] > 0.0, p, np.float32(0)) for p, f in zip(limited, self._F, strict=True)]
+        return shape.pack(lit, self.grid)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays by name, as files hold them; `from_arrays` makes the same of them, to the bit."""
-        own = {
-            "grid": self.grid,
-            "first_bounce": self._F,
-            "errors": self.errors,
-            "confidence": self.confidence,
-        }
+        own = dict(zip(_ARRAYS, (self.grid, self._F, self.errors, self.confidence), strict=True))
         own |= {} if self.mixing is None else {"mixing": self.mixing}
         return {name: np.array(value) for name, value in own.items()} | stored.to_arrays(self.systems)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], device: Device | str | None = None) -> Inverse:
         """Of what `to_arrays` gave, on a device that is opened at once; InputError where they do not fit."""
-        for name in ("grid", "first_bounce", "errors", "confidence"):
+        for name in _ARRAYS:
             if name not in arrays:
                 raise InputError(f"an inverse has the array {name!r}, which is missing")
         systems = stored.from_arrays(open_device(device), arrays)

@@ -7,10 +7,10 @@ corrections, and block Gauss-Seidel solves the rows of a block together:
     l_i += omega (l_out_i - sum_(j<i) S_ij l_j^(k+1) - sum_(j>=i) S_ij l_j^(k)) / S_ii,  row i after row i
     l_B += (S_BB)^-1 (l_out - S l)_B,  block B after block
 
-All are exact, in place and deterministic, and a sweep costs about one product. They converge for every albedo
-where S is self-adjoint, so also where Jacobi does not (Saad, Iterative Methods for Sparse Linear Systems, 2nd
-ed., sections 4.1.1 and 4.2.1, theorem 4.10). The residual of an iterate is a by-product of the sweep that
-follows it; hence k iterations take k + 1 sweeps, and a product confirms the last one.
+A sweep costs about one product. They converge for every albedo where S is self-adjoint, so also where Jacobi
+does not (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., sections 4.1.1 and 4.2.1, theorem 4.10).
+The residual of an iterate is a by-product of the sweep that follows it; hence k iterations take k + 1 sweeps,
+and a product confirms the last one.
 
 Southwell relaxes the largest residual first, as progressive radiosity does with light (R. V. Southwell,
 Relaxation Methods in Engineering Science, 1940; M. Cohen et al., A Progressive Refinement Approach to Fast
@@ -36,47 +36,7 @@ _STEPS = 64  # of an iteration of Southwell's, where `rows` is not given and the
 
 
 @dataclass(frozen=True)
-class GaussSeidel:
-    """Options: ``block``, rows of a block; it changes the speed, not the iterates."""
-
-    name: ClassVar[str] = "gauss_seidel"
-    block: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.block is not None:
-            checks.count("block", self.block)
-
-    def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
-        """Improve `x`, whose residual is `r`, until the monitor ends it with one of the iterates."""
-        if monitor.check(x, r):
-            return
-        sweeps = Sweeps(relaxation(system.S, self.name, self.block, self._omega()), x, system.b, r)
-        sweeps.sweep()
-        system.products += 1
-        _repeat(sweeps.sweep, system, sweeps.before, r, monitor)
-        x.copy_from(sweeps.before)
-
-    def _omega(self) -> float | None:
-        return 1.0
-
-
-@dataclass(frozen=True)
-class SOR(GaussSeidel):
-    """Options: ``omega`` in (0, 2), and ``block`` as of Gauss-Seidel, which SOR is with omega = 1."""
-
-    name: ClassVar[str] = "sor"
-    omega: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.number("omega", self.omega, above=0.0, below=2.0)
-
-    def _omega(self) -> float:
-        return float(self.omega)
-
-
-@dataclass(frozen=True)
-class BlockGaussSeidel(GaussSeidel):
+class BlockGaussSeidel:
     """Options: ``block``, rows of a block, which changes the iterates; inverses take 4 N block bytes.
 
     With blocks of one row it is Gauss-Seidel, with one block the direct solution.
@@ -84,12 +44,38 @@ class BlockGaussSeidel(GaussSeidel):
 
     name: ClassVar[str] = "block_gauss_seidel"
     block: int | None = INVERTED
+    omega: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
-        checks.count("block", self.block)
+        if self.block is not None or self.omega is None:
+            checks.count("block", self.block)
+        if self.omega is not None:
+            checks.number("omega", self.omega, above=0.0, below=2.0)
 
-    def _omega(self) -> None:
-        return None
+    def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
+        """Improve `x`, whose residual is `r`, until the monitor ends it with one of the iterates."""
+        sweeps = Sweeps(relaxation(system.S, self.name, self.block, self.omega), x, system.b, r)
+        sweeps.sweep()
+        system.products += 1
+        _repeat(sweeps.sweep, system, sweeps.before, r, monitor)
+        x.copy_from(sweeps.before)
+
+
+@dataclass(frozen=True)
+class GaussSeidel(BlockGaussSeidel):
+    """Options: ``block``, rows of a block; it changes the speed, not the iterates."""
+
+    name: ClassVar[str] = "gauss_seidel"
+    block: int | None = None
+    omega: ClassVar[float | None] = 1.0
+
+
+@dataclass(frozen=True)
+class SOR(GaussSeidel):
+    """Options: ``omega`` in (0, 2), and ``block`` as of Gauss-Seidel, which SOR is with omega = 1."""
+
+    name: ClassVar[str] = "sor"
+    omega: float = 1.0  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 @dataclass(frozen=True)
@@ -111,8 +97,6 @@ class Southwell:
 
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
-        if monitor.check(x, r):
-            return
         n = x.shape[0]
         rows = min(max(1, n // _STEPS) if self.rows is None else self.rows, n)
         steps = Steps(system.S, self.name, x, r, rows)
@@ -135,5 +119,5 @@ def _repeat(iteration: Callable[[], None], system: System, x: Array, r: Array, m
             vectors.queue_dot(r, r, squares, slot)
         system.products += ahead
         norms = np.sqrt(squares.get()[:ahead].astype(np.float64))
-        if monitor.check(x, r, norms, recursive=True):
+        if monitor.check(x, r, norms, travelled=np.inf):
             return

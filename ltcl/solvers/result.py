@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ltcl import checks
+
 
 class Status(enum.Enum):
     """How a solve ended; the value says why, and most say what to try next."""
@@ -17,52 +19,31 @@ class Status(enum.Enum):
     CONVERGED = "the true residual is within the tolerance"
     MAXITER = "maxiter was reached before the tolerance; raise maxiter, loosen rtol, or try another method"
     DIVERGED = "the residual grew"
-    STAGNATED = (
-        "the residual stopped falling, or the tolerance is below what float32 products can tell, about 1e-6; "
-        "loosen rtol"
-    )
+    STAGNATED = "the residual stopped falling, or rounding may hide more than the tolerance; loosen rtol"
     INDEFINITE = (
         "S is not positive definite in the inner product of cg, which then has no next step; "
-        "give the weights= that make S self-adjoint, normal=True, or try method='gmres' or 'chebyshev'"
+        "give the weights= that make S self-adjoint, or try method='gmres' or 'chebyshev'"
     )
-    NO_STEP = (
-        "the method has no next step here, not even started anew; "
-        "try method='gmres', 'cg' with normal=True, or 'direct'"
-    )
-    SAMPLED = "the samples are spent; .reason tells what to try next"
+    NO_STEP = "the method has no next step here, not even started anew; try method='gmres' or 'direct'"
+    SAMPLED = "an estimate with noise; .reason tells what was reached and what to try next"
     PRECOMPUTED = "one product with an inverse whose error is bounded; no residual was computed"
     BREAKDOWN = "the system is singular; check the first bounce and the transport"
 
 
-_SERIES = ("jacobi", "neumann", "matrix_iteration", "matrix_series")
-
-
-def _advice(status: Status, method: str) -> str:
-    """Why a solve ended and what else to try: never the method that just failed."""
-    if status is Status.STAGNATED and method != "direct":
-        return f"{status.value} or try method='direct'"
-    if status is not Status.DIVERGED:
-        return status.value
-    series = ": the series converges only where the spectral radius of R is below 1"
-    other = "gmres" if method == "chebyshev" else "chebyshev"
-    return f"{status.value}{series if method in _SERIES else ''}; try method='{other}' or 'direct'"
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution:
     """Result of `ltcl.solve`; of three S at once `products` are those of all, and `residuals` the largest.
 
     Attributes
     ----------
-    x : like b, float32 (float64 of "direct", of values beyond float32 or too small for it, and of what
-        `exact` refined in float64)
+    x : like b, float32 (float64 of "direct", of values beyond float32, and where `exact` was so refined)
         The solution; where `converged` is False, the iterate with the smallest residual, or what was sampled.
         Of `pixels=` (P,) or (P, k), in their order; of three S (3, P) or (3, P, k).
     status : Status
     iterations : int
     products : int
         Products with S, those for checks included; of "auto" those of all methods tried, and of the survey
-        in the solve that made it. Not the one that finds the row sums, once in the life of an operator.
+        in the solve that made it, without the one that finds the row sums of an operator.
     residuals : tuple of float
         ``||b - S x|| / ||b||`` before each iteration and at the end; the largest over right-hand sides.
     seconds : float
@@ -75,9 +56,10 @@ class Solution:
         Residual of the best iterate; the least of `residuals` when not given.
     standard_error : like x, optional
         Of "monte_carlo": of the noise of n samples, without the bias of alias tables, which leave out entries
-        drawn less than once in about 2^19 times the entries of their row. Its first part, of the spread of
-        samples, falls as 1 / sqrt(n); that of light which they may not have met as 1 / n (by the rule of
-        three about 1.7 |R_i| max |b| / n), and is the larger one where few pixels hold most of the light.
+        drawn less than once in about 2^19 times the entries of their row. It falls as 1 / sqrt(n), its part
+        of light which no sample may have met as 1 / n (by the rule of three about 1.7 |R_i| max |b| / n).
+    least_rtol : float, optional
+        Of "direct" that did not converge: the smallest rtol that this x can be claimed to meet.
     error : float, optional
         Bound on the relative error of x, where one is known: of a precomputed inverse.
     rest : like x, optional
@@ -94,6 +76,7 @@ class Solution:
     reason: str = ""
     lowest: float | None = None
     standard_error: np.ndarray | None = None
+    least_rtol: float | None = None
     error: float | None = None
     rest: np.ndarray | None = None
 
@@ -113,19 +96,38 @@ class Solution:
     def __str__(self) -> str:
         if self.error is not None:
             return f"{self.method}: relative error at most {self.error:.2g}: {self.status.value}"
+        return f"{self._outcome()}: {self._advice()}"
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.x.shape))
+        return f"<ltcl Solution of {shape} values by {self._outcome()}>"
+
+    def _outcome(self) -> str:
         best, last = self.residual, self.residuals[-1]
         residual = f"{best:.2g}"
         if np.isnan(last) and self.status is Status.SAMPLED:
-            residual = "unknown of some pixels alone"
+            residual = "not known for selected pixels only"
         elif last > best:
             residual += f" at best and {last:.2g} at the end"
-        why = _advice(self.status, self.method)
-        if self.status is Status.SAMPLED and self.reason:
-            why = f"{why.partition(';')[0]}: {self.reason}"
         return (
             f"{self.method}: {self.status.name.lower()} after {self.iterations} iterations, "
-            f"{self.products} products, relative residual {residual}: {why}"
+            f"{self.products} products, relative residual {residual}"
         )
+
+    def _advice(self) -> str:
+        """Why a solve ended and what else to try: never the method that just failed."""
+        why, method = self.status.value, self.method
+        if self.status is Status.SAMPLED:
+            return self.reason or why
+        if self.least_rtol is not None:
+            return f"rounding may hide up to {checks.upwards(self.least_rtol)} of it; ask for no less"
+        if self.status is Status.STAGNATED and method != "direct":
+            return f"{why} or try method='direct'"
+        if self.status is not Status.DIVERGED:
+            return why
+        if method in ("jacobi", "neumann", "matrix_series"):
+            why += ": the series converges only where the spectral radius of R is below 1"
+        return f"{why}; try method='{'gmres' if method == 'chebyshev' else 'chebyshev'}' or 'direct'"
 
 
 def joined(channels: Sequence[Solution]) -> Solution:

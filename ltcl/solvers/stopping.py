@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One stopping rule for every method, and the system it is asked about.
 
-A right-hand side b is solved when ``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2 solved for l_d), for each
-column of b. CONVERGED is claimed only of a residual of x itself that is within the tolerance with all that
-rounding may hide (`ltcl.solvers.precision`): the one the method has where that is little, else one that is
-computed anew, in float64 where the numbers of S are at hand.
+``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2 solved for l_d) for each column of b. CONVERGED is claimed
+only of a residual that is within the tolerance with all that rounding may hide (`ltcl.solvers.precision`):
+the one the method has where that is little, else one that is computed anew, in float64 where S is at hand.
 """
 
 from __future__ import annotations
@@ -18,137 +17,64 @@ from typing import Any
 import numpy as np
 
 from ltcl.device import Array, vectors
-from ltcl.operators import Epilogue, Operator
+from ltcl.operators import Operator
 from ltcl.solvers import precision
 from ltcl.solvers.result import Status
 
 SLOTS = 8  # steps between two readings, at most
-_BOUND = 8  # products of which the arrays are kept
 
 # Residuals of Chebyshev swing under an envelope that falls, and come close to 0 by chance on the way; so what
 # counts is the start and the largest of a long window, not the best residual so far.
 _GROWTH = 100.0  # times the first residual: past all transient growth of a nearly self-adjoint system
 _RISES = 20  # residuals in a row, each above the one before, up to more than the first
-_WINDOW = 100  # steps whose largest residual must be below that of as many steps before
+_WINDOW = 100  # steps whose largest residual must be 1 % below that of as many steps before
 _PATIENCE = 25  # steps without a new best residual once they are near rounding
 _DRIFT = 2.0**-20  # relative residual, below which one kept by recursion in float32 may be far off
 CLAIM = 1.01  # times the tolerance: what a residual may reach with what rounding hides added
 _REFUSALS = 3  # claims in a row that could not be confirmed, none better than those before
-_BETTER = 0.99  # times the least residual of such claims
+_BETTER = 0.99  # times a residual: less of it is progress
 
 
+@dataclass(eq=False)
 class System:
     """S x = b on the device, counting products.
 
-    `whole` is what tolerances are relative to: b, or, where S and b are a part of a system whose other part
-    is solved already, the b of both. `host` is b before it became float32. Of a `fine` system x is float64 on
-    the host, and so are residuals; what is left of them in r is rounded once.
+    `norms` (k,) are what tolerances are relative to: those of b, or, where a part of the system is solved
+    already, of the whole right-hand side. `host` is b before it became float32. Of a `fine` system x is
+    float64 on the host, residuals are computed in float64, and r is rounded once. With `on_coefficients` x
+    will come back to pixels by float32 products, so that float64 proves nothing.
     """
 
-    fine = False
-    _norms: np.ndarray | None = None
-
-    def __init__(
-        self, S: Operator, b: Array, whole: Array | None = None, host: np.ndarray | None = None
-    ) -> None:
-        self.S = S
-        self.b = b
-        self.whole = b if whole is None else whole
-        self.products = 0
-        self.start_norms: np.ndarray | None = None  # (1, k) of the first residual, where they are known
-        self._host = host
-        self._bound: dict[tuple[Any, ...], Callable[[], object]] = {}  # products that loops come back to
+    S: Operator
+    b: Array
+    norms: np.ndarray
+    host: np.ndarray | None = None
+    on_coefficients: bool = False
+    fine: bool = False
+    products: int = 0
 
     @functools.cached_property
     def times(self) -> precision.Product | None:
         """Products by S in float64, None where its numbers are not at hand on the host."""
-        return precision.product(self.S)
+        return None if self.on_coefficients else precision.product(self.S)
 
-    @functools.cached_property
-    def whole_norms(self) -> np.ndarray:
-        """Norms (k,) of the right-hand sides that tolerances are relative to."""
-        return vectors.norm(self.whole)
-
-    @property
-    def least(self) -> float:
-        """Relative residual that is rounding alone."""
-        return 2.0**-52 if self.fine else precision.EPS
-
-    def apply(self, x: Array, out: Array, *, scale: float = 1.0, add: Array | None = None) -> Array:
-        """out = scale * (S x) + add; see `Operator.apply`."""
+    def residual(self, x: Any, r: Array) -> np.ndarray:
+        """r = b - S x, and its norms (k,)."""
         self.products += 1
-        key = (x, out, scale, add)
-        if key not in self._bound:
-            if len(self._bound) == _BOUND:
-                self._bound.clear()
-            self._bound[key] = self.S.bind(x, out, Epilogue(scale, 0.0 if add is None else 1.0, add))
-        self._bound[key]()
-        return out
-
-    def apply_transpose(self, x: Array, out: Array) -> Array:
-        """out = S^T x."""
-        self.products += 1
-        return self.S.apply_transpose(x, out)
-
-    def residual(self, x: Any, r: Array) -> Array:
-        """r = b - S x."""
-        if not self.fine:
-            return self.apply(self._on_device(x), r, scale=-1.0, add=self.b)
-        self.products += 1
-        self._norms = self.exact_norms(x, r)
-        return r
-
-    def confirm(
-        self, x: Any, r: Array, norms: np.ndarray, limit: np.ndarray, travelled: Any, steps: int
-    ) -> tuple[np.ndarray, bool]:
-        """Norms of the residual of x as exact as can be told, and whether they are below `limit`.
-
-        `norms` are of a residual computed from x itself `steps` steps ago and kept by recursion since;
-        `travelled` bounds the way of x since then, None if unknown. What is computed anew is left in `r`.
-        """
         if self.fine:
-            norms = self.whole_norms if self._norms is None else self._norms  # of x = 0
-            return norms, _within(norms, limit)
-        x = self._on_device(x)
-        if steps and (travelled is None or not precision.is_bounded(self.S)):
-            (norms, size), steps = vectors.norms(self.residual(x, r), x), 0
-        else:
-            size = vectors.norm(x) if _within(norms, limit) else norms
-        if self._proven(size, norms, limit, travelled if steps else 0.0, steps):
-            return norms, True
-        if precision.is_small(self.S) and self.times is not None:
-            norms = self.exact_norms(x, r)
-            return norms, _within(norms, limit)
-        if steps:
-            norms, size = vectors.norms(self.residual(x, r), x)
-            return norms, self._proven(size, norms, limit)
-        return norms, False
+            return self.exact_residual(x, r)
+        x = x if isinstance(x, Array) else self.S.device.upload(x)
+        return vectors.norm(self.S.apply(x, r, scale=-1.0, add=self.b))
 
-    def exact_norms(self, x: Any, r: Array) -> np.ndarray:
-        """Norms of b - S x in float64, with b and S as they were given; the residual is left in `r`."""
+    def exact_residual(self, x: Any, r: Array) -> np.ndarray:
+        """The same in float64, with b and S as they were given."""
         assert self.times is not None  # noqa: S101 - asked for by the callers
-        b = np.asarray(self.b.get() if self._host is None else self._host, np.float64)
+        b = np.asarray(self.b.get() if self.host is None else self.host, np.float64)
         x = x.get() if isinstance(x, Array) else x
         left = b - self.times(x.astype(np.float64).reshape(len(b), -1)).reshape(b.shape)
         if np.all(np.abs(left) <= np.finfo(np.float32).max):
             r.set(left)
         return np.atleast_1d(np.linalg.norm(left, axis=0))
-
-    def _on_device(self, x: Any) -> Array:
-        return x if isinstance(x, Array) else self.S.device.upload(x)
-
-    def _proven(
-        self, size: np.ndarray, norms: np.ndarray, limit: np.ndarray, travelled: Any = 0.0, steps: int = 0
-    ) -> bool:
-        """Whether norms are within the limit with what rounding may hide; `size` are norms (k,) of x."""
-        if not _within(norms, limit):
-            return False
-        hidden = precision.UNIT * precision.norm_bound(self.S) * (steps + 1) * (size + travelled)
-        return _within(norms + hidden + 0.5 * precision.EPS * self.whole_norms, CLAIM * limit)
-
-
-def _within(norms: np.ndarray, limit: np.ndarray) -> bool:
-    return bool(np.all(norms <= limit))
 
 
 @dataclass(frozen=True)
@@ -160,14 +86,18 @@ class Rule:
     maxiter: int
     callback: Callable[[int, float], object] | None = None
 
+    def target(self, norms: np.ndarray) -> np.ndarray:
+        """Norms (k,) that residuals may have where right-hand sides have `norms`."""
+        return np.maximum(self.rtol * norms, self.atol)
+
 
 @dataclass
 class Monitor:
     """Watches a solve: decides when it ends, keeps the history and the best iterate.
 
-    A method asks `steps_ahead()` how many steps it may queue, and calls `check` after them with the iterate
-    and its residual. `factor` is what a step shrinks its residual by in theory, where it knows. After a check
-    `norms` are those of the columns of the residual, and `unsolved` the columns above the tolerance.
+    A method asks `steps_ahead()` how many steps it may queue, and calls `check` after them; where it has no
+    next step, it sets `status`. `factor` is what a step shrinks its residual by in theory, where it knows.
+    After a check `norms` (k,) are those of the residual, and `unsolved` the columns above the tolerance.
     """
 
     system: System
@@ -179,14 +109,14 @@ class Monitor:
     factor: float = 1.0
 
     def __post_init__(self) -> None:
-        norms = self.system.whole_norms
-        self._scale = np.where(norms > 0, norms, 1.0)
-        self._target = np.maximum(self.rule.rtol * norms, self.rule.atol)
-        self._trusted = np.maximum(self._target, _DRIFT * norms)
-        self.norms = norms
-        self.unsolved = np.ones(norms.shape, bool)
-        self._lowest_at = self._rises = self._refused = self._true_at = 0
-        self._untrue = math.inf
+        self.norms = self.system.norms
+        self._scale = np.where(self.norms > 0, self.norms, 1.0)
+        self._target = self.rule.target(self.norms)
+        self._trusted = np.maximum(self._target, _DRIFT * self.norms)
+        self.unsolved = np.ones(self.norms.shape, bool)
+        self._lowest_at = self._rises = self._refused = 0
+        self._steps, self._travelled = 0, 0.0  # since the residual was computed from x itself
+        self._unproven = math.inf
         self._finite = True
 
     @property
@@ -203,8 +133,7 @@ class Monitor:
     def steps_ahead(self) -> int:
         """Steps to queue before residuals are read: half of those to the tolerance, or to divergence.
 
-        Half, since residuals may fall faster than they did, and no more than were made so far: products made
-        in vain cost more than readings.
+        No more than were made so far: products made in vain cost more than readings.
         """
         done, residual = self.iterations, self.residuals[-1]
         if done == 0 or not residual > 0.0:
@@ -213,41 +142,35 @@ class Monitor:
             recent = np.array(self.residuals[-SLOTS - 1 :])
             ratios = recent[1:] / recent[:-1]
             factor = min(float(np.min(ratios)), self.factor)
-            wanted = np.maximum(self._target, self.system.least * self._scale)
-            left = _steps(float(np.max(self.norms / wanted)), 1.0 / factor if factor > 0.0 else math.inf)
+            goal = np.maximum(self._target, precision.EPS * self._scale)
+            left = _steps(float(np.max(self.norms / goal)), 1.0 / factor if factor > 0.0 else math.inf)
             growth = _steps(_GROWTH * self.residuals[0] / residual, float(ratios[-1]))
         most = min(left, growth, 2.0 * SLOTS - 1.0, 2.0 * (self.rule.maxiter - done) - 1.0)
         return max(1, min(int((most + 1.0) / 2.0), done))
 
-    def check(
-        self,
-        x: Any,
-        r: Array,
-        norms: np.ndarray | None = None,
-        *,
-        recursive: bool = False,
-        travelled: np.ndarray | None = None,
-    ) -> bool:
-        """Whether the solve ends with the iterate `x`; sets `status` when it does.
+    def check(self, x: Any, r: Array, norms: np.ndarray, travelled: Any = None) -> bool:
+        """Whether the solve ends with the iterate `x`, whose residual is `r`; sets `status` when it does.
 
-        `norms` (m, k) are those of the residuals of the m steps since the last check, the newest last; that
-        of `r` is measured now when not given. A residual kept by recursion is computed anew, into `r`, before
-        convergence is claimed and wherever rounding may have parted the two; but not where `travelled`, a
-        bound (k,) on the way of x since that was done last, shows that nothing that counts can be lost.
+        `norms` (m, k) are those of the residuals of the m steps since the last check, the newest last.
+        `travelled` is None where r was computed from x itself; of a residual kept by recursion it bounds the
+        way (k,) of x in these steps, `inf` where that is unknown. Such a residual is computed anew, into `r`,
+        before convergence is claimed, unless all that rounding may have parted the two by is within the
+        tolerance, too.
         """
-        *before, last = vectors.norm(r)[None] if norms is None else norms
-        steps = len(self.residuals) + len(before) - self._true_at if recursive else 0
-        norms, claimed = self._confirm(x, r, last, travelled, steps)
-        troubles = [self._judge(one) for one in (*before, norms)]
-        if norms is not last or not steps:
-            self._true_at = self.iterations
-        self.norms, self.unsolved = norms, self.above(norms)
+        *before, last = norms
+        if travelled is None:
+            self._steps, self._travelled = 0, 0.0
+        else:
+            self._steps, self._travelled = self._steps + len(norms), self._travelled + travelled
+        self.norms, claimed = self._confirm(x, r, last)
+        troubles = [self._judge(one) for one in (*before, self.norms)]
+        self.unsolved = self.above(self.norms)
         if not claimed and not self.unsolved.any():  # within the tolerance, but for what rounding may hide
-            self.unsolved = norms > 0.0
+            self.unsolved = self.norms > 0.0
         if self._finite and self.residuals[-1] <= self.lowest:  # equal: one column stuck, others improve
             if self.residuals[-1] < self.lowest:
                 self.lowest, self._lowest_at = self.residuals[-1], self.iterations
-            self.best = x.copy()
+            self.best = x if claimed else x.copy()
         if self._finite and claimed:
             self.status = Status.CONVERGED
         else:
@@ -265,19 +188,17 @@ class Monitor:
         """
         if self.iterations + 1 >= self.rule.maxiter or not np.all(np.isfinite(norms)):
             return True
+        self._steps += 1
         self._record(norms)
         return False
-
-    def give_up(self, status: Status) -> None:
-        """End the solve where the method has no next step; the best iterate stays."""
-        self.status = status
 
     def resume(self, x: Array, r: Array) -> bool:
         """Whether a solve that grew may go on, with another choice of its method, from its best iterate."""
         if self.status is not Status.DIVERGED or self.best is None or self.iterations >= self.rule.maxiter:
             return False
-        self.status, self._rises, self._finite, self._true_at = None, 0, True, self.iterations
-        self.norms = vectors.norm(self.system.residual(x.copy_from(self.best), r))
+        self.status, self._rises, self._finite = None, 0, True
+        self._steps, self._travelled = 0, 0.0
+        self.norms = self.system.residual(x.copy_from(self.best), r)
         self.unsolved = self.above(self.norms)
         return True
 
@@ -285,28 +206,57 @@ class Monitor:
         """The last iterate where it solves the system, else the best one."""
         return x if self.status is Status.CONVERGED or self.best is None else self.best
 
-    def _confirm(
-        self, x: Any, r: Array, norms: np.ndarray, travelled: np.ndarray | None, steps: int
-    ) -> tuple[np.ndarray, bool]:
-        """The norms of the newest residual, confirmed where they seem to be small enough, and if they are."""
-        if not _within(norms, self._trusted if steps else self._target):
+    def _confirm(self, x: Any, r: Array, norms: np.ndarray) -> tuple[np.ndarray, bool]:
+        """The norms of the newest residual, as exact as need be, and whether they solve the system."""
+        system, seems_solved = self.system, np.all(norms <= self._target)
+        if not seems_solved and not (self._steps and np.all(norms <= self._trusted)):
             return norms, False
-        found, claimed = self.system.confirm(x, r, norms, self._target, travelled, steps)
-        if claimed or not _within(norms, self._target):
-            return found, claimed
-        worst = float(np.max(found / self._scale))
-        self._refused = self._refused + 1 if worst > _BETTER * self._untrue else 1
-        self._untrue = min(worst, self._untrue)
-        if self._refused >= _REFUSALS and self.system.times is not None:
-            found = self.system.exact_norms(x, r)
-            return found, _within(found, self._target)
-        return found, False
+        if system.fine or self._is_proven(x, norms):
+            return norms, bool(seems_solved)
+        at_hand = precision.is_small(system.S) and system.times is not None
+        if self._steps and not (at_hand and seems_solved and np.all(np.isfinite(self._travelled))):
+            self._steps, self._travelled = 0, 0.0
+            norms = system.residual(x, r)
+            if self._is_proven(x, norms):
+                return norms, True
+        if not seems_solved:
+            return norms, False
+        if at_hand or (self._refused + 1 >= _REFUSALS and system.times is not None):
+            norms = system.exact_residual(x, r)
+            self._steps, self._travelled = 0, 0.0
+            if np.all(norms <= self._target):
+                return norms, True
+        worst = float(np.max(norms / self._scale))
+        self._refused = self._refused + 1 if worst > _BETTER * self._unproven else 1
+        self._unproven = min(worst, self._unproven)
+        return norms, False
+
+    def _is_proven(self, x: Any, norms: np.ndarray) -> bool:
+        """Whether norms are within the tolerance with all that rounding may hide of the residual of x."""
+        if not np.all(norms <= self._target):
+            return False
+        norm, is_bound = precision.norm_bound(self.system.S)
+        if self._steps and not is_bound:
+            return False
+        size = vectors.norm(x) if isinstance(x, Array) else np.linalg.norm(x, axis=0)
+        hidden = precision.UNIT * norm * (self._steps + 1) * (size + self._travelled)
+        rounded = 0.5 * precision.EPS * self.system.norms  # of b
+        return bool(np.all(norms + hidden + rounded <= CLAIM * self._target))
 
     def _judge(self, norms: np.ndarray) -> Status | None:
         """Record the norms of one iterate; what is wrong with it, if anything."""
         self._record(norms)
-        self._finite &= bool(np.isfinite(self.residuals[-1]))  # what comes after an overflow is no iterate
-        return self._trouble()
+        first, residual = self.residuals[0], self.residuals[-1]
+        self._finite &= bool(np.isfinite(residual))  # what comes after an overflow is no iterate
+        grown = residual > _GROWTH * first or (self._rises >= _RISES and residual > first)
+        if grown or not np.isfinite(residual):
+            return Status.DIVERGED
+        before, recent = self.residuals[-2 * _WINDOW : -_WINDOW], self.residuals[-_WINDOW:]
+        stalled = len(before) == _WINDOW and max(recent) > _BETTER * max(before)
+        waited = self.iterations - self._lowest_at
+        if stalled or (waited >= _PATIENCE and self.lowest < _DRIFT) or self._refused >= _REFUSALS:
+            return Status.STAGNATED
+        return Status.MAXITER if self.iterations >= self.rule.maxiter else None
 
     def _record(self, norms: np.ndarray) -> None:
         residual = float(np.max(norms / self._scale, initial=0.0))
@@ -316,27 +266,9 @@ class Monitor:
             self.rule.callback(self.iterations, residual)
         self._rises = self._rises + 1 if residual > previous else 0
 
-    def _trouble(self) -> Status | None:
-        first, residual = self.residuals[0], self.residuals[-1]
-        grown = residual > _GROWTH * first or (self._rises >= _RISES and residual > first)
-        if grown or not np.isfinite(residual):
-            return Status.DIVERGED
-        waited = self.iterations - self._lowest_at
-        if (waited >= _PATIENCE and self.lowest < _DRIFT) or self._stalled() or self._refused >= _REFUSALS:
-            return Status.STAGNATED
-        return Status.MAXITER if self.iterations >= self.rule.maxiter else None
-
-    def _stalled(self) -> bool:
-        before, recent = self.residuals[-2 * _WINDOW : -_WINDOW], self.residuals[-_WINDOW:]
-        return len(before) == _WINDOW and max(recent) >= max(before)
-
 
 def _steps(times: float, rate: float) -> float:
-    """Steps in which what grows by `rate` a step grows so many times; infinite where it never does.
-
-    >>> _steps(8.0, 2.0), _steps(0.5, 2.0), _steps(8.0, 0.5), _steps(8.0, float("inf"))
-    (3.0, 0.0, inf, 0.0)
-    """
+    """Steps in which what grows by `rate` a step grows so many times; infinite where it never does."""
     if times <= 1.0 or rate == math.inf:
         return 0.0
     return math.log(times) / math.log(rate) if rate > 1.0 else math.inf

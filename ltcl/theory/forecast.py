@@ -16,8 +16,8 @@ from ltcl.operators import Compressed, IdentityPlus, Operator
 from ltcl.theory.spectrum import POWER_ITERATION, SpectralRadius, require_operator
 
 FREE_BOUNDS, SWEEPS, RITZ = "free bounds", "trial sweeps", "ritz values"
-NOTHING, BEYOND = "none", "none: float32 cannot confirm this rtol"
-_FLOAT32 = 2.0**-23  # relative residual that is rounding
+NOTHING = "none"
+LEAST_RTOL = 2.0**-23  # a relative residual below is rounding
 _LARGEST_SWEEP = 4096  # pixels: a sweep on the host takes hundredths of a second
 _LATE = 30  # trial sweeps at least, the later half of which tells the growth
 _TRIAL = 300_000_000  # entries that trial sweeps read at most, beyond those: about a second
@@ -34,8 +34,7 @@ class Forecast:
         Infinite where the method diverges, NaN where nothing is known.
     certificate : str
         That of rho(R), "collatz-wielandt" or "power iteration"; "free bounds" on the spectrum of S, which
-        are those of Lambertian scenes; "trial sweeps" and "ritz values", estimates; or "none",
-        with a reason where there is more to say.
+        are those of Lambertian scenes; "trial sweeps" and "ritz values", estimates; or "none".
     """
 
     products: float
@@ -56,6 +55,7 @@ def forecasts(
     forecast then rests on the power iteration alone. Krylov methods are foretold by the Chebyshev polynomial
     on `spectrum`, an estimate of the positive interval that holds the eigenvalues of S, where there is one;
     they may well need less. Nothing foretells Southwell's method, nor the blocks of block_gauss_seidel.
+    InputError where rtol is below what float32 products confirm, 1.2e-7.
 
     >>> from ltcl.operators import IdentityPlus, as_operator
     >>> S = IdentityPlus(as_operator([[0.0, 0.5], [0.5, 0.0]]))
@@ -77,6 +77,7 @@ def forecasts(
     require_operator("S", S)
     if not isinstance(rho, SpectralRadius):
         raise InputTypeError(f"rho is a {type(rho).__name__}; it must be what theory.spectral_radius returns")
+    checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     decided = not rho.lower < 1.0 <= rho.upper
     series = Forecast(series_products(rho.value, rtol), rho.certificate if decided else POWER_ITERATION)
     sweeps = gauss_seidel_forecast(S, rtol)
@@ -86,7 +87,7 @@ def forecasts(
         "gmres": degree + 1,
         "bicgstab": 2 * math.ceil(degree / 2) + 2 if spectrum else math.nan,  # and one by S^T to begin
     }
-    found = {
+    return {
         "jacobi": series,
         "neumann": series,
         "richardson": Forecast(richardson_products(*bounds, rtol), FREE_BOUNDS),
@@ -97,12 +98,6 @@ def forecasts(
         "southwell": Forecast(math.nan, NOTHING),
         **{name: Forecast(n, NOTHING if math.isnan(n) else RITZ) for name, n in krylov.items()},
     }
-    return found if rtol >= _FLOAT32 else {name: _beyond(one) for name, one in found.items()}
-
-
-def _beyond(forecast: Forecast) -> Forecast:
-    """What diverges does so at any tolerance; of the rest nothing can be said."""
-    return forecast if math.isinf(forecast.products) else Forecast(math.nan, BEYOND)
 
 
 def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
@@ -116,37 +111,35 @@ def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
     3
     """
     n = require_operator("S", S).shape[0]
-    if isinstance(S, IdentityPlus) and isinstance(S.R, Compressed):
-        return Forecast(math.nan, NOTHING)  # its sweeps, where it has any, are over coefficients
-    if n > _LARGEST_SWEEP or 2 * 8 * n * n > checks.host_memory():
+    compressed = isinstance(S, IdentityPlus) and isinstance(S.R, Compressed)  # sweeps go over coefficients
+    if compressed or n > _LARGEST_SWEEP or 2 * 8 * n * n > checks.host_memory():
         return Forecast(math.nan, NOTHING)
-    left, made, rho = _trial_sweeps(S.to_dense(), rtol)
-    if left <= rtol:
-        return Forecast(made, SWEEPS)
-    more = series_products(rho, rtol / left) if math.isfinite(rho) else math.nan
-    return Forecast(made + more, NOTHING if math.isnan(more) else SWEEPS)
+    residuals = _trial_sweeps(S.to_dense(), rtol)
+    sweeps, last = len(residuals) - 1, residuals[-1]
+    if last <= rtol:
+        return Forecast(sweeps, SWEEPS)
+    late = residuals[-_LATE // 2 :]
+    rate = (last / late[0]) ** (1.0 / max(1, len(late) - 1)) if math.isfinite(last) and sweeps else math.nan
+    return (
+        Forecast(math.nan, NOTHING)
+        if math.isnan(rate)
+        else Forecast(sweeps + series_products(rate, rtol / last), SWEEPS)
+    )
 
 
-def _trial_sweeps(S: np.ndarray, rtol: float) -> tuple[float, int, float]:
-    """Relative residual after so many sweeps, to `rtol` at best, and how errors grew in late ones."""
+def _trial_sweeps(S: np.ndarray, rtol: float) -> list[float]:
+    """Relative residuals before and after each sweep, to `rtol` at best; 1 alone without a diagonal."""
+    residuals = [1.0]
     if not np.diagonal(S).all():
-        return 1.0, 0, math.nan
+        return residuals
     S = np.asfortranarray(S)
-    upper = np.triu(S, 1)
-    error, size = np.random.default_rng(0).uniform(0.5, 1.5, len(S)), 1.0
-    first, left, growth = float(np.linalg.norm(S @ error)), 1.0, []
-    given = upper @ error
-    while left > rtol and len(growth) < max(_LATE, _TRIAL // S.size) and size < _DIVERGED:
-        error = -scipy.linalg.solve_triangular(S, given, lower=True, check_finite=False)
-        growth.append(float(np.linalg.norm(error)))
-        if growth[-1] == 0.0 or not math.isfinite(growth[-1]):
-            return (0.0 if growth[-1] == 0.0 else 1.0), len(growth), math.nan
-        error /= growth[-1]
-        size *= growth[-1]
-        before, given = given / growth[-1], upper @ error
-        left = size * float(np.linalg.norm(given - before)) / first  # S e = (D + L) e + U e
-    settled = growth[-_LATE // 2 :]
-    return left, len(growth), math.exp(float(np.mean(np.log(settled)))) if settled else math.nan
+    upper, error = np.triu(S, 1), np.random.default_rng(0).uniform(0.5, 1.5, len(S))
+    first, right = float(np.linalg.norm(S @ error)), upper @ error
+    while rtol < residuals[-1] < _DIVERGED and len(residuals) <= max(_LATE, _TRIAL // S.size):
+        error = -scipy.linalg.solve_triangular(S, right, lower=True, check_finite=False)
+        before, right = right, upper @ error
+        residuals.append(float(np.linalg.norm(right - before)) / first)  # S e = (D + L) e + U e
+    return residuals
 
 
 def series_products(rho: float, rtol: float) -> float:

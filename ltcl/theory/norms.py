@@ -12,9 +12,7 @@ d^2 is a Beta distribution, whatever A is; of several independent starts one at 
 the product of these probabilities. The largest of their bounds then holds, after any number of steps.
 
 For one start and p_k alone this is the bound of van Dorsselaer, Hochstenbach and van der Vorst, SIAM J.
-Matrix Anal. Appl. 22 (2000). It adapts to A; that of Kuczynski and Wozniakowski, ibid. 13 (1992), holds for
-all A alike and so asks for more steps: after k of them the largest eigenvalue is too small by more than its
-share e with probability 1.648 sqrt(N) exp(-sqrt(e) (2k - 1)) at most.
+Matrix Anal. Appl. 22 (2000).
 """
 
 from __future__ import annotations
@@ -41,10 +39,8 @@ class TwoNorm:
 
     Attributes
     ----------
-    estimate : float
-        A lower bound, up to rounding.
-    upper : float
-        An upper bound.
+    estimate, upper : float
+        A lower bound, up to rounding, and an upper one.
     confidence : float
         Of the upper bound; 1 where it is a Frobenius norm, which is certain.
     products : int
@@ -83,9 +79,8 @@ def two_norm(
         They end also when it is clear whether the norm is at most this.
     frobenius : float
         ||A - minus||_F or more, where it is known: taken where it is smaller.
-    starts : int
+    starts, maxsteps, seed : int
         Random vectors, multiplied together as columns.
-    maxsteps, seed : int
 
     Returns
     -------
@@ -111,13 +106,16 @@ def two_norm(
     miss = 1.0 - checks.number("confidence", confidence, above=0.0, below=1.0)
     factor = checks.number("factor", factor, above=1.0)
     starts, maxsteps = checks.count("starts", starts), checks.count("maxsteps", maxsteps)
-    least = _least_overlap(A.shape[1], miss ** (1.0 / starts))
+    # A random unit vector in n dimensions has <x, v>^2 < `least` with probability miss^(1 / starts).
+    n, least = A.shape[1], 1.0
+    if n > 1:
+        least = float(scipy.special.betaincinv(0.5, 0.5 * (n - 1), miss ** (1.0 / starts)))
     process = _Bidiagonal(A, minus, starts, seed)
     estimate, upper = 0.0, math.inf
     for _ in range(maxsteps):
         process.step()
-        estimate, found = process.bounds(least)
-        upper = min(upper, found)
+        estimate, bound = process.bounds(least)
+        upper = min(upper, bound)
         if upper <= factor * estimate or process.ended:
             break
         if below is not None and (min(upper, frobenius) <= below or estimate > below):
@@ -127,11 +125,6 @@ def two_norm(
     return TwoNorm(
         min(estimate, frobenius), min(upper, frobenius), 1.0 if certain else confidence, process.products
     )
-
-
-def _least_overlap(n: int, miss: float) -> float:
-    """d^2 such that a random unit vector in n dimensions has <x, v>^2 < d^2 with probability `miss`."""
-    return 1.0 if n == 1 else float(scipy.special.betaincinv(0.5, 0.5 * (n - 1), miss))
 
 
 class _Bidiagonal:
@@ -205,24 +198,24 @@ def _bounds(alphas: np.ndarray, betas: np.ndarray, least: float) -> tuple[float,
     if len(ended) or lower == 0.0:
         return lower, lower
     inside, outside = lower**2, 4.0 * lower**2
-    a, b, wanted = alphas.tolist(), betas.tolist(), 1.0 / least
-    while not _exceeds(outside, a, b, wanted):
+    a, b = alphas.tolist(), betas.tolist()
+    while not _exceeds(outside, a, b, 1.0 / least):
         inside, outside = outside, 4.0 * outside
     for _ in range(20):
         middle = math.sqrt(inside * outside)
-        if _exceeds(middle, a, b, wanted):
+        if _exceeds(middle, a, b, 1.0 / least):
             outside = middle
         else:
             inside = middle
     return lower, math.sqrt(outside)
 
 
-def _exceeds(x: float, alphas: list[float], betas: list[float], wanted: float) -> bool:
-    """Whether p_0(x)^2 + ... + p_k(x)^2 > `wanted`, of the orthonormal polynomials by their recurrence."""
+def _exceeds(x: float, alphas: list[float], betas: list[float], limit: float) -> bool:
+    """Whether p_0(x)^2 + ... + p_k(x)^2 > `limit`, of the orthonormal polynomials by their recurrence."""
     earlier, now, total, link, beta = 0.0, 1.0, 1.0, 0.0, 0.0
     for a, b in zip(alphas, betas, strict=True):
         earlier, now = now, ((x - a * a - beta * beta) * now - link * earlier) / (a * b)
         total, link, beta = total + now * now, a * b, b
-        if total > wanted:  # the sum only grows, perhaps beyond what a float holds
+        if total > limit:  # the sum only grows, perhaps beyond what a float holds
             return True
     return False

@@ -23,36 +23,20 @@ def bounce_coefficients(n: int, bounces: int) -> tuple[int, ...]:
     R^k = (A + A^2 + ...)^k holds A^j binom(j-1, k-1) times; summed with alternating signs over k = 1 ..
     min(j, n) these cancel for 2 <= j <= n (eq. 13), so that I - A remains and bounces above n.
 
-    Parameters
-    ----------
-    n : int
-        Order of the series, at least 0.
-    bounces : int
-        Highest power of A, at least 0.
+    Both are whole numbers of at least 0, else an InputError; ``bounces + 1`` coefficients come back.
 
-    Returns
-    -------
-    tuple of int
-        ``bounces + 1`` of them.
-
-    Raises
-    ------
-    InputError
-        Not whole numbers of at least 0.
-
-    Examples
-    --------
     >>> bounce_coefficients(3, 6)  # I - A, bounces 2 and 3 gone, higher ones not yet
     (1, -1, 0, 0, -1, -3, -6)
     """
     checks.count("n", n, least=0)
     checks.count("bounces", bounces, least=0)
-    return (1, *(_coefficient(n, j) for j in range(1, bounces + 1)))
-
-
-def _coefficient(n: int, j: int) -> int:
-    """Of A^j, j >= 1; R^0 = I has none."""
-    return sum((-1) ** k * math.comb(j - 1, k - 1) for k in range(1, min(j, n) + 1))
+    return (
+        1,
+        *(
+            sum((-1) ** k * math.comb(j - 1, k - 1) for k in range(1, min(j, n) + 1))  # R^0 = I has none
+            for j in range(1, bounces + 1)
+        ),
+    )
 
 
 @dataclass(frozen=True)
@@ -75,15 +59,8 @@ class Terms:
 
 
 def after_terms(m: float, orders: Sequence[int] = (1, 2, 4, 8, 16)) -> tuple[Terms, ...]:
-    """Eq. 13, 15 and 16 for several numbers of terms.
+    """Eq. 13, 15 and 16 for several numbers of terms, at least 1; m in [0, 1).
 
-    Raises
-    ------
-    InputError
-        m outside [0, 1), an order below 1.
-
-    Examples
-    --------
     >>> after_terms(0.25, [1, 2])[1]
     Terms(n=2, next_bounce=1, forward=0.020833333333333332, inverse=0.05555555555555555)
     """
@@ -100,15 +77,8 @@ def after_terms(m: float, orders: Sequence[int] = (1, 2, 4, 8, 16)) -> tuple[Ter
 
 
 def norm_bound(m: float) -> float:
-    """||R|| <= m / (1 - m) (eq. 14).
+    """||R|| <= m / (1 - m) (eq. 14); an InputError where m is not in [0, 1).
 
-    Raises
-    ------
-    InputError
-        m outside [0, 1): no surface gives back all light, or more.
-
-    Examples
-    --------
     >>> norm_bound(0.5)
     1.0
     """
@@ -117,15 +87,8 @@ def norm_bound(m: float) -> float:
 
 
 def forward_error_bound(m: float, n: int) -> float:
-    """||S - S_n|| <= m^(n+1) / (1 - m) of n bounces (eq. 15).
+    """||S - S_n|| <= m^(n+1) / (1 - m) of n bounces (eq. 15); m in [0, 1), n at least 0.
 
-    Raises
-    ------
-    InputError
-        m outside [0, 1), n below 0.
-
-    Examples
-    --------
     >>> forward_error_bound(0.5, 3)
     0.125
     """
@@ -136,13 +99,8 @@ def forward_error_bound(m: float, n: int) -> float:
 def inverse_error_bound(m: float, n: int) -> float:
     """||S^-1 - S_n^-1|| <= m^(n+1) / ((1 - m)^n (1 - 2 m)) of n terms (eq. 16).
 
-    Raises
-    ------
-    InputError
-        m outside [0, 1/2): beyond, ||R|| < 1 is not certain and no bound follows; n below 0.
+    m must be in [0, 1/2): beyond, ||R|| < 1 is not certain and no bound follows; n at least 0.
 
-    Examples
-    --------
     >>> inverse_error_bound(0.25, 1)
     0.16666666666666666
     """

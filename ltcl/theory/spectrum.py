@@ -18,7 +18,6 @@ from ltcl.operators import Norms, Operator
 _ranges: weakref.WeakKeyDictionary[Operator, tuple[float, float, float]] = weakref.WeakKeyDictionary()
 _FLOOR = 1e-12  # of the largest value of a vector: far above what underflows
 
-
 COLLATZ_WIELANDT, POWER_ITERATION = "collatz-wielandt", "power iteration"
 
 
@@ -87,6 +86,7 @@ def spectral_radius(
     (0.5, 'collatz-wielandt', True)
     """
     require_operator("R", R)
+    certificate = POWER_ITERATION if norms is None or norms.lowest < 0.0 else COLLATZ_WIELANDT
     start = np.random.default_rng(seed).uniform(0.5, 1.5, R.shape[0])
     v = R.device.upload(start / np.linalg.norm(start))
     w = v.like()
@@ -95,7 +95,7 @@ def spectral_radius(
         R.apply(v, w)
         growth.append(float(vectors.norm(w)[0]))
         if growth[-1] == 0.0:  # nilpotent up to rounding: no light comes back for ever
-            return SpectralRadius(0.0, 0.0, len(growth), 0.0, 0.0, _certificate(norms))
+            return SpectralRadius(0.0, 0.0, len(growth), 0.0, 0.0, certificate)
         vectors.axpby(1.0 / growth[-1], w, 0.0, w, w)
         v, w = w, v
         if len(growth) > 1:
@@ -103,19 +103,15 @@ def spectral_radius(
             change = abs(values[-1] - values[-2]) / values[-1] if len(values) > 1 else math.inf
             if change < rtol / 10:  # one step's change is a fraction of the distance still to go
                 break
-    found = SpectralRadius(values[-1] if values else growth[-1], change, len(growth))
-    if norms is None or norms.lowest < 0.0:
-        return _estimated(found, values)
+    rho = SpectralRadius(values[-1] if values else growth[-1], change, len(growth))
+    if norms is None or certificate is POWER_ITERATION:
+        return _estimated(rho, values)
     # In the sum of two steps a part that belongs to -rho, which would keep ratios apart, cancels.
-    return _certified(found, R, vectors.axpby(1.0, w, growth[-1] / found.value, v, w), norms)
+    return _certified(rho, R, vectors.axpby(1.0, w, growth[-1] / rho.value, v, w), norms)
 
 
-def _certificate(norms: Norms | None) -> str:
-    return POWER_ITERATION if norms is None or norms.lowest < 0.0 else COLLATZ_WIELANDT
-
-
-def _certified(found: SpectralRadius, R: Operator, v: Array, norms: Norms) -> SpectralRadius:
-    """`found` with the bounds of Collatz and Wielandt from v >= 0."""
+def _certified(rho: SpectralRadius, R: Operator, v: Array, norms: Norms) -> SpectralRadius:
+    """`rho` with the bounds of Collatz and Wielandt from v >= 0."""
     x = v.get().astype(np.float64)
     floor = _FLOOR * x.max()  # of rows that give no light: v is 0 there, but must be positive
     seen, x = x > floor, np.maximum(x, floor).astype(np.float32).astype(np.float64)
@@ -125,25 +121,18 @@ def _certified(found: SpectralRadius, R: Operator, v: Array, norms: Norms) -> Sp
     others = 0.0 if seen.all() else 2.0 * floor * norms.inf
     lower = float(np.min((y[seen] - others) / x[seen])) * (1.0 - rounding)
     upper = min(float(np.max(y / x)) * (1.0 + rounding), norms.one, norms.inf, norms.frobenius)
-    value = min(max(found.value, lower), upper)
-    return dataclasses.replace(
-        found,
-        value=value,
-        products=found.products + 1,
-        lower=max(lower, 0.0),
-        upper=upper,
-        certificate=COLLATZ_WIELANDT,
-    )
+    value = min(max(rho.value, lower), upper)
+    return SpectralRadius(value, rho.change, rho.products + 1, max(lower, 0.0), upper, COLLATZ_WIELANDT)
 
 
-def _estimated(found: SpectralRadius, values: list[float]) -> SpectralRadius:
-    """`found` with the error that a geometric approach leaves: the last change times q / (1 - q)."""
+def _estimated(rho: SpectralRadius, values: list[float]) -> SpectralRadius:
+    """`rho` with the error that a geometric approach leaves: the last change times q / (1 - q)."""
     changes = np.abs(np.diff(values[-3:]))
     if len(changes) < 2:
-        return found
+        return rho
     q = min(float(changes[1] / changes[0]), 0.99) if changes[0] > 0.0 else 0.0
     error = float(changes[1]) * max(1.0, q / (1.0 - q))
-    return dataclasses.replace(found, lower=max(found.value - error, 0.0), upper=found.value + error)
+    return dataclasses.replace(rho, lower=max(rho.value - error, 0.0), upper=rho.value + error)
 
 
 def free_bounds(S: Operator) -> tuple[float, float]:

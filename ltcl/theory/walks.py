@@ -19,17 +19,19 @@ noise dies away where the bracket is below 1, and, with any s, where rho(Q) < 1,
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ltcl.operators import CSR, Dense, Operator
+from ltcl.operators import CSR, Dense
 from ltcl.operators.walks import Tables
 from ltcl.theory.norms import two_norm
 from ltcl.theory.spectrum import spectral_radius
 
 LONGEST = 0.9999  # chance to go on; beyond, walks of many thousand steps would carry nothing
 _SHORTEST = 1 / 16  # below, terms that matter little are seen so rarely that nobody can tell their error
+_LONG = 3 / 4  # for heavy rows alone; beyond, walks from b, which score where they end, lose too much
 
 
 class Weights(NamedTuple):
@@ -48,22 +50,27 @@ def weights(R: CSR | Dense, tables: Tables) -> Weights:
     >>> round(weights(R, tables(R)).radius, 6), weights(R, tables(R)).mean_square.tolist()
     (0.25, [[0.25, 0.25]])
     """
-    if "weights" not in tables.kept:
+    if "weights" not in tables.moments:
         Qs = tables.second_moments(R)
         radius = float(np.max([spectral_radius(Q).value for Q in Qs]))
-        tables.kept["weights"] = Weights(radius, np.stack([Q.row_sums().astype(np.float64) for Q in Qs]))
-    return tables.kept["weights"]
+        tables.moments["weights"] = Weights(radius, np.stack([Q.row_sums().astype(np.float64) for Q in Qs]))
+    return tables.moments["weights"]
 
 
-def chance_to_go_on(radius: float, albedo: float | None) -> float:
-    """q = m / (1 - m) of eq. 24; where no albedo m is given sqrt(radius), at which rho(Q) / q = q.
+def chance_to_go_on(step: Weights, albedo: float | None) -> float:
+    """q = m / (1 - m) of eq. 24; where no albedo m is given sqrt(rho(Q)), at which rho(Q) / q = q.
 
-    For equal row sums that is rho(R), hence the m of a closed scene (eq. 14).
+    For equal row sums that is rho(R), hence the m of a closed scene (eq. 14). Light that goes one way has a
+    lower rho(Q), down to 0: q is then the root of the heaviest row of Q, up to 3/4, so that weights do not
+    grow while walks become rare.
 
-    >>> chance_to_go_on(0.25, None), round(chance_to_go_on(0.25, 0.3), 4)
-    (0.5, 0.4286)
+    >>> chance_to_go_on(Weights(0.25, np.array([[0.25, 0.25]])), None)
+    0.5
     """
-    return max(math.sqrt(radius), _SHORTEST) if albedo is None else albedo / (1.0 - albedo)
+    if albedo is not None:
+        return albedo / (1.0 - albedo)
+    heaviest = math.sqrt(float(np.max(step.mean_square, initial=0.0)))
+    return max(math.sqrt(step.radius), min(heaviest, _LONG), _SHORTEST)
 
 
 def has_variance(radius: float, q: float) -> bool:
@@ -71,13 +78,22 @@ def has_variance(radius: float, q: float) -> bool:
     return radius < q <= LONGEST
 
 
-def enough_samples(R: Operator, Q: Operator) -> float:
-    """Samples of a row from which on the noise of a sampled product dies away; infinite of ||R||_2 >= 1.
+def enough_samples(Rs: Sequence[CSR | Dense], tables: Tables) -> float:
+    """Samples of a row from which on the noise of sampled products by all Rs dies away; kept with the tables.
+
+    Infinite where a ||R||_2 >= 1.
 
     >>> from ltcl.operators import as_operator
-    >>> R, Q = [[0.0, 0.5], [0.5, 0.0]], [[0.0, 4.0], [4.0, 0.0]]
-    >>> enough_samples(as_operator(R), as_operator(Q))  # (4 - 1/4) / (1 - 1/4), and one more
-    6.0
+    >>> from ltcl.operators.walks import tables
+    >>> R = as_operator([[0.0, 0.5], [0.5, 0.0]])
+    >>> enough_samples([R], tables(R))  # one is enough
+    1.0
     """
-    norm, most = two_norm(R).upper ** 2, Q.norms().one
-    return math.floor(max(most - norm, 0.0) / (1.0 - norm)) + 1.0 if norm < 1.0 else math.inf
+    if "enough" not in tables.moments:
+        pairs = zip(Rs, tables.second_moments(Rs[0]), strict=True)
+        tables.moments["enough"] = max(_enough(two_norm(R).upper ** 2, Q.norms().one) for R, Q in pairs)
+    return tables.moments["enough"]
+
+
+def _enough(square: float, most: float) -> float:
+    return math.floor(max(most - square, 0.0) / (1.0 - square)) + 1.0 if square < 1.0 else math.inf

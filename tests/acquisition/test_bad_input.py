@@ -218,7 +218,7 @@ def test_photographs_of_another_kind(spoilt: Callable[[np.ndarray], Any], text: 
         ({"exposures": 0.5}, InputError, "exposures is 0.5"),
         ({"exposures": [1.0, -1.0]}, InputError, "exposures is"),
         ({"exposures": [np.nan]}, InputError, "exposures has 1 NaN"),
-        ({"exposures": "fast"}, InputTypeError, "exposures holds"),
+        ({"exposures": "fast"}, InputTypeError, "exposures is"),
         ({"response": "srgb"}, InputTypeError, "response is a str"),
         ({"progress": 3}, InputTypeError, "progress is 3"),
         ({"store": 3}, InputTypeError, "store is 3"),

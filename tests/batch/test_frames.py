@@ -425,7 +425,7 @@ def test_resuming_nothing_begins(T, source, tmp_path):
         ({"fps": -1}, InputError, "fps is -1"),
         ({"gain": 0}, InputError, "gain is 0"),
         ({"loss": 0.1}, InputError, "loss is 0.1, but gain is 1.0"),
-        ({"bounds": (1, 0)}, InputError, r"bounds\[1\] is 0"),
+        ({"bounds": (1, 0)}, InputError, r"bounds is \(1, 0\)"),
         ({"video": "a.gif"}, FileError, r"a\.gif: extension \.gif is unknown"),
         (
             {"exact": np.eye(64)},

@@ -52,6 +52,7 @@ def test_everything_is_in_the_tables_and_in_json(program: Program, transport: Pa
         "cancel bounces",
         "between",
         "collatz-wielandt",
+        "no forecast",
         "gauss_seidel",
         "richardson",
         "reciprocity defect",

@@ -181,7 +181,7 @@ def test_earlier_results_give_way_to_new_ones(
         (["{transport}", "{picture}", "--gain", "auto", "--loss", "0"], ["--loss is 0.0", "at least 1e-06"]),
         (["{transport}", "{picture}", "--gain", "-1"], ["--gain is -1.0", "above 0"]),
         (["{transport}", "{picture}", "--weights", "{large}"], ["20 x 30", "--resize"]),
-        (["{transport}", "{picture}", "--low", "1", "--high", "0"], ["--high is 0.0", "above 1"]),
+        (["{transport}", "{picture}", "--low", "1", "--high", "0"], ["(--low, --high) is (1.0, 0.0)"]),
         (["{transport}", "{picture}", "--rtol", "nan"], ["rtol is nan"]),
         (["{transport}", "{picture}", "--rtol", "0"], ["--rtol is 0; it must be above 0"]),
         (["{transport}", "{picture}", "--background", "{large}"], ["20 x 30", "--resize"]),

@@ -203,7 +203,7 @@ def test_clipped_frames_come_with_advice(
         (["{film}", "--video", "a.webm"], ["a.webm: extension .webm is unknown"]),
         (["{film}", "--fps", "0"], ["fps is 0.0"]),
         (["{film}", "--gain", "0"], ["--gain is 0.0"]),
-        (["{film}", "--low", "2"], ["--high is 1.0"]),
+        (["{film}", "--low", "2"], ["(--low, --high) is (2.0, 1.0)"]),
         (["{video}"], ["film.avi: frame 1 of 10 is 4 x 12 pixels, but the camera has 5 x 10; give --resize"]),
         (["nowhere.mp4"], ["nowhere.mp4: no such file"]),
         (["{empty}"], ["holds no pictures"]),

@@ -77,6 +77,7 @@ def test_a_budget_is_refused_with_what_it_takes(program: Program, transport: Pat
     assert (outcome.code, outcome.out) == (1, "")
     last = outcome.err.splitlines()[-1]
     assert last.startswith("ltcl: error: --budget is 10 bytes, but rtol 0.01 needs ")
+    assert " of at least " in last
     assert not list(tmp_path.iterdir())
 
 

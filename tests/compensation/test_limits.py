@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.sparse
@@ -12,7 +14,7 @@ from scipy.optimize import lsq_linear
 from scipy.sparse.linalg import aslinearoperator
 
 import ltcl
-from ltcl.errors import ConvergenceError, InputError, InputTypeError
+from ltcl.errors import ConvergenceError, InputError, LtclError
 from tests.problems import lambertian
 
 GRID = (4, 6)
@@ -37,29 +39,31 @@ def error(seen: np.ndarray, target: np.ndarray, weights: np.ndarray | float = 1.
     rho=st.sampled_from([0.1, 0.8, 4.0]),
     rtol=st.sampled_from([1e-1, 1e-2, 1e-4]),
     bright=st.floats(0.1, 4.0),
-    low=st.sampled_from([0.0, 0.1]),
+    bounds=st.sampled_from([(0.0, 1.0), (0.1, 1.0), (-0.5, 0.5), (0.0, 255.0)]),
     ambient=st.sampled_from([0.0, 0.3]),
 )
 def test_never_worse_than_clamping_and_never_far_from_the_least(
-    device, seed, rho, rtol, bright, low, ambient
+    device, seed, rho, rtol, bright, bounds, ambient
 ):
     """Over random scenes: the claim of `compensate`, and of the certificate that comes with it."""
     rng = np.random.default_rng(seed)
     scene = lambertian(N, rho, seed=seed % 50, density=rng.choice([0.1, 1.0]))
-    desired = bright * rng.uniform(0, 1, N) ** rng.choice([1, 3]) * scene.T.sum(axis=1)
+    low, high = bounds
+    desired = bright * high * rng.uniform(0, 1, N) ** rng.choice([1, 3]) * scene.T.sum(axis=1)
     background = ambient * rng.uniform(0, 1, N)
     T = ltcl.Transport(scene.T, GRID, device=device)
-    c = ltcl.compensate(T, desired, background=background, bounds=(low, 1.0), method="direct", rtol=rtol)
-    clamped = np.clip(np.linalg.solve(scene.T, desired - background), low, 1.0)
+    c = ltcl.compensate(T, desired, background=background, bounds=bounds, method="direct", rtol=rtol)
+    clamped = np.clip(np.linalg.solve(scene.T, desired - background), low, high)
     found, target = scene.T @ c.pattern.astype(float), desired - background
     assert np.linalg.norm(found - target) <= np.linalg.norm(
         scene.T @ clamped - target
     ) + 2e-5 * np.linalg.norm(desired)
-    best = least(scene.T, target, bounds=(low, 1.0))
+    best = least(scene.T, target, bounds=bounds)
     share = np.linalg.norm(target) / np.linalg.norm(desired)  # error and gap are relative to desired
     assert c.error - c.gap <= best * share + 1e-5
     assert c.gap <= max(rtol * share, 1e-4) * (1 + 1e-5)
-    at_bound = (c.pattern == np.float32(low)) | (c.pattern == np.float32(1.0))
+    assert low <= c.pattern.min() <= c.pattern.max() <= high
+    at_bound = (c.pattern == np.float32(low)) | (c.pattern == np.float32(high))
     assert c.clipped <= at_bound.mean() + 1e-12
     assert c.error == pytest.approx(np.linalg.norm(found - target) / np.linalg.norm(desired), abs=1e-5)
 
@@ -124,22 +128,19 @@ def test_rectangular_T_in_the_least_squares_sense(device, camera, form):
 
 def test_a_rectangular_T_has_no_method_of_solve(device):
     T = ltcl.Transport(np.ones((6, N)), GRID, camera_grid=(2, 3), device="there is no such device")
-    with pytest.raises(InputError, match=r"method is 'jacobi', but this T has no S .* must be 'auto'"):
-        ltcl.compensate(T, np.ones((2, 3)), method="jacobi")
-    with pytest.raises(
-        InputTypeError,
-        match=r"unknown option 'omega'; compensate has bounds, .*, rtol, atol, maxiter, callback, throw$",
-    ):
-        ltcl.compensate(T, np.ones((2, 3)), omega=1.5)
-    with pytest.raises(InputError, match=r"desired has shape \(4, 6\); it must be \(2, 3\)"):
+    refused: list[dict[str, Any]] = [{"method": "jacobi"}, {"clamp": True}, {"x0": 0}]
+    for options in refused:
+        with pytest.raises(LtclError, match=next(iter(options))):
+            ltcl.compensate(T, np.ones((2, 3)), **options)
+    with pytest.raises(InputError, match=r"desired .*\(4, 6\).*\(2, 3\)"):
         ltcl.compensate(T, np.ones(GRID))
 
 
-def test_a_limit_of_steps_is_told(device):
+def test_a_limit_of_steps_raises_or_leaves_a_gap(device):
     scene = lambertian(N, 4.0, seed=2)
     T = ltcl.Transport(scene.T, GRID, device=device)
     desired = 3 * random.uniform(0, 1, N)
-    with pytest.raises(ConvergenceError, match="bounded: maxiter after 1 iterations"):
+    with pytest.raises(ConvergenceError):
         ltcl.compensate(T, desired, method="direct", rtol=1e-4, maxiter=1)
     c = ltcl.compensate(T, desired, method="direct", rtol=1e-4, maxiter=1, throw=False)
     assert c.gap > 1e-4
@@ -192,34 +193,7 @@ def test_out_of_reach_leaves_out_what_the_tolerance_explains(device):
     )
     assert c.out_of_reach[3] > 0.0
     weights[3] = 0.0
-    told = ltcl.compensate(T, desired, weights=weights, rtol=1e-2)
-    assert told.clipped > 0.0
-    assert told.out_of_reach[3] == 0.0
-    assert abs(told.target[3] - told.appearance[3]) > explained
-
-
-def test_error_and_gap_are_relative_to_the_same(device):
-    """With a bright background gain * desired - background is another measure."""
-    scene = lambertian(N, 1.0, seed=9)
-    T = ltcl.Transport(scene.T, GRID, device=device)
-    desired = random.uniform(0.5, 2, N) * scene.T.sum(axis=1)
-    dark = 0.8 * desired * random.uniform(0, 1, N)
-    c = ltcl.compensate(T, desired, background=dark, rtol=1e-2)
-    p = lsq_linear(scene.T, desired - dark, (0, 1), tol=1e-14).x
-    best = float(np.linalg.norm(scene.T @ p + dark - desired) / np.linalg.norm(desired))
-    assert c.error - c.gap <= best + 1e-6 <= c.error + 1e-5
-    seen = scene.T @ c.pattern.astype(float) + dark
-    assert c.error == pytest.approx(np.linalg.norm(seen - desired) / np.linalg.norm(desired), rel=1e-4)
-
-
-def test_one_number_is_a_background(device):
-    T = ltcl.Transport(lambertian(N, 0.5, seed=9).T, GRID, device=device)
-    one, all_ = (ltcl.compensate(T, np.ones(N), background=b) for b in (0.1, np.full(N, 0.1)))
-    np.testing.assert_array_equal(one.pattern, all_.pattern)
-
-
-def test_a_misspelt_keyword_is_told_from_those_of_compensate():
-    T = ltcl.Transport(lambertian(N, 0.5, seed=9).T, GRID, device="there is no such device")
-    says = r"unknown option 'gian'; compensate has bounds, background, gain, loss, .* throw, x0$"
-    with pytest.raises(InputTypeError, match=says):
-        ltcl.compensate(T, np.ones(GRID), gian="auto")
+    silent = ltcl.compensate(T, desired, weights=weights, rtol=1e-2)
+    assert silent.clipped > 0.0
+    assert silent.out_of_reach[3] == 0.0
+    assert abs(silent.target[3] - silent.appearance[3]) > explained

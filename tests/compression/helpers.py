@@ -20,27 +20,6 @@ def smooth(grid: tuple[int, int], seed: int = 0) -> np.ndarray:
     return R.astype(np.float32)
 
 
-def spilled(n: int, spill: float) -> ltcl.Transport:
-    """A corner whose pixels light up to `spill` of their own light on each of their neighbours."""
-    scene = ltcl.scenes.dihedral(n, albedo=0.8)
-    (T,) = scene.matrices()
-    index, rng = np.arange(len(T)).reshape(scene.grid), np.random.default_rng(0)
-    for shift in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        near = np.roll(index, shift, (0, 1)).ravel()
-        T[near, index.ravel()] += spill * scene.first_bounce * rng.random(len(T))
-    return ltcl.Transport(T, scene.grid, first_bounce=scene.first_bounce)
-
-
-def sharp(n: int) -> ltcl.Transport:
-    """A corner, where a few pixels also light up one another."""
-    scene = ltcl.scenes.dihedral(n, albedo=0.6)
-    (T,) = scene.matrices()
-    rng = np.random.default_rng(0)
-    linked = rng.random(T.shape) < 0.005
-    T += 0.05 * linked * rng.random(T.shape) * scene.first_bounce
-    return ltcl.Transport(T, scene.grid, first_bounce=scene.first_bounce)
-
-
 def sparse(h: int, w: int) -> ltcl.Transport:
     """A few strong links between pixels, and F between 0.5 and 1."""
     n = h * w
@@ -57,14 +36,6 @@ def dense_systems(T: ltcl.Transport) -> list[np.ndarray]:
     ]
 
 
-def worst_error(S: np.ndarray, found: np.ndarray) -> float:
+def worst_error(S: np.ndarray, approximate: np.ndarray) -> float:
     """The largest ||x~ - x|| / ||x|| over all right-hand sides: ||S~^-1 E||."""
-    return float(np.linalg.norm(np.linalg.solve(found, found - S), 2))
-
-
-def core_arrays(C: ltcl.Transport) -> list[np.ndarray]:
-    """Everything that a file would hold of a compressed transport."""
-    from ltcl.transport import to_arrays
-
-    arrays = to_arrays(C)
-    return [arrays[name] for name in sorted(arrays)]
+    return float(np.linalg.norm(np.linalg.solve(approximate, approximate - S), 2))

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from ltcl.compression import inverse_norm
 from ltcl.errors import ConvergenceError
-from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, SubsetBasis, Wavelet
+from ltcl.operators import Compressed, Dense, IdentityPlus, SubsetBasis
 from tests import gallery
-from tests.problems import enclosure
 
 
 def truth(S: np.ndarray) -> float:
@@ -25,9 +24,9 @@ def test_the_bound_is_never_below(device, n, size, seed):
     R = gallery.signed(n, n, seed).astype(np.float64)
     R *= size / max(np.linalg.norm(R, 2), 1e-9)
     bound = inverse_norm(IdentityPlus(Dense(device, R)), seed=seed)
-    wanted = truth(np.eye(n) + R)
-    assert wanted <= bound.upper <= 1.25 * wanted
-    assert bound.estimate <= 1.01 * wanted
+    exact = truth(np.eye(n) + R)
+    assert exact <= bound.upper <= 1.25 * exact
+    assert bound.estimate <= 1.01 * exact
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -47,20 +46,6 @@ def test_coefficients_that_are_left_out_have_the_norm_of_the_identity(device):
     bound = inverse_norm(S)
     assert truth(S.to_dense()) == pytest.approx(1.0)
     assert 1.0 <= bound.upper <= 1.1
-
-
-@pytest.mark.parametrize("albedo", [0.3, 0.5, 0.8])
-def test_a_closed_room(device, albedo):
-    R = enclosure(60, albedo).R
-    bound = inverse_norm(IdentityPlus(Dense(device, R)), factor=1.05)
-    assert truth(np.eye(60) + R) <= bound.upper <= 1.1 * truth(np.eye(60) + R)
-
-
-def test_coefficients_have_the_norm_of_pixels(device):
-    W = Wavelet(device, (5, 9), "db2")
-    core = 0.1 * gallery.sparse(45, 45)
-    S = IdentityPlus(Compressed(CSR(device, core), W, W))
-    assert truth(S.to_dense()) * (1 - 1e-5) <= inverse_norm(S).upper <= 1.25 * truth(S.to_dense())
 
 
 def test_a_singular_system_has_no_bound(device):

@@ -13,12 +13,9 @@ import zarr
 
 import ltcl
 from ltcl import checks
-from ltcl.compression import RowSource
-from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import CSR, Dense
-from tests.compression.helpers import dense_systems, smooth, spilled, worst_error
-
-SUM = "db2 + pixels"
+from tests.compression.helpers import dense_systems, smooth, worst_error
 
 
 @pytest.fixture(scope="module")
@@ -29,30 +26,21 @@ def corner() -> ltcl.Transport:
 class Rows:
     """Rows of a matrix, of so many columns, and so many more than were asked for."""
 
-    def __init__(
-        self, matrix: Any = None, columns: int = 128, more: int = 0, shape: Any = (128, 128)
-    ) -> None:
-        self.matrix = np.eye(128) if matrix is None else matrix
-        self.columns, self.more, self.shape = columns, more, shape
+    def __init__(self, matrix: Any, columns: int = 128, more: int = 0, shape: Any = (128, 128)) -> None:
+        self.matrix, self.columns, self.more, self.shape = matrix, columns, more, shape
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         return self.matrix[start : stop + self.more, : self.columns]
 
 
-def mapped(matrix, folder):
-    np.save(folder / "T.npy", matrix)
-    return np.load(folder / "T.npy", mmap_mode="r")
-
-
 def chunked(matrix, folder):
-    array = zarr.create_array(folder / "T.zarr", shape=matrix.shape, chunks=(7, 5), dtype=matrix.dtype)
+    array = zarr.create_array(folder / "T.zarr", shape=matrix.shape, chunks=(30, 50), dtype=matrix.dtype)
     array[:] = matrix
     return array
 
 
 HOLDERS = {
     "array": lambda matrix, folder: matrix,
-    "file": mapped,
     "zarr": chunked,
     "csc": lambda matrix, folder: scipy.sparse.csc_matrix(matrix),
     "rows": lambda matrix, folder: Rows(matrix),
@@ -66,16 +54,12 @@ OPERATORS = {
 
 @pytest.mark.parametrize("kind", HOLDERS)
 def test_rows_from_elsewhere_give_the_same_bits(kind, corner, tmp_path):
-    held = HOLDERS[kind](corner.matrices[0], tmp_path)
-    least = 32 * 128 * 16  # bytes of the smallest block
-    whole, blocks = (
-        ltcl.compress(held, 0.02, basis="db2", grid=corner.grid, memory=memory) for memory in (None, least)
-    )
-    kept = ltcl.compress(corner, 0.02, basis="db2")
-    for streamed in (whole, blocks):
-        np.testing.assert_array_equal(kept.systems[0].R.to_dense(), streamed.systems[0].R.to_dense())
-        np.testing.assert_array_equal(kept.first_bounce, streamed.first_bounce)
-    assert isinstance(Rows(), RowSource)
+    matrix = HOLDERS[kind](corner.matrices[0], tmp_path)
+    direct = ltcl.compress(corner, 0.02, basis="db2")
+    for memory in (None, 32 * 128 * 16):  # the second is that of the smallest block
+        C = ltcl.compress(matrix, 0.02, basis="db2", grid=corner.grid, memory=memory)
+        np.testing.assert_array_equal(direct.systems[0].R.to_dense(), C.systems[0].R.to_dense())
+        np.testing.assert_array_equal(direct.first_bounce, C.first_bounce)
 
 
 @pytest.mark.parametrize("kind", OPERATORS)
@@ -87,13 +71,6 @@ def test_operators_give_their_rows_by_products(kind, corner, device):
     assert worst_error(dense_systems(corner)[0], C.systems[0].to_dense()) <= C.error <= 0.05
 
 
-def test_three_channels_of_rows():
-    T = ltcl.scenes.dihedral(4, albedo=(0.8, 0.5, 0.2)).transport()
-    C = ltcl.compress(list(T.matrices), 0.02, basis="haar", grid=T.grid)
-    for S, found in zip(dense_systems(T), C.systems, strict=True):
-        assert worst_error(S, found.to_dense()) <= C.error <= 0.02
-
-
 @pytest.mark.parametrize("basis", ["db2", "db2 rows", "pixels"])
 def test_rows_may_be_dropped_where_no_memory_holds_them(basis, monkeypatch):
     T = ltcl.scenes.dihedral(16, albedo=0.8).transport()
@@ -102,7 +79,9 @@ def test_rows_may_be_dropped_where_no_memory_holds_them(basis, monkeypatch):
     rtol = {"db2": 0.05, "db2 rows": 0.2, "pixels": 0.6}[basis]
     C = ltcl.compress(T, rtol, basis=basis, memory=1 << 20)
     monkeypatch.undo()
-    assert worst_error(dense_systems(T)[0], C.systems[0].to_dense()) <= C.error <= rtol
+    (S,), R, (report,) = dense_systems(T), C.systems[0].to_dense(), C.compression.channels
+    assert worst_error(S, R) <= C.error <= rtol
+    assert np.linalg.norm(R - S) <= report.dropped + report.quantisation + 1e-6 * np.linalg.norm(S)
 
 
 def test_bases_are_compared_in_the_middle_of_a_large_picture():
@@ -110,29 +89,18 @@ def test_bases_are_compared_in_the_middle_of_a_large_picture():
     T = ltcl.Transport(S, (4, 128), first_bounce=np.ones(512))
     C = ltcl.compress(T, 0.02)
     assert C.compression.window == (4, 64)
-    assert len(C.compression.channels[0].trials) == 5
+    assert len(C.compression.channels[0].trials) == 4
     assert worst_error(S, C.systems[0].to_dense()) <= C.error <= 0.02
-
-
-def test_without_room_on_the_host_a_sum_is_left_or_refused(monkeypatch):
-    T = spilled(8, 0.1)
-    assert T.systems
-    monkeypatch.setattr(checks, "host_memory", lambda: 300_000)  # 4 of 128 x 128 numbers
-    (channel,) = ltcl.compress(T, 0.1, basis=["haar", SUM]).compression.channels
-    assert channel.basis == "haar"
-    assert "128 pixels" in channel.trials[1].left
-    with pytest.raises(MemoryLimitError, match="128 pixels"):
-        ltcl.compress(T, 0.1, basis=SUM)
 
 
 @pytest.mark.parametrize("first_bounce", [None, np.ones(128)])
 @pytest.mark.parametrize(
     ("rows", "kind", "words"),
     [
-        (Rows(columns=3), InputError, r"T.*\(1, 3\).* \(1, 128\)"),
-        (Rows(more=1), InputError, r"T.*\(2, 128\).* \(1, 128\)"),
-        (Rows(np.eye(128) * 1j), InputTypeError, r"T.*complex128"),
-        (Rows(shape=128), InputError, "T has shape 128"),
+        (Rows(np.eye(128), columns=3), InputError, r"T.*\(1, 3\).* \(1, 128\)"),
+        (Rows(np.eye(128), more=1), InputError, r"T.*\(2, 128\).* \(1, 128\)"),
+        (Rows(np.eye(128) * 1j), InputTypeError, r"T.*complex"),
+        (Rows(np.eye(128), shape=128), InputError, "T has shape 128"),
         (Rows(np.diag([np.nan] * 128)), InputError, "NaN"),
         ([np.eye(128)] * 2, InputError, "T has 2 channels"),
         (np.eye(128)[:, :5], InputError, r"T has shape \(128, 5\)"),
@@ -146,11 +114,12 @@ def test_rows_must_be_what_the_shape_says(rows, kind, words, first_bounce):
 
 
 @pytest.mark.parametrize("first_bounce", [None, np.arange(128) != 2])
-def test_dark_pixels_and_operators_without_a_transpose_are_refused(first_bounce):
-    rows = np.eye(128) * (np.arange(128) != 2)
+def test_dark_pixels_are_refused(first_bounce):
     with pytest.raises(InputError, match=r"first_bounce .* 1 of 128 pixels, the first 2"):
-        ltcl.compress(rows, grid=(8, 16), first_bounce=first_bounce)
+        ltcl.compress(np.diag(np.arange(128) != 2) * 1.0, grid=(8, 16), first_bounce=first_bounce)
+
+
+def test_operators_without_a_transpose_are_refused():
     parts: dict[str, Any] = {"shape": (128, 128), "matvec": lambda x: x, "dtype": float}
-    half = scipy.sparse.linalg.LinearOperator(**parts)
     with pytest.raises(InputError, match="rmatvec"):
-        ltcl.compress(half, grid=(8, 16), first_bounce=np.ones(128))
+        ltcl.compress(scipy.sparse.linalg.LinearOperator(**parts), grid=(8, 16), first_bounce=np.ones(128))

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
-from pathlib import Path
 
+import pyopencl as cl
 import pytest
 
 import ltcl
@@ -16,7 +15,7 @@ from ltcl.errors import DeviceError, InputTypeError
 
 
 def describe(index: str, name: str, kind: str, driver: str, units: int = 2) -> Description:
-    return Description(index, name, kind, driver.split()[0], driver, units, 1 << 30, 1 << 28, None)
+    return Description(index, name, kind, driver, units, 1 << 30, 1 << 28, None)
 
 
 SIMULATOR = describe("0:0", "Oclgrind Simulator", "simulator", "Oclgrind 21.10")
@@ -38,77 +37,53 @@ def test_ranking():
 
 
 @pytest.mark.parametrize(
-    ("select", "found"),
+    ("select", "device"),
     [
         (None, BIG),
-        ("gpu", BIG),
         (" CPU ", NEWER),
         ("accelerator", STRANGE),
         ("4:0", LITTLE),
         ("radeon g", LITTLE),
         ("3.1", NEW),
-        ("intel", NEWER),
         ("pocl", NEW),
-        ("oclgrind", SIMULATOR),
         ("simulator", SIMULATOR),
     ],
 )
-def test_selection(select, found):
-    assert discovery.choose(ALL, select) is found
-
-
-@pytest.mark.parametrize("select", ["9:0", "tpu", "cpu"])
-def test_selection_of_nothing_lists_what_there_is(select):
-    with pytest.raises(DeviceError, match=f"'{select}'") as error:
-        discovery.choose([BIG, SIMULATOR], select)
-    assert "4:1 Radeon" in str(error.value)
-    assert "0:0 Oclgrind" in str(error.value)
+def test_selection(select, device):
+    assert discovery.choose(ALL, select) is device
 
 
 @pytest.mark.parametrize(
-    ("system", "fix"),
-    [
-        ("linux", "pip install 'pyopencl[pocl]'"),
-        ("darwin", "conda-forge"),
-        ("win32", "driver"),
-        ("sunos5", "pip"),
-    ],
+    ("select", "kind"), [("9:0", "index"), ("tpu", "name"), ("cpu", "CPU"), ("accelerator", "accelerator")]
 )
-def test_no_device_at_all_tells_the_fix_of_the_system(monkeypatch, system, fix):
+def test_selection_of_nothing_lists_what_there_is(select, kind):
+    with pytest.raises(DeviceError, match=f"'{select}'.* {kind} .*4:1 Radeon.*0:0 Oclgrind"):
+        discovery.choose([BIG, SIMULATOR], select)
+
+
+@pytest.mark.parametrize("system", ["linux", "darwin", "win32", "sunos5"])
+def test_no_device_at_all_names_a_driver_and_what_may_hide_it(monkeypatch, system):
     monkeypatch.setattr(sys, "platform", system)
-    with pytest.raises(DeviceError, match="no OpenCL device") as error:
-        discovery.choose([], "gpu")
-    assert fix in str(error.value)
-
-
-def test_no_device_at_all_names_what_may_hide_it(monkeypatch, tmp_path):
-    (tmp_path / "home").touch()  # a file: PoCL can make no cache in it
-    monkeypatch.delenv("POCL_CACHE_DIR", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home" / "cache"))
     monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
-    with pytest.raises(DeviceError, match=r"OCL_ICD_VENDORS=/nowhere.*POCL_CACHE_DIR.*home"):
-        discovery.choose([], None)
+    fix = {"darwin": "conda-forge", "win32": "Intel"}.get(system, "pocl")
+    with pytest.raises(DeviceError, match=f"OCL_ICD_VENDORS=/nowhere.*{fix}"):
+        discovery.choose([], "gpu")
 
 
-def test_simulator_is_never_taken_unasked():
+def test_a_simulator_is_never_taken_unasked():
     with pytest.raises(DeviceError, match="Oclgrind Simulator"):
         discovery.choose([SIMULATOR], None)
 
 
-def test_environment_names_the_default(device, monkeypatch):
-    monkeypatch.setenv("LTCL_DEVICE", device.description.index)
-    assert ltcl.open_device() is device
-    assert ltcl.open_device("") is device
+def test_the_environment_names_the_default(device, monkeypatch):
+    index = device.description.index
+    monkeypatch.setenv("LTCL_DEVICE", index)
+    assert ltcl.open_device() is ltcl.open_device("") is ltcl.open_device(device) is device
+    assert device.description in ltcl.list_devices()
     monkeypatch.setenv("LTCL_DEVICE", "no such device")
     with pytest.raises(DeviceError, match="no such device"):
         ltcl.open_device()
-    assert ltcl.open_device(device.description.index) is device  # an argument overrides it
-
-
-def test_a_device_is_opened_once(device):
-    assert ltcl.open_device(device) is device
-    assert ltcl.open_device(device.description.index) is device
-    assert device.description in ltcl.list_devices()
+    assert ltcl.open_device(index) is device  # an argument overrides it
 
 
 def test_other_types_are_refused():
@@ -117,15 +92,8 @@ def test_other_types_are_refused():
 
 
 def test_a_machine_without_platforms_has_no_devices(monkeypatch):
-    import pyopencl as cl
-
     def none() -> None:
         raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
 
     monkeypatch.setattr(cl, "get_platforms", none)
     assert ltcl.list_devices() == []
-
-
-def test_importing_the_device_layer_touches_no_driver():
-    code = "import sys, ltcl.device; sys.exit('pyopencl' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2]).returncode == 0

@@ -10,8 +10,8 @@ import scipy.sparse
 
 from ltcl.device import Device
 from ltcl.errors import InputError, MemoryLimitError
-from ltcl.operators import CSR, Dense, IdentityPlus, ScaledColumns, Shifted
-from ltcl.operators.relaxation import Relaxation, Steps, Sweeps, readable, relaxation
+from ltcl.operators import CSR, Dense, IdentityPlus, ScaledColumns
+from ltcl.operators.relaxation import Relaxation, Steps, Sweeps, relaxation
 from tests import gallery, reference
 from tests.conftest import SMALL
 from tests.operators import helpers
@@ -28,7 +28,7 @@ MATRICES = {
     "above only": np.triu(gallery.signed(33, 33, 7), 1) / 9,
 }
 METHODS = {"sor": 1.3, "block_gauss_seidel": None}  # omega
-SHAPES = {"cpu": 1, "gpu7": 7, "gpu32": 32, "gpu256": 256}  # items of a work-group
+SHAPES = {"cpu": 1, "gpu7": 7, "gpu64": 64, "gpu256": 256}  # items of a work-group
 
 
 @pytest.fixture(scope="module", params=SHAPES)
@@ -59,17 +59,19 @@ def test_sweeps_meet_their_twins(shaped, form, method, name, k):
     """Blocks of 1 to all rows; what a sweep leaves behind is what the next one tells the residual from."""
     (device, group), M, omega = shaped, MATRICES[name], METHODS[method]
     A, S = FORMATS[form](device, M), np.eye(len(M)) - M.astype(np.float64)
-    for block in (1, 7, 64, None):
+    for block in (1, 7, None):
         relax = relaxation(IdentityPlus(A, -1), method, block, omega)
+        if form == "csr":
+            windows = reference.relax_windows(M, relax.block, relax.panel, inverses=relax.inverses)
+            np.testing.assert_array_equal(relax.windows[0].get(), windows)
         sweeps, y, b = sweeps_of(relax, k)
         sweeps.group, carry = group, np.full_like(y, np.nan)
         for sweep in range(3):
-            before = y
-            how = (relax.block, omega, y, b, carry)
+            before, how = y, (relax.block, omega, y, b, carry)
             y, r, carry = reference.relax_strips(S, *how, in_place=not relax.inverses)
             sweeps.sweep()
-            found = [(sweeps.x, y), (sweeps.before, before), (sweeps.carry, carry), (sweeps.r, r)]
-            for array, wanted in found:
+            arrays = [(sweeps.x, y), (sweeps.before, before), (sweeps.carry, carry), (sweeps.r, r)]
+            for array, wanted in arrays:
                 np.testing.assert_allclose(array.get(), wanted, rtol=0, atol=1e-5)
             if sweep:
                 np.testing.assert_allclose(sweeps.r.get(), b - S @ before, rtol=0, atol=1e-5)
@@ -97,7 +99,7 @@ def test_many_strips_on_many_threads_repeat_to_the_bit(device, form):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("block", [1, 5, 19, None])
+@pytest.mark.parametrize("block", [1, 5, 16])  # inverses fit in one buffer
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_block_may_cross_slabs(device, form, kind, block, method):
@@ -106,8 +108,7 @@ def test_a_block_may_cross_slabs(device, form, kind, block, method):
     M = gallery.signed(53, 53, 4) / 20
     A, omega = FORMATS[form](small, M), METHODS[method]
     assert len(A.slabs) > 1
-    block = 16 if block is None and method == "block_gauss_seidel" else block  # inverses fit in one buffer
-    relax = relaxation(IdentityPlus(A), method, block if kind == "cpu" else block or 5, omega)
+    relax = relaxation(IdentityPlus(A), method, block, omega)
     sweeps, y, b = sweeps_of(relax, 2)
     S, before, carry = np.eye(53) + M.astype(np.float64), y, np.zeros_like(y)
     for _ in range(3):
@@ -118,35 +119,14 @@ def test_a_block_may_cross_slabs(device, form, kind, block, method):
     np.testing.assert_allclose(sweeps.r.get(), b - S @ before, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", MATRICES)
-def test_rows_are_split_as_the_twin_splits_them(shaped, name):
-    (device, _), M = shaped, MATRICES[name]
-    A = FORMATS["csr"](device, M)
-    for block in (1, 7, 64):
-        relax = Relaxation(readable(IdentityPlus(A, -1), "sor"), "sor", block, 1.0)
-        expected = reference.relax_windows(M, relax.block, relax.panel, inverses=relax.inverses)
-        np.testing.assert_array_equal(relax.windows[0].get(), expected)
-
-
-def test_a_correction_meets_its_twin(device):
-    W, s, x = gallery.signed(9, 4), gallery.vectors(9, 3, 1), gallery.vectors(9, 3, 2)
+def test_a_correction_meets_its_twin(shaped):
+    (device, group), W = shaped, gallery.signed(9, 4)
+    s, x = gallery.vectors(9, 3, 1), gallery.vectors(9, 3, 2)
     X, before = device.upload(x), device.upload(x * np.nan)
     kernel = device.kernel("relax", "relax_correct", K=3, PACKED=1)
-    group = kernel.group(32)
-    kernel(
-        3 * group,
-        group,
-        4,
-        3,
-        4,
-        3,
-        0,
-        device.upload(W),
-        X,
-        before,
-        device.upload(s),
-        device.local(3 * group),
-    )
+    group = kernel.group(group)
+    arrays = device.upload(W), X, before, device.upload(s), device.local(3 * group)
+    kernel(3 * group, group, 4, 3, 4, 3, 0, *arrays)
     expected = x.copy()
     expected[4:7] = reference.relax_correct(W[4:7, :3], s[4:7], x[4:7])
     np.testing.assert_allclose(X.get(), expected, rtol=0, atol=1e-6)
@@ -155,47 +135,24 @@ def test_a_correction_meets_its_twin(device):
 
 @pytest.mark.parametrize("k", [1, 3])
 @pytest.mark.parametrize("parts", [1, 7, 1000])
-@pytest.mark.parametrize("name", ["1x1", "53", "empty rows", "runs"])
+@pytest.mark.parametrize("name", ["1x1", "53", "empty rows", "runs", "53 in slabs"])
 @pytest.mark.parametrize("form", FORMATS)
 def test_steps_meet_their_twin(shaped, form, name, parts, k):
-    (device, group), M = shaped, MATRICES[name]
+    (device, group), M = shaped, MATRICES[name.split(" in ")[0]]
     n, parts, S = len(M), min(parts, len(M)), np.eye(len(M)) - M.astype(np.float64)
+    if "slabs" in name:
+        device, kind = Device(device.description), device.kind
+        device.max_allocation, device.kind = SMALL, kind
     x, r = gallery.vectors(n, k, 1), gallery.vectors(n, k, 2)
-    A = IdentityPlus(FORMATS[form](device, M), -1)
-    steps = Steps(A, "southwell", device.upload(x), device.upload(r), parts)
+    R = FORMATS[form](device, M)
+    assert (len(R.slabs) > 1) == ("slabs" in name)
+    steps = Steps(IdentityPlus(R, -1), "southwell", device.upload(x), device.upload(r), parts)
     steps.group = group
-    for _ in range(3):
-        steps.step()
-        x, r = reference.southwell_step(S, parts, x, r)
-    steps.step(picks=False)
-    np.testing.assert_allclose(steps.x.get(), x, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(steps.r.get(), r, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_steps_over_slabs_give_the_same(small_device, form):
-    M, x, r = gallery.signed(53, 53, 4) / 20, np.zeros((53, 1)), gallery.vectors(53, 1)
-    A = FORMATS[form](small_device, M)
-    assert len(A.slabs) > 1
-    steps = Steps(IdentityPlus(A), "southwell", small_device.upload(x), small_device.upload(r), 5)
     for picks in (True, True, False, True, False):
         steps.step(picks=picks)
-        if picks:
-            x, r = reference.southwell_step(np.eye(53) + M, 5, x, r)
+        x, r = reference.southwell_step(S, parts, x, r) if picks else (x, r)
     np.testing.assert_allclose(steps.x.get(), x, rtol=0, atol=1e-5)
     np.testing.assert_allclose(steps.r.get(), r, rtol=0, atol=1e-5)
-
-
-def test_it_is_made_once_and_lives_with_its_matrix(device):
-    R = Dense(device, MATRICES["53"])
-    S = IdentityPlus(R)
-    assert relaxation(S, "sor", 8) is relaxation(S, "gauss_seidel", 8)
-    assert relaxation(S, "sor", 8) is not relaxation(S, "sor", 9)
-    assert relaxation(S, "sor", 8) is not relaxation(IdentityPlus(R, -1), "sor", 8)
-    assert relaxation(S, "sor", 8) is not relaxation(S, "block_gauss_seidel", 8, None)
-    assert relaxation(S, "sor", 8, 1.2).omega == 1.2
-    assert relaxation(S, "sor", 8).omega == 1.0
-    assert len(R.relaxations) == 4  # another omega takes the place of the one before
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -206,19 +163,7 @@ def test_inverses_beyond_the_device_are_refused_with_both_sizes(device, monkeypa
         relaxation(S, "block_gauss_seidel", 16, None)
 
 
-@pytest.mark.parametrize(
-    "make", [lambda A: ScaledColumns(A, np.ones(5)), lambda A: IdentityPlus(Shifted(A)), lambda A: A.T]
-)
+@pytest.mark.parametrize("make", [lambda A: ScaledColumns(A, np.ones(5)), lambda A: A.T])
 def test_operators_without_rows_are_refused(device, make):
-    with pytest.raises(InputError, match=r"'sor'.*chebyshev") as caught:
+    with pytest.raises(InputError, match=r"'sor'.*chebyshev"):
         relaxation(make(Dense(device, np.eye(5))), "sor")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_a_zero_on_the_diagonal_is_refused_by_row(shaped, form):
-    A = FORMATS[form](shaped[0], np.diag([1.0, -1.0, 0.0]))
-    with pytest.raises(InputError, match=r"'gauss_seidel'.*diagonal.* 1 row.* row 1"):
-        relaxation(IdentityPlus(A), "gauss_seidel")
-    with pytest.raises(InputError, match="row 2"):
-        relaxation(A, "gauss_seidel")

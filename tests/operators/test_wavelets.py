@@ -10,8 +10,6 @@ import sys
 import numpy as np
 import pytest
 import pywt
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from ltcl.device import Device
 from ltcl.errors import InputError
@@ -41,40 +39,21 @@ def small(request, monkeypatch):
     monkeypatch.setattr(wavelets, "_SMALL", request.param)
 
 
-def twin(W: Wavelet, transpose: bool = False):
-    """The twin of a transform with its epilogue, as `helpers.meets_twin` takes it."""
+def meets_twins(W: Wavelet) -> None:
     taps = wavelets.filters(W.name)
-    transform = reference.wavelet_join_all if transpose else reference.wavelet_split_all
-
-    def product(x, scale=1.0, add=None):
-        out = scale * transform(x.reshape(*W.grid, -1), W.levels, taps).reshape(x.shape)
-        return out if add is None else out + add
-
-    return product
-
-
-def matrix(W: Wavelet) -> np.ndarray:
-    return twin(W)(np.eye(W.shape[1]))
+    helpers.meets_twin(W, reference.wavelet_split(W.grid, W.levels, taps))
+    helpers.meets_twin(W.T, reference.wavelet_join(W.grid, W.levels, taps))
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.usefixtures("small", "shape_of_launches")
 def test_transforms_meet_their_twin(device, grid, name):
-    W = Wavelet(device, grid, name)
-    for transpose in (False, True):
-        helpers.meets_twin(W, matrix(W), twin(W, transpose), transpose=transpose)
-
-
-@pytest.mark.parametrize("levels", range(5))
-def test_transforms_stop_after_the_levels_asked_for(device, levels):
-    W = Wavelet(device, (7, 12), "db2", levels)
-    for transpose in (False, True):
-        helpers.meets_twin(W, matrix(W), twin(W, transpose), transpose=transpose)
+    meets_twins(Wavelet(device, grid, name))
 
 
 @pytest.mark.parametrize("name", [*NAMES, "db38", "sym20"])
-@pytest.mark.parametrize("grid", [(8, 8), (16, 2), (12, 20), (64, 96)])
+@pytest.mark.parametrize("grid", [(8, 8), (16, 2), (12, 20), (128, 256)])
 @pytest.mark.filterwarnings("ignore:Level value of")  # sides shorter than the filter are wanted here
 def test_coefficients_are_those_of_pywavelets_where_sides_halve_evenly(device, grid, name):
     levels = min(side & -side for side in grid).bit_length() - 1
@@ -86,58 +65,23 @@ def test_coefficients_are_those_of_pywavelets_where_sides_halve_evenly(device, g
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("k", [1, 3])
-@pytest.mark.filterwarnings("ignore:Level value of")
-def test_a_picture_of_the_size_that_counts(device, k):
-    x = gallery.vectors(256 * 512, k)
-    W = Wavelet(device, (256, 512), "db2", 8)
-    found = helpers.product(W, x)
-    for c in range(k):
-        coefficients = pywt.wavedec2(x[:, c].reshape(256, 512).astype(float), "db2", "periodization", 8)
-        expected = pywt.coeffs_to_array(coefficients)[0].ravel()
-        np.testing.assert_allclose(found[:, c], expected, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(helpers.product(W.T, found), x, rtol=0, atol=1e-5)
-
-
-@given(
-    grid=st.tuples(st.integers(1, 40), st.integers(1, 40)),
-    name=st.sampled_from(NAMES),
-    k=st.integers(1, 11),
-    seed=st.integers(0, 99),
-)
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_bases_are_orthonormal_and_keep_constants_compact(device, grid, name, k, seed):
-    W = Wavelet(device, grid, name)
-    n = W.shape[1]
-    x, y = gallery.vectors(n, k, seed), gallery.vectors(n, k, seed + 100)
-    x[:, 0] = 0.7
-    a = helpers.product(W, x).astype(np.float64)
-    # A value goes through two passes of a few products a level: some 50 units of the norm.
-    size = 50 * reference.UNIT * (1 + W.levels)
-    norms = np.linalg.norm(x, axis=0)
-    assert np.all(np.abs(np.linalg.norm(a, axis=0) - norms) <= size * norms)
-    assert np.all(np.linalg.norm(helpers.product(W.T, a) - x, axis=0) <= 2 * size * norms)
-    errors = size * norms * np.linalg.norm(y, axis=0)
-    assert np.all(
-        np.abs((a * y).sum(axis=0) - (x * np.float64(helpers.product(W.T, y))).sum(axis=0)) <= 2 * errors
-    )
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("grid", [*GRIDS, (37, 40)])
+def test_bases_are_orthonormal_and_keep_constants_compact(device, grid, name):
+    """A value goes through two passes of a few products a level: some 50 units of the norm."""
+    W, n = Wavelet(device, grid, name), grid[0] * grid[1]
+    error = 50 * reference.UNIT * (1 + W.levels)
+    dense = W.to_dense()
+    np.testing.assert_allclose(dense @ dense.T, np.eye(n), rtol=0, atol=2 * error)
     constant = np.zeros(n)
     constant[0] = np.float32(0.7) * np.sqrt(n)
-    np.testing.assert_allclose(a[:, 0], constant, rtol=0, atol=size * norms[0])
-
-
-@pytest.mark.usefixtures("shape_of_launches")
-def test_a_picture_takes_four_launches(device):
-    W = Wavelet(device, (256, 512), "db2")
-    x = device.upload(gallery.vectors(256 * 512, 3))
-    for apply in (W.apply, W.apply_transpose):
-        with device.profile() as profile:
-            apply(x)
-        assert sum(profile.launches.values()) <= 4
+    product = helpers.product(W, np.full(n, 0.7, np.float32))
+    np.testing.assert_allclose(product, constant, rtol=0, atol=error * constant[0])
 
 
 SMALL_GROUPS = """
 import numpy as np
+import scipy.sparse
 import ltcl
 from ltcl.device import Device
 from ltcl.operators import Pyramid, SubsetBasis, Tiles, Wavelet
@@ -153,7 +97,7 @@ assert (P.T @ np.eye(P.shape[0])[-1] == 1).all()
 S = SubsetBasis(device, (70, 90), np.arange(0, 6300, 7))
 assert (S @ x == x[::7]).all()
 A = np.where(np.arange(60 * 6300).reshape(60, 6300) % 5, 0, 1).astype(np.float32)
-assert abs(Tiles(device, A) @ x - A @ x).max() < 0.01
+assert abs(Tiles(device, scipy.sparse.csr_array(A)) @ x - A @ x).max() < 0.01
 """
 
 
@@ -173,27 +117,10 @@ def test_long_lines_need_more_than_an_item_has(device, grid):
     np.testing.assert_allclose(helpers.product(W.T, a), x, rtol=0, atol=1e-5)
 
 
-def test_facts(device):
-    W = Wavelet(device, (6, 9), "db2")
-    assert (W.grid, W.name, W.levels, W.shape, W.error) == ((6, 9), "db2", 4, (54, 54), 0.0)
-    assert W.orthonormal
-    assert [W.sides(level) for level in range(5)] == [(6, 9), (3, 5), (2, 3), (1, 2), (1, 1)]
-    with pytest.raises(InputError, match="diagonal"):
-        W.diagonal()
-
-
-def test_every_wavelet_that_is_offered_is_orthonormal(device):
-    for family in wavelets.families().split(", "):
-        name = family.split()[-1]  # the longest filters of each family
-        taps = wavelets.filters(name)
-        M = reference.wavelet_side(2 * taps.shape[1], 0, taps)
-        np.testing.assert_allclose(M @ M.T, np.eye(len(M)), atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        *((((8, 8), name), f"{name}.*db1 to db38.*haar") for name in ("bior2.2", "rbio1.3", "dmey")),
+        *((((8, 8), name), f"{name}.*haar") for name in ("bior2.2", "rbio1.3", "dmey")),
         *((((8, 8), name), f"wavelet is {name!r}.*haar") for name in ("db99", "morl", "", None, 2)),
         *((((8, 5), "haar", levels), f"levels is {levels!r}") for levels in (4, -1, 1.5, "3")),
         *(((grid, "haar"), "grid is") for grid in ((0, 4), (2.5, 2), 9, (1, 2, 3))),

@@ -116,5 +116,5 @@ def test_three_walls_take_an_explicit_shape() -> None:
 
 
 def test_albedo_must_be_numbers() -> None:
-    with pytest.raises(InputTypeError, match="albedo holds"):
+    with pytest.raises(InputTypeError, match="albedo is"):
         spread_albedo("white", walls=2, n=2)

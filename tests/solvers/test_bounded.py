@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 from ltcl.device import Array
-from ltcl.operators import Dense
+from ltcl.operators import Dense, IdentityPlus
 from ltcl.solvers import Status
 from ltcl.solvers.bounded import minimise
 from ltcl.solvers.columns import Columns
@@ -95,8 +95,9 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
 @pytest.mark.parametrize("rho", [0.8, 4.0])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("bright", [0.5, 1.0, 2.0])
-def test_it_finds_the_least_squares(device, rho, weighted, bright):
-    S = lambertian(60, rho, seed=3).S.astype(np.float32)
+@pytest.mark.parametrize("seed", [0, 79])  # of the second, lengths and steps once took turns for ever
+def test_it_finds_the_least_squares(device, rho, weighted, bright, seed):
+    S, random = lambertian(60, rho, seed=3).S.astype(np.float32), np.random.default_rng(seed)
     lower, upper = np.zeros(60), random.uniform(0.3, 0.9, 60)
     lower[5] = upper[5] = 0.0  # a masked pixel
     b = bright * (S @ np.clip(random.uniform(-0.5, 1.2, (60, 3)), -0.3, 1.0))
@@ -171,22 +172,15 @@ def test_an_iteration_is_six_launches_and_one_wait(device, monkeypatch):
     monkeypatch.setattr(Array, "get", lambda array: reads.append(array) or read(array))
     for steps in (2, 7):
         reads.clear()
-        with device.profile() as profile:
-            minimise(
-                Dense(device, S), b, np.zeros(60), np.ones(60), np.zeros((60, 3)), weights=w,
-                maxiter=steps, rtol=1e-9,
-            )  # fmt: skip
-        counts.append((sum(profile.launches.values()), len(reads), sum(array.size > 500 for array in reads)))
+        before = device.launches.total()
+        minimise(
+            Dense(device, S), b, np.zeros(60), np.ones(60), np.zeros((60, 3)), weights=w,
+            maxiter=steps, rtol=1e-9,
+        )  # fmt: skip
+        whole = sum(array.size > 500 for array in reads)
+        counts.append((device.launches.total() - before, len(reads), whole))
     (first, reads_first, vectors), (last, reads_last, _) = counts
     assert (last - first, reads_last - reads_first, vectors) == (30, 5, 0)
-
-
-def test_a_target_within_reach_costs_no_step(device):
-    S = lambertian(30, 0.8).S.astype(np.float32)
-    x = random.uniform(0.1, 0.9, (30, 2))
-    s = minimise(Dense(device, S), S @ x, np.zeros(30), np.ones(30), x)
-    assert (s.iterations, s.status, s.products) == (0, Status.CONVERGED, 2)
-    assert not s.held.any()
 
 
 @pytest.mark.parametrize("far", [1e3, 1e9, 1e30])
@@ -222,12 +216,14 @@ def test_what_ends_a_solve(device):
     assert (errors(S, s.x, b) <= errors(S, exact(S, b, np.zeros(40), np.ones(40)), b) * (1 + 1e-6)).all()
 
 
-def test_weighing_meets_its_twin(device):
-    w, v = gallery.vectors(53, 3), gallery.vectors(53, 3, 2)
-    V, U, sums = device.upload(v), device.empty((53, 3)), device.empty((1, 3))
-    kernel = device.kernel("bounded", "bounded_weigh", ADJACENT=1)
-    group = (kernel.group(16), 1, 1)
-    items = (group[0], 1, -(-3 // group[0]))
-    kernel(items, group, 53, 3, 2, device.upload(w), V, U, sums, device.local(group[0]))
-    for found, wanted in zip((V.get(), U.get(), sums.get()[0]), reference.bounded_weigh(w, v), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
+@pytest.mark.parametrize("seed", range(12))
+def test_a_column_that_float32_has_lost_is_not_certified(device, seed):
+    """S = T F^-1 with F far above T: of x = F p, rounding of (I + R) x hides more than the residual."""
+    rng = np.random.default_rng(seed)
+    T = rng.uniform(0.0, 0.3, (2, 2)) + np.diag(rng.uniform(0.2, 1.0, 2))
+    F, b = np.diagonal(T) * (1e6, 1e-6), rng.uniform(0.0, 1.0, (2, 1))
+    S = IdentityPlus(Dense(device, T / F - np.eye(2)))
+    s = minimise(S, b, np.zeros(2), F, 0.5 * F[:, None], rtol=1e-3)
+    best = errors(T, exact(T, b, np.zeros(2), np.ones(2)), b)
+    assert (s.least <= best + 1e-6).all()
+    assert (errors(T, s.x / F[:, None], b) <= s.least + s.gap * np.linalg.norm(b) + 1e-6).all()

@@ -72,14 +72,12 @@ def error_of(solution: Solution) -> np.ndarray:
 
 def launched(device, call: Any) -> dict[str, int]:
     """Launches of walks, by kernel."""
-    with device.profile() as profile:
-        call()
-    return {name: count for name, count in profile.launches.items() if name.startswith("walk")}
+    before = device.launches.copy()
+    call()
+    return {name: count for name, count in (device.launches - before).items() if name.startswith("walk")}
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"estimator": "endpoint"}, {"sampler": "uniform"}, {"adjoint": True}]
-)
+@pytest.mark.parametrize("options", [{}, {"adjoint": True}])
 @pytest.mark.parametrize("name", COLOURS)
 def test_the_mean_of_many_runs_is_the_solution_of_every_channel(device, name, options):
     """Within 4 standard errors at every pixel, and these are as large as the runs' own spread says."""
@@ -109,18 +107,6 @@ def test_a_sample_is_one_walk_and_not_three(device, method):
         assert launched(device, call) == {"walk_rows": steps}
 
 
-def test_grey_light_on_nearly_grey_walls_has_hardly_any_colour_noise(device):
-    """Errors of channels that share walks go together; those of their own walks do not, seeds apart."""
-    factors = (1.0, 0.95, 0.9)
-    S = tuple(IdentityPlus(Dense(device, SCENES[0].R * factor)) for factor in factors)
-    b = np.stack([np.random.default_rng(0).random(N)] * 3)
-    exact = solved(np.stack([np.eye(N) + SCENES[0].R * factor for factor in factors]), b)
-    off = ltcl.solve(S, b, "monte_carlo", samples=64).x - exact
-    own = [ltcl.solve(S[c], b[c], "monte_carlo", samples=64, seed=c).x for c in range(3)]
-    apart = np.stack(own) - exact
-    assert np.abs(off[0] - off[2]).mean() < 0.3 * np.abs(apart[0] - apart[2]).mean()
-
-
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (1e-20, 1.0, 1e15)])
 def test_a_target_error_is_reached_in_every_channel(device, scale):
     """In the units of x: the brightest channel needs the most walks, and the others get as many."""
@@ -128,7 +114,7 @@ def test_a_target_error_is_reached_in_every_channel(device, scale):
     b = np.stack([np.random.default_rng(c).random(N) * factor for c, factor in enumerate(scale)])
     found = ltcl.solve(S, b, "monte_carlo", error=0.005 * max(scale))
     assert error_of(found).max() <= 0.005 * max(scale) * (1 + 1e-6)
-    assert found.reason.count(f"error={0.005 * max(scale):g} met") == 1
+    assert found.reason.count(f"error={0.005 * max(scale):g} was reached") == 1
     for c in range(3):
         z = (found.x[c] - np.linalg.solve(dense[c], b[c])) / error_of(found)[c]
         assert np.abs(z).max() < 4.5
@@ -168,23 +154,6 @@ def test_where_shared_walks_have_no_variance_channels_have_their_own(device):
         S = tuple(IdentityPlus(Dense(device, R)) for R in Rs)
         found = ltcl.solve(S, b, "hybrid", samples=1 if signs.min() > 0 else 64)
         assert ("share no walks" in found.reason) == (signs.min() > 0)
-
-
-@pytest.mark.parametrize("method", ["monte_carlo", "hybrid"])
-def test_where_shared_tables_do_not_fit_channels_have_walks_of_their_own(device, monkeypatch, method):
-    S, _ = systems(device, "scenes")
-    entries = max(np.count_nonzero(one.to_dense()) - N for one in S)
-    monkeypatch.setattr(device, "max_allocation", 12 * entries)
-    found = ltcl.solve(S, pictures(), method, samples=30)
-    assert "channels share no walks" in found.reason
-    np.testing.assert_array_equal(found.x[2], ltcl.solve(S[2], pictures()[2], method, samples=30).x)
-
-
-def test_walks_from_b_are_of_one_channel(device):
-    S, _ = systems(device, "scenes")
-    call = lambda: ltcl.solve(S, pictures(), "monte_carlo", samples=64, adjoint=True)  # noqa: E731
-    assert launched(device, call) == {"walk_columns": 3}
-    assert "channels share no walks" in call().reason
 
 
 def test_what_no_channel_can_do_alone_is_refused(device):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Matrix iteration and matrix series against dense inverses, and against each other."""
+"""The matrix series against dense inverses and powers."""
 
 from __future__ import annotations
 
@@ -7,44 +7,37 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from ltcl import solvers
 from ltcl.errors import ConvergenceError, InputError, MemoryLimitError
-from ltcl.operators import CSR, Dense, IdentityPlus
-from ltcl.solvers import Status
+from ltcl.operators import IdentityPlus, as_operator
+from ltcl.solvers import Status, matrix_series
 from tests.problems import enclosure, lambertian
 
-BOTH = pytest.mark.parametrize("invert", [solvers.matrix_iteration, solvers.matrix_series])
 
-
-def inverse_light(device, scene, kind=Dense):
+def inverse_light(device, scene, form=np.asarray):
     """S = I + R, and S^-1 = I - A."""
-    R = scene.R if kind is Dense else scipy.sparse.csr_array(scene.R)
-    return IdentityPlus(kind(device, R)), np.eye(scene.n) - scene.A
+    return IdentityPlus(as_operator(form(scene.R), device)), np.eye(scene.n) - scene.A
 
 
-def forward_light(device, scene, kind=Dense):
+def forward_light(device, scene, form=np.asarray):
     """I - A, and its inverse S."""
-    A = scene.A if kind is Dense else scipy.sparse.csr_array(scene.A)
-    return IdentityPlus(kind(device, A), sign=-1), scene.S
+    return IdentityPlus(as_operator(form(scene.A), device), sign=-1), scene.S
 
 
-@BOTH
-@pytest.mark.parametrize("kind", [Dense, CSR])
+@pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
 @pytest.mark.parametrize("direction", [inverse_light, forward_light])
-@pytest.mark.parametrize("n", [1, 7, 70, 130])  # with one, two and three chunks of columns
-def test_both_ways_to_the_dense_inverse(device, invert, direction, kind, n):
+@pytest.mark.parametrize("n", [1, 7, 130])  # one and three chunks of columns
+def test_both_ways_to_the_dense_inverse(device, direction, form, n):
     scene = lambertian(n, 0.6 if n > 1 else 0.0, seed=n)
-    S, wanted = direction(device, scene, kind)
-    found = invert(S, rtol=1e-5)
+    S, wanted = direction(device, scene, form)
+    found = matrix_series(S, rtol=1e-5)
     assert found.converged
     assert found.residual <= 1e-5
     assert np.linalg.norm(np.eye(n) - S.to_dense() @ found.x, axis=0).max() <= 1.1e-5
     np.testing.assert_allclose(found.x, wanted, rtol=0, atol=1e-4)
 
 
-@BOTH
 @pytest.mark.parametrize("k", [0, 1, 2, 5])
-def test_k_steps_are_the_k_term_series(device, invert, k):
+def test_k_steps_are_the_k_term_series(device, k):
     """Eq. 10 and eq. 8 to rounding, also where they diverge."""
     scene = lambertian(30, 1.5)
     for (S, _), M in (
@@ -52,7 +45,7 @@ def test_k_steps_are_the_k_term_series(device, invert, k):
         (forward_light(device, scene), scene.A),
     ):
         wanted = sum((np.linalg.matrix_power(M, i) for i in range(k + 1)), np.zeros_like(M))
-        found = invert(S, steps=k)
+        found = matrix_series(S, steps=k)
         assert found.status is Status.MAXITER
         assert (found.iterations, found.products, len(found.residuals)) == (k, k + 1, k + 1)
         np.testing.assert_allclose(found.x, wanted, rtol=0, atol=1e-5 * np.abs(wanted).max())
@@ -60,36 +53,32 @@ def test_k_steps_are_the_k_term_series(device, invert, k):
         assert found.residuals[-1] == pytest.approx(left, rel=1e-3)
 
 
-@BOTH
-def test_divergence_is_detected_and_the_forward_dual_converges(device, invert):
+def test_divergence_is_detected_and_the_forward_dual_converges(device):
     """A closed box of albedo 0.51: rho(R) = 1.04, rho(A) = 0.51."""
     scene = enclosure(20, 0.51)
     with pytest.raises(ConvergenceError, match="diverged") as caught:
-        invert(inverse_light(device, scene)[0])
+        matrix_series(inverse_light(device, scene)[0])
     assert caught.value.solution.status is Status.DIVERGED
     assert np.isfinite(caught.value.solution.x).all()
-    assert invert(forward_light(device, scene)[0]).converged
+    with np.errstate(all="ignore"):
+        assert (
+            matrix_series(np.full((2, 2), 1e38), throw=False).status is Status.DIVERGED
+        )  # infinite from the start
+    assert matrix_series(forward_light(device, scene)[0]).converged
 
 
-@BOTH
-def test_maxiter_is_named_and_need_not_throw(device, invert):
+def test_maxiter_ends_it_and_need_not_throw(device):
     S, _ = inverse_light(device, enclosure(20, 0.48))
-    assert invert(S, maxiter=3, throw=False).status is Status.MAXITER
+    assert matrix_series(S, maxiter=3, throw=False).status is Status.MAXITER
     with pytest.raises(ConvergenceError, match="maxiter after 3 iterations"):
-        invert(S, maxiter=3)
-
-
-def test_columns_are_cut_where_the_device_allocates_little(small_device):
-    scene = lambertian(53, 0.5)
-    found = solvers.matrix_iteration(inverse_light(small_device, scene)[0], rtol=1e-4)
-    np.testing.assert_allclose(found.x, np.eye(53) - scene.A, rtol=0, atol=1e-3)
+        matrix_series(S, maxiter=3)
 
 
 def test_what_does_not_fit_is_refused_before_allocation(device, monkeypatch):
     S, _ = inverse_light(device, lambertian(40, 0.5))
     monkeypatch.setattr(device, "memory", 2 * 4 * 40 * 40)
-    with pytest.raises(MemoryLimitError, match="a matrix iteration for N = 40, two N x N iterates"):
-        solvers.matrix_iteration(S)
+    with pytest.raises(MemoryLimitError, match="a matrix series for N = 40, two N x N iterates"):
+        matrix_series(S)
 
 
 @pytest.mark.parametrize(
@@ -103,4 +92,4 @@ def test_what_does_not_fit_is_refused_before_allocation(device, monkeypatch):
 )
 def test_bad_input(options, says):
     with pytest.raises(InputError, match=says):
-        solvers.matrix_iteration(**{"S": np.eye(2), **options})
+        matrix_series(**{"S": np.eye(2), **options})

@@ -27,12 +27,11 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {  # method and its options
     "sor, rows of 1": ("sor", {"omega": 0.8, "block": 1}),
     "blocks of 1": ("block_gauss_seidel", {"block": 1}),
     "blocks of 7": ("block_gauss_seidel", {"block": 7}),
-    "blocks of 32": ("block_gauss_seidel", {"block": 32}),
 }
 random = np.random.default_rng(3)
 
 
-@pytest.mark.parametrize("sweeps", [1, 2, 5])
+@pytest.mark.parametrize("sweeps", [1, 5])
 @pytest.mark.parametrize("dual", DUALS)
 @pytest.mark.parametrize("name", OPTIONS)
 @pytest.mark.parametrize("form", FORMATS)
@@ -73,12 +72,8 @@ def test_what_one_sweep_solves(device, form):
     """Rows that need none below them, one block, and blocks that do not see each other."""
     lower = np.eye(30) + np.tril(random.uniform(0.0, 1.0, (30, 30)), -1) / 30
     apart = scipy.linalg.block_diag(*(lambertian(8, 4.0, seed).S for seed in range(4)))
-    table = [
-        (lower, "gauss_seidel", 4),
-        (SCENE.S, "block_gauss_seidel", 53),
-        (SCENE.S, "block_gauss_seidel", 1000),
-        (apart, "block_gauss_seidel", 8),
-    ]
+    block_method = "block_gauss_seidel"
+    table = [(lower, "gauss_seidel", 4), (SCENE.S, block_method, 1000), (apart, block_method, 8)]
     for S, method, block in table:
         b = random.uniform(0.0, 1.0, (len(S), 3))
         s = ltcl.solve(FORMATS[form](device, S), b, method, block=block, rtol=1e-5)
@@ -90,7 +85,7 @@ def test_what_one_sweep_solves(device, form):
 
 def test_growth_is_noticed(device):
     """S of spectral radius far beyond what any splitting takes, and not self-adjoint."""
-    S = np.eye(6) + np.triu(np.full((6, 6), 9.0), 1) + np.tril(np.full((6, 6), 9.0), -1)
+    S = np.full((6, 6), 9.0) - 8.0 * np.eye(6)
     S[0] *= (1, -1, -1, -1, -1, -1)
     with pytest.raises(ConvergenceError) as caught:
         ltcl.solve(S, np.ones(6), "gauss_seidel")
@@ -110,12 +105,12 @@ def test_one_row_a_step_is_the_textbook_of_southwell(device, dual):
     np.testing.assert_allclose(s.residuals[-1], residual(S, x, b), rtol=1e-2)
 
 
-def test_sets_of_rows_converge(device):
+@pytest.mark.parametrize("form", FORMATS)
+def test_sets_of_rows_converge(device, form):
     scene = lambertian(400, 4.0, seed=7, density=0.3)
     b = scene.S @ random.uniform(0.0, 1.0, scene.n)
-    for make in FORMATS.values():
-        s = ltcl.solve(IdentityPlus(make(device, scene.R)), b, "southwell", rtol=1e-3)
-        assert residual(scene.S, s.x, b) <= 1e-3 * (1 + 1e-3)
+    s = ltcl.solve(IdentityPlus(FORMATS[form](device, scene.R)), b, "southwell", rtol=1e-3)
+    assert residual(scene.S, s.x, b) <= 1e-3 * (1 + 1e-3)
 
 
 def test_all_rows_at_once_is_jacobi(device):
@@ -128,18 +123,20 @@ def test_all_rows_at_once_is_jacobi(device):
 
 
 BAD_COUNTS = [0, -1, 2.5, "all", np.nan]
-BAD_OPTIONS = [
-    *((method, "block", value) for method in ("gauss_seidel", "sor") for value in BAD_COUNTS),
-    *(("block_gauss_seidel", "block", value) for value in (*BAD_COUNTS, None)),
-    *(("southwell", "rows", value) for value in BAD_COUNTS),
-    *(("sor", "omega", value) for value in (0.0, -1.0, 2.0, np.inf, np.nan, "fast", [1.0])),
-]
+BAD_OPTIONS: dict[tuple[str, str], list[Any]] = {
+    ("gauss_seidel", "block"): BAD_COUNTS,
+    ("sor", "block"): BAD_COUNTS,
+    ("block_gauss_seidel", "block"): [*BAD_COUNTS, None],
+    ("southwell", "rows"): BAD_COUNTS,
+    ("sor", "omega"): [0.0, -1.0, 2.0, np.inf, np.nan, "fast", [1.0]],
+}
 
 
-@pytest.mark.parametrize(("method", "option", "value"), BAD_OPTIONS)
-def test_an_unusable_option_is_refused(method, option, value):
-    with pytest.raises(InputError, match=rf"{option} is "):
-        ltcl.solve(np.eye(3), np.ones(3), method, **{option: value})
+@pytest.mark.parametrize(("method", "option"), BAD_OPTIONS)
+def test_an_unusable_option_is_refused(method, option):
+    for value in BAD_OPTIONS[method, option]:
+        with pytest.raises(InputError, match=rf"{option} is "):
+            ltcl.solve(np.eye(3), np.ones(3), method, **{option: value})
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -149,11 +146,12 @@ def test_a_singular_block_is_refused_by_rows(device, form):
     S[2:4, 2:4] = [[1.0, 2.0], [2.0, 4.0]]
     S[2, 4] = S[4, 2] = 1.0
     assert np.linalg.matrix_rank(S) == 5
-    with pytest.raises(InputError, match=r"'block_gauss_seidel'.* 2 to 3 .*block") as caught:
+    with pytest.raises(InputError, match=r"'block_gauss_seidel'.* 2 to 3 .*block"):
         ltcl.solve(FORMATS[form](device, S), np.ones(5), "block_gauss_seidel", block=2)
-    assert "\n" not in str(caught.value)
 
 
-def test_a_zero_on_the_diagonal_is_refused(device):
-    with pytest.raises(InputError, match=r"'southwell'.*diagonal.* row 1"):
-        ltcl.solve(np.diag([1.0, 0.0]), np.ones(2), "southwell")
+@pytest.mark.parametrize("method", ["gauss_seidel", "southwell"])
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_zero_on_the_diagonal_is_refused(device, form, method):
+    with pytest.raises(InputError, match=rf"'{method}'.*diagonal.* 1 row.* row 1"):
+        ltcl.solve(FORMATS[form](device, np.diag([1.0, 0.0])), np.ones(2), method)

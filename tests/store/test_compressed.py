@@ -14,13 +14,11 @@ import ltcl
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.operators import (
     CSR,
-    Chained,
     Compressed,
     Dense,
     IdentityPlus,
     ScaledColumns,
     SubsetBasis,
-    Sum,
     Tiles,
     Wavelet,
 )
@@ -78,13 +76,10 @@ def test_the_same_transport_comes_back(device, tmp_path, channels, core):
     )
 
 
-def test_orders_chains_and_sums_come_back(device, tmp_path):
-    order = SubsetBasis(device, GRID, np.random.default_rng(0).permutation(N), "hilbert")
-    W = Chained(SubsetBasis(device, (1, N), np.arange(N)[::-1]), Wavelet(device, GRID, "haar", 2))
-    R = enclosure(N, 0.4).R / 2
-    sharp = Compressed(_core(device, "tiles", order, R), order, order)
-    smooth = Compressed(_core(device, "csr", W, R), W, W)
-    S = IdentityPlus(Sum(sharp, smooth), weights=F[0])
+@pytest.mark.parametrize("of", [None, "haar"])
+def test_orders_come_back(device, tmp_path, of):
+    W = SubsetBasis(device, GRID, np.arange(N)[::-1], of and Wavelet(device, GRID, of, 2))
+    S = IdentityPlus(Compressed(_core(device, "tiles", W, enclosure(N, 0.4).R), W, W), weights=F[0])
     C = ltcl.Transport(ScaledColumns(S, F[0]), GRID, first_bounce=F[0])
     ltcl.save(tmp_path / "C.npz", C)
     same(C, ltcl.load(tmp_path / "C.npz"))
@@ -146,9 +141,7 @@ def test_other_formats_and_operators_are_refused(device, tmp_path):
         with pytest.raises(FileError, match=r"does not keep compressed transports; \.npz and \.zarr do"):
             ltcl.save(tmp_path / name, C)
     plain = ltcl.Transport(Dense(device, np.eye(N)), GRID)
-    with pytest.raises(
-        InputTypeError, match="T is made of Dense; only arrays, sparse matrices and operators"
-    ):
+    with pytest.raises(InputTypeError, match="T is made of Dense"):
         ltcl.save(tmp_path / "C.npz", plain)
     assert not list(tmp_path.iterdir())
 

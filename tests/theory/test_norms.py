@@ -89,10 +89,11 @@ def test_a_difference_in_the_last_bits_is_bounded_by_rounding(device):
     assert 0.0 < found.upper < 1e-5 * np.linalg.norm(A.to_dense(), 2)
 
 
-def test_a_smaller_frobenius_norm_is_taken_and_certain(device):
-    A = Dense(device, np.diag([2.0] + [0.0] * 40))
-    found = theory.two_norm(A, frobenius=2.0, maxsteps=1)
+def test_a_smaller_frobenius_norm_is_certain_and_zero_has_the_norm_zero(device):
+    found = theory.two_norm(Dense(device, np.diag([2.0] + [0.0] * 40)), frobenius=2.0, maxsteps=1)
     assert (found.upper, found.confidence) == (2.0, 1.0)
+    found = theory.two_norm(Dense(device, np.zeros((17, 9))))
+    assert (found.estimate, found.upper) == (0.0, 0.0)
 
 
 def test_steps_end_when_the_question_is_answered(device):
@@ -104,11 +105,6 @@ def test_steps_end_when_the_question_is_answered(device):
     above = theory.two_norm(A, factor=1.001, below=0.3)
     assert above.products < whole.products
     assert above.estimate > 0.3
-
-
-def test_zero_has_the_norm_zero(device):
-    found = theory.two_norm(Dense(device, np.zeros((17, 9))))
-    assert (found.estimate, found.upper) == (0.0, 0.0)
 
 
 def test_refusals(device):

@@ -126,7 +126,7 @@ class OpenCVCamera:
         seconds: float | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
-        self.channels = checks.colours("channels", channels)
+        self.channels = checks.one_of("channels", channels, (1, 3))
         self.source = _source(source)
         self.stream = not (isinstance(self.source, str) and os.path.isfile(self.source))
         self._seconds = None if seconds is None else as_seconds(seconds)

@@ -103,7 +103,7 @@ class FolderRig:
         self.projector_grid = checks.grid("projector_grid", projector_grid)
         if pattern_bits not in (8, 16):
             raise InputError(f"pattern_bits is {pattern_bits!r}; it must be 8 or 16")
-        self.channels = checks.colours("channels", channels)
+        self.channels = checks.one_of("channels", channels, (1, 3))
         self.bits = (
             None if camera_bits is None else checks.count("camera_bits", camera_bits, least=9, most=16)
         )

@@ -106,7 +106,7 @@ class LiveRig:
         _refuse_lacking("camera", camera, ("channels", "stream", "expose", "frame"))
         _refuse_lacking("display", display, ("grid", "period", "show"))
         self.projector_grid = checks.grid("display.grid", display.grid)
-        self.channels = checks.colours("camera.channels", camera.channels)
+        self.channels = checks.one_of("camera.channels", camera.channels, (1, 3))
         self.bits = getattr(camera, "bits", None)
         self._period = _period(period, display)
         limits = getattr(camera, "limits", (SHORTEST, LONGEST))

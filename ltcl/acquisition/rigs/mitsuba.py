@@ -96,7 +96,7 @@ class MitsubaRig:
         seed: int = 0,
     ) -> None:
         self.projector_grid = checks.grid("projector_grid", projector_grid)
-        self.channels = checks.colours("channels", channels)
+        self.channels = checks.one_of("channels", channels, (1, 3))
         self._samples = checks.count("samples", samples)
         self._projector = curves.projector(projector_response, channels)
         self._sensor = Sensor(curves.camera(response, channels), bits, black, gain, read)

@@ -70,13 +70,13 @@ class GPhoto2Camera:
     --------
     >>> GPhoto2Camera(channels=2)
     Traceback (most recent call last):
-    ltcl.errors.InputError: channels is 2; it must be 1 or 3
+    ltcl.errors.InputError: channels is 2; it must be one of 1, 3
     """
 
     stream = False
 
     def __init__(self, channels: int = 3) -> None:
-        self.channels = checks.colours("channels", channels)
+        self.channels = checks.one_of("channels", channels, (1, 3))
         self._gp = extras.load("gphoto2", "camera", "a camera on a cable")
         self._camera = self._gp.Camera()
         self._seconds: float | None = None

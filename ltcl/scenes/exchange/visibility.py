@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.device import Array, Device, open_device
+from ltcl.device import Device, open_device
 from ltcl.errors import InputError
 from ltcl.scenes.exchange import geometry
 from ltcl.scenes.exchange.geometry import Frame
@@ -56,36 +56,38 @@ class Rays:
         self._blocks = geometry.upload_blocks(device, frame, blocks)
         self._defines = {"LANES": geometry.lanes(device), "BLOCKS": self.boxes}
 
-    @property
-    def _buffers(self) -> tuple[Array, ...]:
-        return self._starts, self._ends, self._normals, self._blocks
-
     def rows(self, first: int, rows: int) -> np.ndarray:
         """V of patches first .. first + rows - 1 and all others, (rows, N) float32."""
-        kernel = self.device.kernel("visibility", "visibility_rows", **self._defines)
-        out = self.device.empty((rows, self.count))
-        pitch, lanes = self._starts.shape[1], geometry.lanes(self.device)
-        numbers = (rows, first, self.count, pitch, self.rays)
-        kernel((-(-self.count // lanes), rows), None, *numbers, *self._buffers, out)
-        return out.get()
+        i = np.arange(first, first + rows)
+        return self._seen(i, np.zeros_like(i), self.count)[: self.count].T
 
     def pairs(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """V of listed pairs, (P,) float32."""
-        kernel = self.device.kernel("visibility", "visibility_pairs", **self._defines)
-        most = max(1, _LAUNCH // (self.rays * self.boxes * geometry.lanes(self.device)))
+        lanes = geometry.lanes(self.device)
+        most = max(1, _LAUNCH // (self.rays * self.boxes * lanes))
         parts = [np.zeros(0, np.float32)]
         for start in range(0, len(i), most):
-            ends = [self.device.upload(end[start : start + most], np.int32) for end in (i, j)]
-            out = self.device.empty(ends[0].shape)
-            pitch = self._starts.shape[1]
-            kernel(out.size, 64, out.size, pitch, self.rays, *ends, *self._buffers, out)
-            parts.append(out.get())
+            ends = (i[start : start + most], j[start : start + most])
+            seen = self._seen(ends[0], ends[1] // lanes * lanes, 1)
+            parts.append(seen[ends[1] % lanes, np.arange(len(ends[0]))])
         return np.concatenate(parts)
+
+    def _seen(self, i: np.ndarray, start: np.ndarray, columns: int) -> np.ndarray:
+        """V of patches i and the `columns` from `start` on, in whole lanes: (columns or more, len(i))."""
+        kernel = self.device.kernel("visibility", "visibility_rows", **self._defines)
+        lanes = geometry.lanes(self.device)
+        stretches = -(-columns // lanes)
+        out = self.device.empty((stretches * lanes, len(i)))
+        lists = (self.device.upload(i, np.int32), self.device.upload(start, np.int32))
+        points = (self._starts, self._ends, self._normals, self._blocks)
+        pitch = self._starts.shape[1]
+        kernel((len(i), stretches), (64, 1), len(i), pitch, self.rays, *lists, *points, out)
+        return out.get()
 
     def most_rows(self) -> int:
         """Rows that one launch should take, and whose result one buffer holds."""
-        pairs = min(_LAUNCH // (self.rays * self.boxes), (self.device.max_allocation - 64) // 4)
-        return max(1, pairs // self.count)
+        largest = (self.device.max_allocation - 64) // (4 * self._starts.shape[1])
+        return max(1, min(_LAUNCH // (self.rays * self.boxes * self.count), largest))
 
 
 def visibility(

@@ -133,7 +133,7 @@ def test_colour_photographs_are_averaged():
         (lambda images: [*images, images[0]], "photographs are 15; they must be 14"),
         (lambda images: [*images[:3], images[3][:-1], *images[4:]], "photographs[3] has shape (7, 8)"),
         (lambda images: [*images[:3], images[3][0], *images[4:]], "photographs[3] has shape (8,)"),
-        (lambda images: [*images[:3], None, *images[4:]], "photographs[3] holds object"),
+        (lambda images: [*images[:3], None, *images[4:]], "photographs[3] is None"),
         (lambda images: [*images[:3], images[3] * np.nan, *images[4:]], "photographs[3] has 64 NaN"),
         (lambda images: [0 * image for image in images], "photographs[12] is of the white pattern"),
         (lambda images: [*images[:12], images[13], images[12]], "photographs[12] is of the white pattern"),

