@@ -72,9 +72,8 @@ class Race:
     @property
     def said(self) -> str:
         """How Jacobi ended."""
-        return (
-            f"rho(R) = {self.rho:.3f}, {'diverges' if self.diverged else f'1 % in {self.steps()} iterations'}"
-        )
+        end = "diverges" if self.diverged else f"1 % in {self.steps()} iterations"
+        return f"rho(R) = {self.rho:.3f}, {end}"
 
 
 def race(name: str, n: int, sides: int, albedo: float, device: ltcl.Device) -> Race:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What every bench shares: options, paired timing, the roofline, and the report.
+"""What every bench shares: options, timing, the roofline, and the report.
 
-Ratios count: competitors are timed in turn with us, in one process, so that a machine whose speed drifts
-slows all of them alike. Figures are medians.
+Ratios count: competitors are timed in turn with us, as the speed of a machine drifts. Figures are medians.
 """
 
 from __future__ import annotations
@@ -23,10 +22,11 @@ from rich.console import Console
 from rich.table import Table
 
 import ltcl
+from ltcl import plots
 from ltcl.device import Device, vectors
+from ltcl.operators import Operator
 
-_REST = 0.3  # seconds
-_rest = _REST
+_rest = 0.3  # seconds
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,9 @@ def options(description: str) -> Options:
     parser.add_argument("--plot", type=Path, help="draw what was found into this PNG")
     parser.add_argument("--device", help="as ltcl.open_device takes it")
     arguments = parser.parse_args()
-    global _rest
-    _rest = 0.0 if arguments.smoke else _REST
+    if arguments.smoke:
+        global _rest
+        _rest = 0.0
     return Options(arguments.smoke, arguments.json, arguments.plot, ltcl.open_device(arguments.device))
 
 
@@ -100,28 +101,34 @@ def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> di
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-class Triad:
-    """a b + c over arrays far larger than the caches: what memory gives (as STREAM: 12 bytes an element)."""
+def product(A: Operator, x: np.ndarray) -> Callable[[], None]:
+    """A @ x with vectors on the device, as inside a solve, and waited for."""
+    on_device = A.device.upload(x)
+    out = A.apply(on_device)
 
-    def __init__(self, device: Device, smoke: bool) -> None:
-        self.device = device
-        self.count = 1 << (16 if smoke else 25)
-        self._arrays = [vectors.fill(device.empty(self.count), 1.0) for _ in range(3)]
+    def run() -> None:
+        A.apply(on_device, out)
+        A.device.finish()
 
-    def __call__(self) -> None:
-        """Run once and wait."""
-        b, c, out = self._arrays
+    return run
+
+
+def triad(device: Device, smoke: bool) -> tuple[Callable[[], None], int]:
+    """a b + c over arrays far larger than the caches: what memory gives; and its bytes, as STREAM counts."""
+    count = 1 << (16 if smoke else 25)
+    b, c, out = (vectors.fill(device.empty(count), 1.0) for _ in range(3))
+
+    def run() -> None:
         vectors.axpby(2.0, b, 1.0, c, out)
-        self.device.finish()
+        device.finish()
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes moved by one run."""
-        return 12 * self.count
+    return run, 12 * count
 
 
-def report(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -> None:
-    """Print the rows, and write them where the command line asked for it."""
+def report(
+    given: Options, title: str, rows: list[Row], facts: dict[str, Any], draw: Callable[[], Any] | None = None
+) -> None:
+    """Print the rows, and write and draw them where the command line asked for it."""
     console = Console(width=150)
     console.print(f"[bold]{title}[/]\n{given.device.name}, {given.device.driver}")
     for name, value in facts.items():
@@ -138,7 +145,8 @@ def report(given: Options, title: str, rows: list[Row], facts: dict[str, Any]) -
         content = [{**asdict(row), "verdict": row.verdict} for row in rows]
         write_json(given.json, record(given, title, facts) | {"rows": content})
     if given.plot is not None:
-        _draw(given.plot, title, rows)
+        given.plot.parent.mkdir(parents=True, exist_ok=True)
+        plots.save(draw() if draw else _bars(title, rows), given.plot)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -164,10 +172,10 @@ def record(given: Options, title: str, facts: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _draw(path: Path, title: str, rows: list[Row]) -> None:
+def _bars(title: str, rows: list[Row]) -> Any:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 0.45 * len(rows) + 1.4), layout="constrained")
+    figure = Figure(figsize=(9, 0.45 * len(rows) + 1.4), dpi=120, layout="constrained")
     axes = figure.subplots()
     places = range(len(rows))[::-1]
     axes.barh(places, [row.ratio for row in rows], color="#3b6ea5", label="measured")
@@ -178,5 +186,4 @@ def _draw(path: Path, title: str, rows: list[Row]) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("times better (red: target)")
     axes.set_title(title, fontsize=10)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
+    return figure

@@ -26,7 +26,7 @@ def missing() -> list[str]:
 
 def sparse_products(A: Any, x: np.ndarray) -> dict[str, Product]:
     """A @ x by every peer that is there, for a csr_array A of float32 and x (N,) or (N, k)."""
-    makers = {"numba": _numba, "sparse_dot_mkl": _mkl, "cupy": _cupy}
+    makers = {"sparse_dot_mkl": _mkl, "cupy": _cupy}
     absent = missing()
     products = {name: make(A, x) for name, make in makers.items() if name not in absent}
     return {"scipy": lambda: A @ x, **products}
@@ -57,27 +57,5 @@ def _cupy(A: Any, x: np.ndarray) -> Product:
         product = matrix @ operand  # cuSPARSE, on the device as ours is
         cupy.cuda.Device().synchronize()
         return product
-
-    return run
-
-
-def _numba(A: Any, x: np.ndarray) -> Product:
-    numba: Any = importlib.import_module("numba")
-
-    @numba.njit(parallel=True, fastmath=True)
-    def product(pointers: Any, columns: Any, values: Any, x: Any, out: Any) -> None:
-        for row in numba.prange(len(pointers) - 1):
-            for c in range(x.shape[1]):
-                total = np.float32(0)
-                for t in range(pointers[row], pointers[row + 1]):
-                    total += values[t] * x[columns[t], c]
-                out[row, c] = total
-
-    operand = x if x.ndim == 2 else x[:, None]
-    out = np.empty((A.shape[0], operand.shape[1]), np.float32)
-
-    def run() -> np.ndarray:
-        product(A.indptr, A.indices, A.data, operand, out)
-        return out.reshape(A.shape[0], *x.shape[1:])
 
     return run

@@ -17,23 +17,13 @@ import numpy as np
 import scipy.sparse
 
 import ltcl
+from _coefficients import analysis, bisect, note, relative
 from _corner import interreflection
 from _harness import Options
-from _kept import analysis, bisect, note
 from ltcl.compression import invert_coefficients
 from ltcl.compression.coefficients import coefficients, drop_below
 from ltcl.compression.sources import source
-from ltcl.operators import (
-    CSR,
-    Basis,
-    Compressed,
-    Dense,
-    IdentityPlus,
-    Operator,
-    Tiles,
-    Wavelet,
-    restrict_to_support,
-)
+from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet, restrict_to_support
 from ltcl.scenes import CornerRows, landscape
 from ltcl.solvers import matrix_series
 
@@ -53,14 +43,10 @@ class Problem:
     l_out: np.ndarray
     l_d: np.ndarray
 
-    def error(self, l: np.ndarray) -> float:
-        """Relative to the direct light."""
-        return float(np.linalg.norm(l - self.l_d) / np.linalg.norm(self.l_d))
-
 
 @dataclass(frozen=True)
 class Way:
-    """A method that is ready to run, and what its first run told."""
+    """A method that is ready to run, and figures of its first run."""
 
     run: Callable[[], np.ndarray]
     error: float
@@ -84,12 +70,11 @@ def iterated(S: IdentityPlus, at: Problem, rtol: float) -> ltcl.Solution:
 
 def by_steps(S: IdentityPlus, at: Problem, kept: float) -> Way:
     """The iteration, with the loosest tolerance whose error is small enough."""
-    enough = (t for t in TOLERANCES if at.error(iterated(S, at, t).x) <= ERROR)
+    enough = (t for t in TOLERANCES if relative(iterated(S, at, t).x, at.l_d) <= ERROR)
     rtol = float(next(enough, TOLERANCES[-1]))
-    found = iterated(S, at, rtol)
-    return Way(
-        lambda: iterated(S, at, rtol).x, at.error(found.x), found.seconds, found.products, S.nbytes, kept
-    )
+    s = iterated(S, at, rtol)
+    error = relative(s.x, at.l_d)
+    return Way(lambda: iterated(S, at, rtol).x, error, s.seconds, s.products, S.nbytes, kept)
 
 
 def dense(given: Options, at: Problem) -> IdentityPlus:
@@ -125,7 +110,7 @@ def _series(inverse: Callable[[], np.ndarray], at: Problem, like: Way) -> Way:
     start = time.perf_counter()
     l_d = run()
     spent = time.perf_counter() - start
-    return Way(run, at.error(l_d), spent, like.products - 1, like.nbytes, like.kept)
+    return Way(run, relative(l_d, at.l_d), spent, like.products - 1, like.nbytes, like.kept)
 
 
 def of_both(given: Options, at: Problem) -> Any:
@@ -153,11 +138,12 @@ def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
     """The fewest numbers that will do, in 16 bits, and the iteration with these."""
     W = Wavelet(given.device, at.rows.grid, "db2")
 
-    def system(core: Operator, V: Basis = W) -> IdentityPlus:
+    def system(core: Any, V: Any = W) -> IdentityPlus:
         return IdentityPlus(Compressed(core, V if both else None, V))
 
     def error(threshold: float) -> float:
-        return at.error(iterated(system(CSR(given.device, drop_below(C, threshold)[0])), at, DROPPED / 10).x)
+        S = system(CSR(given.device, drop_below(C, threshold)[0]))
+        return relative(iterated(S, at, DROPPED / 10).x, at.l_d)
 
     threshold = bisect(error, DROPPED, float(np.abs(C.data).max()))
     kept, _ = drop_below(C, threshold)

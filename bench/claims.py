@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """No answer that is quietly wrong: random systems of all kinds, methods and scales, every claim checked.
 
-S is well conditioned, nearly singular, of entries that differ by many orders, or a diffuse scene; it is given
-as an array of float64 or float32, as a SciPy matrix, a LinearOperator, or an operator on the device. S and b
-are scaled by up to 1e30 and down to 1e-30. Of each solve that says CONVERGED the residual of the x that came
-back is computed in extended precision, with the numbers that were given: above 1.01 times the tolerance it
-counts as untrue. A solve may well fail, as long as it says so.
+S is well conditioned, nearly singular, of entries that differ by many orders, or a diffuse scene, in every
+form that `solve` takes; S and b are scaled by up to 1e30 and down to 1e-30. Of each solve that says CONVERGED
+the residual is computed in extended precision, with the numbers that were given: above 1.01 times the
+tolerance it counts as untrue. A solve may well fail, as long as it says so.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ LARGE, SHARE = 2100, 0.005  # pixels, of a share of the solves: where claims res
 Random = np.random.Generator
 
 
-def well(random: Random, n: int) -> np.ndarray:
+def well_conditioned(random: Random, n: int) -> np.ndarray:
     """I + R with a small R of both signs."""
     return np.eye(n) + random.normal(size=(n, n)) * random.uniform(0.0, 0.5) / np.sqrt(n)
 
@@ -51,7 +50,7 @@ def nearly_singular(random: Random, n: int) -> np.ndarray:
 def uneven(random: Random, n: int) -> np.ndarray:
     """Rows and columns of very different sizes."""
     rows, columns = (10.0 ** random.uniform(-4.0, 4.0, n) for _ in range(2))
-    return well(random, n) * rows[:, None] * columns
+    return well_conditioned(random, n) * rows[:, None] * columns
 
 
 def diffuse(random: Random, n: int) -> np.ndarray:
@@ -62,24 +61,13 @@ def diffuse(random: Random, n: int) -> np.ndarray:
     return np.linalg.inv(np.eye(n) - rho / (1.0 + rho) * G)
 
 
-MATRICES = {
-    "well conditioned": well,
-    "nearly singular": nearly_singular,
-    "uneven": uneven,
-    "diffuse": diffuse,
-}
+MATRICES = {make.__name__: make for make in (well_conditioned, nearly_singular, uneven, diffuse)}
 
 
 def identity_plus(device: Device, S: np.ndarray) -> tuple[Any, np.ndarray]:
     """I + R, with R as it lies on the device."""
     R = (S - np.eye(len(S))).astype(np.float32)
     return IdentityPlus(Dense(device, R)), np.eye(len(S)) + R.astype(np.longdouble)
-
-
-def on_device(device: Device, S: np.ndarray) -> tuple[Any, np.ndarray]:
-    """Dense, of float32."""
-    S = S.astype(np.float32)
-    return Dense(device, S), S
 
 
 def tiles(device: Device, S: np.ndarray) -> tuple[Any, np.ndarray]:
@@ -94,7 +82,7 @@ KINDS: dict[str, Callable[[Device, np.ndarray], tuple[Any, np.ndarray]]] = {
     "float32 array": lambda device, S: (S.astype(np.float32), S.astype(np.float32)),
     "scipy.sparse": lambda device, S: (scipy.sparse.csr_array(S), S),
     "LinearOperator": lambda device, S: (aslinearoperator(S), S),
-    "Dense": on_device,
+    "Dense": lambda device, S: (Dense(device, S), S.astype(np.float32)),
     "CSR": lambda device, S: (CSR(device, scipy.sparse.csr_array(S)), S),
     "tiles": tiles,
     "I + R": identity_plus,
@@ -132,13 +120,11 @@ def untrue(device: Device, random: Random, tally: Counter[str]) -> str | None:
 def main() -> None:
     """Run the bench."""
     given = options(__doc__ or "")
-    random, found, tally = np.random.default_rng(0), [], Counter[str]()
-    total = SOLVES[given.smoke]
+    random, tally, total = np.random.default_rng(0), Counter[str](), SOLVES[given.smoke]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        while sum(tally.values()) < total:
-            claim = untrue(given.device, random, tally)
-            found += [] if claim is None else [claim]
+        claims = [untrue(given.device, random, tally) for _ in range(total)]
+    found = [claim for claim in claims if claim is not None]
     rows = [Row("untrue claims", f"of {total} solves", 0.0, len(found), "claims", float(not found), 1.0)]
     facts = dict(tally) | {f"untrue {i}": claim for i, claim in enumerate(found)}
     report(given, "Claims of convergence", rows, facts)

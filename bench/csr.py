@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from _harness import Options, Row, Triad, options, report, seconds
+from _harness import Options, Row, options, product, report, seconds, triad
 from _peers import sparse_products
 from ltcl.operators import CSR
 
@@ -45,24 +45,18 @@ def products(given: Options, name: str, A: Any) -> dict[str, Callable[[], object
     actions: dict[str, Callable[[], object]] = {}
     for k in SIDES:
         x = rng.random((A.shape[1], k) if k > 1 else A.shape[1], dtype=np.float32)
-        on_device = given.device.upload(x)
-        out = operator.apply(on_device)
-        if not np.allclose(out.get(), A @ x, rtol=1e-4, atol=1e-5):
+        if not np.allclose(operator.dot(x), A @ x, rtol=1e-4, atol=1e-5):
             raise SystemExit(f"the product of {name} with {k} right-hand sides is wrong")
-
-        def ours(x=on_device, out=out) -> None:
-            operator.apply(x, out)
-            given.device.finish()
-
-        actions[f"ours {k}"] = ours
+        actions[f"ours {k}"] = product(operator, x)
         peers = sparse_products(A, x)
         actions |= {f"{peer} {k}": peers[peer] for peer in PEERS if peer in peers}
     return actions
 
 
-def compare(given: Options, name: str, A: Any, triad: Triad) -> list[Row]:
+def compare(given: Options, name: str, A: Any) -> list[Row]:
     """Rows for one matrix; everything is timed in turn, so that all ratios are of one moment."""
-    times = seconds({"triad": triad, **products(given, name, A)})
+    run, nbytes = triad(given.device, given.smoke)
+    times = seconds({"triad": run, **products(given, name, A)})
     ms = {what: 1e3 * spent for what, spent in times.items()}
     rows, alone = [], ms["ours 1"]
     for k in SIDES:
@@ -73,7 +67,7 @@ def compare(given: Options, name: str, A: Any, triad: Triad) -> list[Row]:
             if theirs is not None:
                 rows.append(Row.of_times(question, who, theirs, ours, "ms", targets.get(peer)))
         if k == 1:
-            roof, rate = triad.nbytes / ms["triad"] / 1e6, 8 * A.nnz / ours / 1e6
+            roof, rate = nbytes / ms["triad"] / 1e6, 8 * A.nnz / ours / 1e6
             target = TRIAD_TARGET if "runs" in name else None
             rows.append(Row(question, "our triad", roof, rate, "GB/s", rate / roof, target))
         elif k in SIDE_TARGET:
@@ -85,10 +79,9 @@ def main() -> None:
     """Run the bench."""
     given = options(__doc__ or "")
     n, per_row = (2048, 32) if given.smoke else (131072, 256)
-    triad = Triad(given.device, given.smoke)
     rows = []
     for name, run in (("runs of 16", 16), ("random", 1)):
-        rows += compare(given, name, matrix(n, per_row, run), triad)
+        rows += compare(given, name, matrix(n, per_row, run))
     report(given, "CSR product", rows, {"pixels": n, "nonzeros a row": per_row})
 
 

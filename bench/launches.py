@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a step of each method asks of a device: kernels, waits, allocations and bytes over the bus.
 
-These counts are the same on every device, so they tell here what a GPU will feel. For every method and kind
-of operator a solve runs to a number of iterations that it cannot end before; steps are counted from product
-to product, medians. First solves are counted from an operator that nothing is known of: row sums, survey and
-tables included.
+These counts are the same on every device. For every method and kind of operator a solve runs to a number of
+iterations that it cannot end before; steps are counted from product to product, medians. First solves are
+counted from an operator that nothing is known of: row sums, survey and tables included.
 """
 
 from __future__ import annotations
@@ -30,10 +29,7 @@ WAIT = "wait"
 STEPS = 16  # of a solve that is counted
 # Launches and waits of a step between two checks, at most, and its products.
 TARGETS = {
-    "jacobi": (1, 0, 1),
-    "neumann": (1, 0, 1),
-    "richardson": (1, 0, 1),
-    "chebyshev": (1, 0, 1),
+    **dict.fromkeys(("jacobi", "neumann", "richardson", "chebyshev"), (1, 0, 1)),
     "cg": (3, 0, 1),
     "gmres": (5, 1, 1),
     "bicgstab": (5, 1, 2),
@@ -89,12 +85,10 @@ def operators(given: Options) -> dict[str, Any]:
 
     Its eigenvalues are all over [-0.9, 0.9], so that no method comes near rounding in those steps.
     """
-    side = 16 if given.smoke else 64
-    n, device = side * side, given.device
-    ring = np.roll(np.eye(n, dtype=np.float32), 1, axis=0)
-    G = 0.45 * (ring + ring.T)
+    side, device = 16 if given.smoke else 64, given.device
+    ring = np.roll(np.eye(side**2, dtype=np.float32), 1, axis=0)
+    G, W = 0.45 * (ring + ring.T), Wavelet(device, (side, side), "db2")
     sparse = scipy.sparse.csr_array(G)
-    W = Wavelet(device, (side, side), "db2")
     return {
         "csr": lambda: CSR(device, sparse),
         "dense": lambda: Dense(device, G),
@@ -156,14 +150,13 @@ def main() -> None:
         for k in (1, 3)
     ]
     misses = sum(one["verdict"] == "MISS" for one in rows)
-    table = Table(*rows[0])
+    table = Table(*rows[0], caption=f"{misses} of {len(rows)} targets missed")
     for one in rows:
         table.add_row(*map(str, one.values()))
     Console(width=190).print(table)
-    Console().print(f"{misses} of {len(rows)} targets missed")
     if given.json is not None:
-        content = record(given, "What a step asks of a device", {"missed": misses})
-        write_json(given.json, content | {"rows": rows})
+        facts = record(given, "What a step asks of a device", {"missed": misses})
+        write_json(given.json, facts | {"rows": rows})
 
 
 if __name__ == "__main__":

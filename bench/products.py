@@ -7,7 +7,7 @@ wavelets (the paper's), and of db2 wavelets on both sides; the errors are those 
 float64. Others multiply the thresholded matrix at 1 %, each with its own sparse rows in float32, and the
 dense one. Ours is timed with vectors on the device, as inside a solve; where both sides are in wavelets a
 solve runs on the coefficients that are active, so that a product there is of the core alone: both figures
-are given. All ways to one error are timed in turn, and let go before those to the next are made.
+are given.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import _figures as figures
+from _coefficients import ROWS, analysis, largest, note, relative
 from _corner import interreflection
-from _harness import Options, Row, Triad, options, report, seconds
-from _kept import ROWS, analysis, errors, kept, note
+from _harness import Options, Row, options, product, report, seconds, triad
 from _peers import missing, sparse_products
-from ltcl import plots
 from ltcl.compression.coefficients import coefficients
 from ltcl.compression.sources import source
 from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_to_support
@@ -53,20 +52,17 @@ class Problem:
     x: np.ndarray
     y: np.ndarray
 
-    def error(self, product: np.ndarray) -> float:
-        """Relative, of a product with `x`."""
-        return float(np.linalg.norm(product - self.y) / np.linalg.norm(self.y))
-
 
 @dataclass(frozen=True)
 class Form:
-    """Numbers of R in one format, and the error of R l without the smaller ones of them."""
+    """Numbers of R in one format, `matrix`, and y = matrix @ x in it for the picture."""
 
     name: str
     matrix: Any
     out: Wavelet | None
     into: Wavelet | None
-    errors: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
 
     def operators(self, given: Options, numbers: Any) -> tuple[Operator, Operator]:
         """(core, operator on pictures) of some numbers: sparse rows, or tiles of 16 bits in a basis."""
@@ -115,43 +111,31 @@ def forms(given: Options, at: Problem) -> list[Form]:
             rows = source("R", at.R)
             matrix = coefficients(rows, out and transform, transform, drop=drop).core
         x, y = (v if V is None else V.matvec(v) for V, v in ((into, at.x), (out, at.y)))
-        found.append(Form(name, matrix, out, into, errors(matrix, x, y)))
+        found.append(Form(name, matrix, out, into, x, y))
     return found
 
 
-def action(given: Options, A: Operator, x: np.ndarray) -> Callable[[], None]:
-    """A product on the device, waited for."""
-    on_device = given.device.upload(np.resize(x, A.shape[1]))
-    out = A.apply(on_device)
-
-    def run() -> None:
-        A.apply(on_device, out)
-        given.device.finish()
-
-    return run
-
-
 def measure(
-    given: Options, at: Problem, found: list[Form], wanted: float, triad: Triad
+    given: Options, at: Problem, found: list[Form], wanted: float, memory: Callable[[], None]
 ) -> tuple[list[Point], dict[str, float]]:
     """All formats at one error; where it is that of the targets, milliseconds of everything else too."""
-    numbers = {form.name: kept(form.matrix, form.errors, AIM * wanted) for form in found}
+    note(f"error {wanted:.1%}")
+    numbers = {form.name: largest(form.matrix, form.x, form.y, AIM * wanted) for form in found}
     ways = [(form.name, *form.operators(given, numbers[form.name])) for form in found]
     actions: dict[str, Callable[[], object]] = {}
     if wanted == ERROR:
-        actions = {"triad": triad, "dense numpy": lambda: at.R @ at.x}
+        actions = {"triad": memory, "dense numpy": lambda: at.R @ at.x}
         actions |= sparse_products(numbers["pixels"], at.x)
     others = list(actions)
     for form, core, A in ways:
-        actions[f"ours, {form}"] = action(given, A, at.x)
-        actions[f"core, {form}"] = action(given, core, at.x)
-    note(f"timing {', '.join([*others, f'{len(ways)} of ours'])}")
+        actions[f"ours, {form}"] = product(A, at.x)
+        actions[f"core, {form}"] = product(core, np.resize(at.x, core.shape[1]))
     ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
     points = [
         Point(
             form=form,
             wanted=wanted,
-            error=at.error(A.matvec(at.x)),
+            error=relative(A.matvec(at.x), at.y),
             kept=numbers[form].nnz / len(at.x),
             nbytes=A.nbytes,
             pixels=ms[f"ours, {form}"],
@@ -162,10 +146,9 @@ def measure(
     return points, {name: ms[name] for name in others}
 
 
-def at_one_percent(points: list[Point]) -> tuple[Point, Point]:
+def at_one_percent(points: list[Point]) -> list[Point]:
     """Sparse rows of R, and ours that a solve runs on."""
-    found = {point.form: point for point in points if point.wanted == ERROR}
-    return found["pixels"], found["both"]
+    return [point for point in points if point.wanted == ERROR and point.form in ("pixels", "both")]
 
 
 def compare(at: Problem, points: list[Point], ms: dict[str, float]) -> list[Row]:
@@ -196,13 +179,15 @@ def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
     boxes = [(left + 50, 168, width - 50, 210) for left in lefts]
     memory = figures.graph(figure, boxes[0], "Memory", "megabytes", "relative error of R l")
     time = figures.graph(figure, boxes[1], "Time", "milliseconds", "")
-    for form in FORMATS:
+    for form, colour in COLOURS.items():
         mine = [point for point in points if point.form == form]
-        curve(memory, mine, [point.nbytes / 1e6 for point in mine])
+        errors, style = [point.error for point in mine], {"color": colour, "marker": "o", "ms": 4, "lw": 2}
+        memory.loglog([point.nbytes / 1e6 for point in mine], errors, **style)
+        time.loglog([point.pixels for point in mine], errors, ls="--" if form == "both" else "-", **style)
         if form == "both":
-            curve(time, mine, [point.core for point in mine])
-        curve(time, mine, [point.pixels for point in mine], "--" if form == "both" else "-")
-        entitle(memory, mine[0])
+            time.loglog([point.core for point in mine], errors, **style)
+        name = FORMATS[form].replace("rows ", "rows\n").replace("sides ", "sides\n")
+        memory.text(mine[0].nbytes / 1e6, 1.15 * errors[0], name, color=colour, ha="center", fontsize=9)
     peers = [(name, spent) for name, spent in ms.items() if name != "dense numpy"]
     for (name, spent), marker in zip(peers, "v^<>", strict=False):
         time.plot(spent, ERROR, marker, color=OTHERS, label=name, ms=7, zorder=4, ls="none")
@@ -214,20 +199,6 @@ def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
     across(time, ms["dense numpy"], (sparse.pixels, best.core), text)
     figure.legend(loc="lower center", ncols=6, frameon=False, labelcolor="linecolor", fontsize=9.5)
     return figure
-
-
-def curve(axes: Axes, points: list[Point], x: list[float], ls: str = "-") -> None:
-    """One format at every error."""
-    errors, colour = [point.error for point in points], COLOURS[points[0].form]
-    axes.loglog(x, errors, ls=ls, color=colour, marker="o", ms=4, lw=2)
-
-
-def entitle(axes: Axes, first: Point) -> None:
-    """The name of a format above its largest error."""
-    style: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 9}
-    colour, words = COLOURS[first.form], FORMATS[first.form].rsplit(" ", 2)
-    name = f"{words[0]}\n{' '.join(words[1:])}"
-    axes.annotate(name, (first.nbytes / 1e6, first.error), (0, 7), color=colour, **style)
 
 
 def across(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> None:
@@ -247,17 +218,14 @@ def across(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> No
 def main() -> None:
     """Run it."""
     given = options(__doc__ or "")
-    at, triad = problem(given.smoke), Triad(given.device, given.smoke)
-    found = forms(given, at)
-    points: list[Point] = []
-    ms: dict[str, float] = {}
+    at, (memory, nbytes) = problem(given.smoke), triad(given.device, given.smoke)
+    found, points, ms = forms(given, at), list[Point](), dict[str, float]()
     for wanted in ERRORS:
-        note(f"error {wanted:.1%}")
-        more, others = measure(given, at, found, wanted, triad)
+        more, others = measure(given, at, found, wanted, memory)
         points, ms = points + more, ms | others
     facts: dict[str, Any] = {
         "pixels": len(at.x),
-        "triad, GB/s": triad.nbytes / ms.pop("triad") / 1e6,
+        "triad, GB/s": nbytes / ms.pop("triad") / 1e6,
         **{
             f"{FORMATS[point.form]}, error {point.error:.2%}": f"{point.kept:.4g} a row, "
             f"{point.nbytes / 1e6:.4g} MB, {point.pixels:.4g} ms, core {point.core:.4g} ms"
@@ -265,11 +233,8 @@ def main() -> None:
         },
         "not installed": ", ".join(missing()) or "none",
     }
-    plain = Options(given.smoke, given.json, None, given.device)
-    report(plain, "Products with a smooth R", compare(at, points, ms), facts)
-    if given.plot is not None:
-        given.plot.parent.mkdir(parents=True, exist_ok=True)
-        plots.save(draw(at, points, ms), given.plot)
+    rows = compare(at, points, ms)
+    report(given, "Products with a smooth R", rows, facts, lambda: draw(at, points, ms))
 
 
 if __name__ == "__main__":

@@ -26,14 +26,14 @@ import numpy as np
 
 import _figures as figures
 import ltcl
+from _coefficients import analysis, bisect, note, relative, transport
 from _figures import Claim
-from _harness import Options, options, seconds
-from _kept import analysis, bisect, note
+from _harness import Options, options, product, seconds
 from ltcl.compression import SparseInverse, invert_coefficients
 from ltcl.compression.coefficients import Coefficients, coefficients, drop_below
 from ltcl.compression.sources import source
 from ltcl.images import to_srgb
-from ltcl.operators import CSR, Compressed, IdentityPlus, ScaledColumns, Tiles, Wavelet, restrict_to_support
+from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
 from ltcl.scenes import CornerRows, dihedral, landscape
 from ltcl.scenes.viewer import draw as draw_view
 
@@ -46,7 +46,6 @@ ERROR, SEPARATION = 1e-2, 2e-4  # wanted; of the solves from which bounces come,
 SHARE = 0.6  # of the error of a pattern, what may be left out of R for it
 MEMORY = 1 << 28  # bytes of a block of rows
 BOUNCES = 2
-PAPER_PRODUCT, PAPER_PICTURE = 33.0, 3000.0  # ms; of one colour channel
 TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
 
 
@@ -57,9 +56,9 @@ class Corner:
     rows: CornerRows
 
     @property
-    def pixels(self) -> int:
-        """N."""
-        return self.rows.shape[0]
+    def picture(self) -> np.ndarray:
+        """What the walls are to look like, (h, w, 3)."""
+        return 0.05 + 0.4 * landscape(*self.rows.grid).astype(np.float64)
 
     def bounce(self, light: np.ndarray) -> np.ndarray:
         """A_c l_c of every channel, (N, 3) float64, with every number of A."""
@@ -96,10 +95,10 @@ class Built:
 
 def build(given: Options, corner: Corner) -> Built:
     """The transport, from rows of A alone."""
-    transform, spent = analysis(Wavelet(given.device, corner.rows.grid, "db2")), Stopwatch()
+    W, spent = Wavelet(given.device, corner.rows.grid, "db2"), Stopwatch()
     with spent("compressing A"):
         rows = source("A", corner.rows, MEMORY)
-        A = coefficients(rows, transform, transform, THRESHOLD, first=THRESHOLD / 4)
+        A = coefficients(rows, analysis(W), analysis(W), THRESHOLD, first=THRESHOLD / 4)
     found = []
     for albedo in ALBEDO:
         with spent(f"R of albedo {albedo:g}"):
@@ -108,24 +107,13 @@ def build(given: Options, corner: Corner) -> Built:
     cores = [-one.D for one in found]
     with spent("what a pattern needs of R"):
         fewer = enough(given, corner, cores)
-    return Built(A, found, fewer, transport(given, corner, cores), transport(given, corner, fewer), spent)
-
-
-def transport(given: Options, corner: Corner, cores: list[Any]) -> ltcl.Transport:
-    """T = (I + R) F of R on coefficients."""
-    W, systems = Wavelet(given.device, corner.rows.grid, "db2"), []
-    for C in cores:
-        core, V = restrict_to_support(C, W)
-        systems.append(IdentityPlus(Compressed(Tiles(given.device, core, 8, "float16"), V, V)))
-    F = np.repeat(np.array(ALBEDO)[:, None], corner.pixels, axis=1)
-    scaled = [ScaledColumns(S, f) for S, f in zip(systems, F, strict=True)]
-    return ltcl.Transport(scaled, corner.rows.grid, first_bounce=F)
+    return Built(A, found, fewer, transport(W, cores, ALBEDO), transport(W, fewer, ALBEDO), spent)
 
 
 def enough(given: Options, corner: Corner, cores: list[Any]) -> list[Any]:
     """The largest numbers of R, with which the direct light of another picture is off by 0.6 %."""
     W, (h, w) = Wavelet(given.device, corner.rows.grid, "db2"), corner.rows.grid
-    grey = np.roll(wanted_picture(corner).mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
+    grey = np.roll(corner.picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
     exact, found = corner.direct(grey[:, None]), []
     for channel, C in enumerate(cores):
         truth = exact[:, channel]
@@ -133,26 +121,15 @@ def enough(given: Options, corner: Corner, cores: list[Any]) -> list[Any]:
         def error(threshold: float, C: Any = C, truth: np.ndarray = truth) -> float:
             core, V = restrict_to_support(drop_below(C, threshold)[0], W)
             S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
-            x = ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x
-            return float(np.linalg.norm(x - truth) / np.linalg.norm(truth))
+            return relative(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
 
         found.append(drop_below(C, bisect(error, SHARE * ERROR, float(np.abs(C.data).max())))[0])
     return found
 
 
-def wanted_picture(corner: Corner) -> np.ndarray:
-    """What the wall is to look like, (h, w, 3)."""
-    return 0.05 + 0.4 * landscape(*corner.rows.grid).astype(np.float64)
-
-
-def relative(found: np.ndarray, exact: np.ndarray) -> float:
-    """Error of (N, 3) in the norm over pixels, of the worst colour."""
-    return float(np.max(np.linalg.norm(found - exact, axis=0) / np.linalg.norm(exact, axis=0)))
-
-
 @dataclass(frozen=True)
 class Pictures:
-    """(h, w, 3) each; `exact` are the direct light and the bounces by all of A."""
+    """(h, w, 3) each; errors are of the pattern and the parts."""
 
     wanted: np.ndarray
     pattern: np.ndarray
@@ -167,46 +144,32 @@ def compensate(built: Built, picture: np.ndarray) -> ltcl.Compensation:
 
 def pictures(corner: Corner, built: Built) -> Pictures:
     """Compensate and separate a landscape, and compare with the truth."""
-    wanted = wanted_picture(corner)
-    flat = wanted.reshape(-1, 3)
+    wanted = corner.picture
     with built.spent("compensate, first call"):
         compensation = compensate(built, wanted)
     with built.spent("separate, first call"):
         separation = ltcl.separate(built.T, wanted, BOUNCES, rtol=SEPARATION)
-    exact = [corner.direct(flat)]
+    exact = [corner.direct(wanted.reshape(-1, 3))]
     for _ in range(BOUNCES):
         exact.append(corner.bounce(exact[-1]))
-    found = [separation.direct, *separation.bounces]
-    of_pattern = compensation.pattern.reshape(-1, 3) * np.array(ALBEDO)
-    errors = [relative(of_pattern, exact[0])]
-    errors += [relative(part.reshape(-1, 3), truth) for part, truth in zip(found, exact, strict=True)]
-    return Pictures(wanted, compensation.pattern, found, errors)
+    parts = [separation.direct, *separation.bounces]
+    pairs = zip([compensation.pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
+    errors = [relative(part.reshape(-1, 3), truth) for part, truth in pairs]
+    return Pictures(wanted, compensation.pattern, parts, errors)
 
 
-def times(given: Options, built: Built, wanted: np.ndarray) -> dict[str, float]:
+def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
     """Milliseconds of a product, of a solve and of the whole task."""
     pixels = wanted.reshape(-1, 3).astype(np.float32)
-    x = given.device.upload(pixels[:, 0])
-    out = x.like()
     R: Any = built.lighter.systems[0].R
-    a = given.device.upload(np.zeros(R.core.shape[1], np.float32))
-    product_out = a.like()
-
-    def in_pixels() -> None:
-        R.apply(x, out)
-        given.device.finish()
-
-    def on_coefficients() -> None:
-        R.core.apply(a, product_out)
-        given.device.finish()
 
     def solve() -> None:
         for c, S in enumerate(built.lighter.systems):
             ltcl.solve(S, pixels[:, c], rtol=ERROR)
 
     actions = {
-        "product, on coefficients": on_coefficients,
-        "product, in pixels": in_pixels,
+        "product, on coefficients": product(R.core, np.zeros(R.core.shape[1], np.float32)),
+        "product, in pixels": product(R, pixels[:, 0]),
         "solve in colour": solve,
         "compensate in colour": lambda: compensate(built, wanted),
     }
@@ -252,8 +215,8 @@ def main() -> None:
     corner = Corner(CornerRows(8 if given.smoke else 256, REFERENCE))
     built = build(given, corner)
     found = pictures(corner, built)
-    ms = times(given, built, found.wanted)
-    n = corner.pixels
+    ms = times(built, found.wanted)
+    n = corner.rows.shape[0]
     facts: dict[str, Any] = {
         "pixels": n,
         "A, numbers a row": built.A.core.nnz / n,
@@ -266,8 +229,6 @@ def main() -> None:
         "bytes of R, were it dense": 3 * 4 * n * n,
         **{f"{name}, s": spent for name, spent in built.spent.items()},
         **{f"{name}, ms": spent for name, spent in ms.items()},
-        "the paper's product, ms": PAPER_PRODUCT,
-        "the paper's compensation, ms": PAPER_PICTURE,
         "peak memory, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "largest buffer allowed, MB": given.device.max_allocation / 2**20,
     }

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Video: frames a second from decoded sRGB codes to the 8-bit codes of the projector, 256 x 512 in colour.
 
-T is of the size and kind that `ltcl.compress` makes of a smooth scene: db2 wavelets on both sides, with a
-core of some thousand coarse coefficients, ten numbers a row. Frames drift slowly and are compensated one by
-one, as a live picture needs it, and eight at a time, as `ltcl.batch.compensate_frames` does: with solves to
-1 %, and with a kept inverse. `compensate_frames` is timed with the pictures on disk that it reads and writes.
+T is as `ltcl.compress` makes it of a smooth scene: db2 wavelets on both sides, with a core of some thousand
+coarse coefficients, ten numbers a row. Frames drift slowly and are compensated one by one, and by eights
+as `ltcl.batch.compensate_frames` does, which is timed with its pictures on disk.
 """
 
 from __future__ import annotations
@@ -17,9 +16,10 @@ from typing import Any, cast
 import numpy as np
 import scipy.sparse
 
+import _coefficients
 import ltcl
 from _harness import Options, Row, options, report, seconds
-from ltcl.operators import Compressed, IdentityPlus, ScaledColumns, Tiles, Wavelet, restrict_to_support
+from ltcl.operators import Compressed, Wavelet
 from ltcl.scenes import landscape
 
 ALBEDO = (0.4, 0.3, 0.2)
@@ -41,13 +41,8 @@ def transport(given: Options, grid: tuple[int, int], coarse: tuple[int, int]) ->
     half = scipy.sparse.csr_array((numbers, (places[rows], places[columns])), shape=(n, n))
     core = scipy.sparse.csr_array(half + half.T)
     core *= 1.0 / abs(core).sum(axis=1).max()
-    systems = []
-    for m in ALBEDO:
-        C, V = restrict_to_support((core * (m / (1.0 - m))).astype(np.float32), W)
-        systems.append(IdentityPlus(Compressed(Tiles(given.device, C, 8, "float16"), V, V)))
-    F = np.repeat(np.array(ALBEDO)[:, None], n, axis=1)
-    scaled = [ScaledColumns(S, f) for S, f in zip(systems, F, strict=True)]
-    return ltcl.Transport(scaled, grid, first_bounce=F)
+    cores = [(core * (m / (1.0 - m))).astype(np.float32) for m in ALBEDO]
+    return _coefficients.transport(W, cores, ALBEDO)
 
 
 def film(T: ltcl.Transport, frames: int) -> np.ndarray:

@@ -2,11 +2,10 @@
 """Steps of random walks over the rows of R, beside a walker in Numba.
 
 R has 131072 pixels and 100 nonzeros a row at random places. Walks start at every pixel, go on with chance
-1/2 (m = 1/3), and score at every step. Both draw by |R_ij|, Numba by alias tables of float32 and int32 in a
-`prange` over pixels.
+1/2 (m = 1/3), and score at every step. Both draw by |R_ij| and alias tables, Numba in a `prange` over pixels.
 One walk for three colours is measured beside three walks, of R whose rows have albedos of their own in each
-colour and whose entries differ by a tenth; its steps count for all three.
-All walks are checked against the same float64 solution.
+colour and whose entries differ by a tenth; its steps count for all three. Walks are checked against a float64
+solution.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import scipy.sparse
 
 from _harness import Options, Row, options, report, seconds
 from _peers import missing
+from csr import matrix
 from ltcl.operators import CSR
 from ltcl.operators.walks import Lengths, Tables, Walker, linked, tables
 
@@ -28,13 +28,10 @@ GO_ON = 0.5
 STEPS = 1.0 / (1.0 - GO_ON)  # of a walk, in the mean
 
 
-def matrix(n: int, per_row: int) -> scipy.sparse.csr_array:
-    """R of n pixels, entries of row sums around 0.6 at random places, a fifth of them negative."""
-    random = np.random.default_rng(0)
-    columns = random.integers(0, n, (n, per_row), dtype=np.int32)
-    values = random.uniform(-0.25, 1.0, (n, per_row)).astype(np.float32) * np.float32(1.2 / per_row)
-    R = scipy.sparse.csr_array((values.ravel(), columns.ravel(), np.arange(n + 1) * per_row), shape=(n, n))
-    R.sum_duplicates()
+def signed(n: int, per_row: int) -> Any:
+    """R of n pixels, entries of row sums around 0.45 at random places, a fifth of them negative."""
+    R = matrix(n, per_row, 1)
+    R.data = (np.random.default_rng(0).uniform(-0.3, 1.2, R.nnz) / per_row).astype(np.float32)
     return R
 
 
@@ -86,18 +83,15 @@ def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
         host = scipy.sparse.csr_array((data.astype(np.float32), R.indices, R.indptr), shape=R.shape)
         Rs.append(CSR(given.device, host, Rs[0].pattern if Rs else None))
     b, lengths = random.random((n, 3), dtype=np.float32), Lengths.geometric(GO_ON, -1.0)
-    together = Walker(linked(Rs, (1.0, 1.0, 1.0)), lengths, 0), given.device.upload(b)
-    apart = [
-        (Walker(tables(M), lengths, 0), given.device.upload(column))
-        for M, column in zip(Rs, b.T, strict=True)
-    ]
-    actions = {
-        "one walk": lambda: together[0].rows(together[1], np.arange(n), samples),
-        "three walks": lambda: [walker.rows(b_c, np.arange(n), samples) for walker, b_c in apart],
-    }
-    times = seconds(actions)
-    rate = {name: 3 * samples * n * STEPS / time / 1e6 for name, time in times.items()}
-    theirs, ours = rate["three walks"], rate["one walk"]
+    walkers = [(Walker(linked(Rs, (1.0, 1.0, 1.0)), lengths, 0), given.device.upload(b))]
+    for M, column in zip(Rs, b.T, strict=True):
+        walkers.append((Walker(tables(M), lengths, 0), given.device.upload(column)))
+
+    def walk(some: list[Any]) -> list[Any]:
+        return [walker.rows(light, np.arange(n), samples) for walker, light in some]
+
+    times = seconds({"one": lambda: walk(walkers[:1]), "three": lambda: walk(walkers[1:])})
+    ours, theirs = (3 * samples * n * STEPS / times[name] / 1e6 for name in ("one", "three"))
     return Row("steps for three colours", "three walks", theirs, ours, "M/s", ours / theirs)
 
 
@@ -107,34 +101,33 @@ def check(name: str, found: np.ndarray, exact: np.ndarray, samples: int) -> None
         raise SystemExit(f"the walks of {name} do not lead to the solution")
 
 
-def rows(given: Options, n: int, per_row: int, samples: int) -> tuple[list[Row], dict[str, Any]]:
-    """All comparisons."""
-    R, b = matrix(n, per_row), np.random.default_rng(2).random(n, dtype=np.float32)
-    M, device = CSR(given.device, R), given.device
-    made, b_there, pixels = Tables(M), device.upload(b), np.arange(n)
+def main() -> None:
+    """Run the bench."""
+    given = options(__doc__ or "")
+    n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
+    R, b = signed(n, per_row), np.random.default_rng(2).random(n, dtype=np.float32)
+    made, light, pixels = Tables(CSR(given.device, R)), given.device.upload(b), np.arange(n)
     walker = Walker(made, Lengths.geometric(GO_ON, -1.0), 0)
-    actions: dict[str, Callable[[], Any]] = {"ours": lambda: walker.rows(b_there, pixels, samples).mean}
+    actions: dict[str, Callable[[], Any]] = {"ours": lambda: walker.rows(light, pixels, samples).mean}
     if (theirs := numba_walker(R, b, made)) is not None:
         actions["Numba alias"] = lambda: theirs(samples)
     exact = scipy.sparse.linalg.bicgstab(scipy.sparse.eye_array(n) + R.astype(float), b, rtol=1e-8)[0] - b
     for name, action in actions.items():
         check(name, action(), exact, samples)
     rate = {name: samples * n * STEPS / time / 1e6 for name, time in seconds(actions).items()}
-    ours, numba = rate["ours"], rate.get("Numba alias")
-    found = [colours(given, R, samples)]
-    if numba is not None:
-        found.insert(0, Row("steps of walks", "Numba alias", numba, ours, "M/s", ours / numba, TARGET))
-    megabytes = (made.records.nbytes + made.entries.nbytes) / 1e6
-    facts = {"pixels": n, "nonzeros": R.nnz, "samples a pixel": samples, "MB of tables": megabytes}
-    return found, facts | {"steps, M/s": ours, "not installed": ", ".join(missing()) or "none"}
-
-
-def main() -> None:
-    """Run the bench."""
-    given = options(__doc__ or "")
-    n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
-    found, facts = rows(given, n, per_row, samples)
-    report(given, "Random walks", found, facts)
+    ours = rate.pop("ours")
+    rows = [
+        Row("steps of walks", name, peer, ours, "M/s", ours / peer, TARGET) for name, peer in rate.items()
+    ]
+    facts = {
+        "pixels": n,
+        "nonzeros": R.nnz,
+        "samples a pixel": samples,
+        "MB of tables": (made.records.nbytes + made.entries.nbytes) / 1e6,
+        "steps, M/s": ours,
+        "not installed": ", ".join(missing()) or "none",
+    }
+    report(given, "Random walks", [*rows, colours(given, R, samples)], facts)
 
 
 if __name__ == "__main__":

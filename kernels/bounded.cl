@@ -2,9 +2,9 @@
 // Least squares within bounds between two products (`ltcl/solvers/bounded.py`): x is (rows, k), r is (height, k).
 //
 // z is the part of -g that may be followed: 0 where x is at a bound and -g points out. lower and upper hold one value a
-// row; w counts where weighted == 1. `numbers` holds k columns by rows: alpha, the curvature <A d, A d> of the last d,
-// or 0 where it tells nothing of the next, lambda; from row 4 on the 2 sums of bounded_look by slices; then those of r
-// r. Required define, items, groups, partial sums and `scratch`: common/columns.h.
+// row; w, squares of weights, counts where weighted == 1. `numbers` holds k columns by rows: alpha, the curvature <A d,
+// A d> of the last d, or 0 where it tells nothing of the next, lambda; from row 4 on the 2 sums of bounded_look by
+// slices; then those of w r r. Items, groups, partial sums and `scratch`: common/columns.h.
 
 #include "common/columns.h"
 
@@ -50,23 +50,8 @@ kernel void bounded_direction(
     columns_sum(most, shares + get_group_id(0) * k, 1, s, scratch);
 }
 
-// weighted == 2 makes u as well.
-kernel void bounded_weigh(
-    int rows, int k, int weighted, global const real *w, global real *v, global real *u, global real *sums,
-    local real *scratch)
-{
-    const share s = columns_share(rows, k);
-    real sum = 0;
-    EACH_VALUE(i, row) {
-        const real value = weighted ? v[i] *= w[i] : v[i];
-        if (weighted == 2)
-            u[i] = w[i] * value;
-        sum += value * value;
-    }
-    columns_sum(sum, sums + get_group_id(0) * k, 0, s, scratch);
-}
-
-// `sums` and `shares` are of bounded_direction, `curvatures` the sums of Ad Ad. u = w r. scratch: 4 more a column.
+// `sums` and `shares` are of bounded_direction, `curvatures` the sums of w Ad Ad;
+// of 0 slices nothing moves. u = w r; it may be r where w does not count. scratch: 4 more a column.
 kernel void bounded_move(
     int rows, int k, int height, int slices, int weighted, global real *numbers, global const real *sums,
     global const real *shares, global const real *curvatures, global const real *lower, global const real *upper,
@@ -95,21 +80,19 @@ kernel void bounded_move(
     s = columns_share(height, k);
     real rr = 0;
     EACH_VALUE(i, row) {
-        const real left = lambda == 0 ? r[i] : r[i] - lambda * Ad[i];
+        const real left = lambda == 0 ? r[i] : r[i] - lambda * Ad[i], weighed = weighted ? w[i] * left : left;
         r[i] = left;
-        if (weighted)
-            u[i] = w[i] * left;
-        rr += left * left;
+        u[i] = weighed;
+        rr += left * weighed;
     }
-    columns_sum(rr, numbers + (4 + 2 * slices + get_group_id(0)) * k, 0, s, scratch);
+    columns_sum(rr, numbers + (4 + 2 * get_num_groups(0) + get_group_id(0)) * k, 0, s, scratch);
 }
 
-// g = -q, q = A^T w r; h = (g - last g) / lambda = A^T w^2 A d, which anew == 1 leaves as it is. Sums: the
+// g = -q, q = A^T w r; h = (g - last g) / lambda = A^T w A d, which anew == 1 leaves as it is. Sums: the
 // Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), and z.h.
 kernel void bounded_look(
     int rows, int k, int anew, global const real *lower, global const real *upper, global const real *x,
-    global const real *q, global real *g, global real *h, global real *numbers,
-    local real *scratch)
+    global const real *q, global real *g, global real *h, global real *numbers, local real *scratch)
 {
     const share s = columns_share(rows, k);
     const real lambda = s.first < s.end ? numbers[2 * k + s.origin + s.column] : 0;

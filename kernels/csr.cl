@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Product of a matrix in compressed sparse rows with K right-hand sides, and steps of an iteration along one; see
-// common/product.h for the three kernels, their arguments and defines.
+// common/product.h for the two kernels, their arguments and defines.
 //
 // Layout: pointers[rows + 1] counts from 0 within the slab; columns and values follow it, columns ascending and
 // unique within a row.
@@ -12,15 +12,11 @@
 
 kernel void csr_matvec(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    BY_ITEM(csr_add(sum.item, columns, values, x + offset, stride, pointers[row], pointers[row + 1], 1));
-}
-
-kernel void csr_matvec_stream(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
-{
-    BY_ITEM(sum = csr_sum(columns, values, x + offset, stride, pointers[row], pointers[row + 1]));
+    BY_ITEM(sum.vector = row_sum(true, columns, values, x + offset, stride, pointers[row], pointers[row + 1]));
 }
 
 kernel void csr_matvec_group(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    BY_GROUP(csr_add(sum.item, columns, values, x + offset, stride, pointers[row] + me, pointers[row + 1], items));
+    const int begin = pointers[get_group_id(0)] + get_local_id(0), end = pointers[get_group_id(0) + 1];
+    BY_GROUP(row_add(true, sum.item, columns, values, x + offset, stride, begin, end, items));
 }

@@ -1,40 +1,107 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Product of a matrix of form factors that is never stored: every entry is computed where it is used.
+// Light between flat patches: a matrix of form factors that is never stored, every entry computed where it is used,
 //
 //     A = diag(left) G diag(right),    G_ij = mean of  cos(t_i) cos(t_j) / (pi r^2)  over pairs of points on i and j
 //
-// With left = albedo and right = area this is one bounce, and with the two swapped its transpose.
+// and what opaque boxes along the axes hide. With left = albedo and right = area A is one bounce, and with the two
+// swapped its transpose.
 //
-//   form_factor_weigh   z = diag(right) x, each right-hand side as a row of `pitch` reals; one work-item a patch
-//   form_factor_matvec  out = a (A x) + b y + c x, as in common/product.h; one work-item a row
-//   form_factor_pairs   G_ij of listed pairs; one work-item a pair
+//   form_factor_weigh    z = diag(right) x, each right-hand side as a row of `pitch` reals; one work-item a patch
+//   form_factor_matvec   out = a (A x) + b y + c x, as in common/product.h; one work-item a row
+//   form_factor_pairs    G_ij of listed pairs; one work-item a pair
+//   form_factor_visible  the share of the rays between two patches that no box stops; an item a row, LANES columns
 //
 // A pair at least OUTER sizes apart is taken at its centres; nearer, the curvature of cos cos / r^2 is added; within
 // INNER sizes, or where the plane of one patch cuts the other, it is taken at eight pairs of points, which is exact
 // for polynomials of degree 3. Pairs of points with a box between them add nothing.
 //
-// Required defines: K, see common/lanes.h; LANES and BLOCKS, see common/spots.h. Optional: PACKED.
+// Required defines: K, see common/lanes.h; LANES, patches that an item takes together, 8 on CPUs
+// and 1 on GPUs; BLOCKS, the number of boxes. Optional: PACKED.
 // Layout: geometry is 13 rows of `pitch` reals, a multiple of LANES, one column a patch, the last without a normal:
 // centre, right edge, down edge, normal (three rows each), and squared size, (right^2 + down^2) / 4, of which a pair
-// has the sum. Lengths are parts of the scene's size.
+// has the sum. A box is its centre and its half sides, 6 reals. Lengths are parts of the scene's size.
 
 #include "common/product.h"
-#include "common/spots.h"
 
-enum { CENTRE, RIGHT, DOWN, NORMAL, SIZE };
+#if !defined(LANES) || !defined(BLOCKS)
+#error "form_factor.cl needs -DLANES=<patches that an item takes: 8 on CPUs, 1 on GPUs>, -DBLOCKS=<number of boxes>"
+#endif
+
+// stretch: of patches side by side; flags: what comparing two gives. TOTAL: the sum of the lanes.
+typedef OF(real, LANES) stretch;
+#define LOAD_STRETCH(a) OF(LOAD, LANES)(a)
+#if LANES == 8
+typedef int8 flags;
+#define ANY(flags) any(flags)
+#define TOTAL(v) sum8(v)
+#else
+typedef int flags;
+#define ANY(flags) (flags)
+#define TOTAL(v) (v)
+#endif
+
+// PoCL compiles fabs() of eight lanes to a call.
+INLINE stretch magnitude(stretch v)
+{
+    return v < 0 ? -v : v;
+}
+
+#define GRAZING 1e-6f  // heights above a plane below this are rounding errors: such points do not see each other
+
+// Points or directions in space, one a lane.
+typedef struct {
+    stretch x, y, z;
+} spots;
+
+INLINE stretch dot3(spots a, spots b)
+{
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+INLINE spots between(spots p, spots q)
+{
+    return (spots){q.x - p.x, q.y - p.y, q.z - p.z};
+}
+
+// Space vector number `what` of patches item .. item + LANES - 1, or of patch `item` in every lane.
+INLINE spots load_spots(global const real *geometry, int pitch, int what, int item, bool spread)
+{
+    global const real *x = geometry + 3 * what * pitch + item, *y = x + pitch, *z = y + pitch;
+    return spread ? (spots){(stretch)(*x), (stretch)(*y), (stretch)(*z)}
+                  : (spots){LOAD_STRETCH(x), LOAD_STRETCH(y), LOAD_STRETCH(z)};
+}
+
+// `value`, or 0 where a box is between p and q: separating axes of a segment and a box (Ericson, Real-Time Collision
+// Detection, 2005, section 5.3.3), where swapping the ends changes signs only, so the answer is the same to the bit.
+INLINE stretch unless_blocked(stretch value, spots p, spots q, global const real *blocks)
+{
+    if (!ANY(value > 0))
+        return value;
+    const stretch dx = 0.5f * (q.x - p.x), dy = 0.5f * (q.y - p.y), dz = 0.5f * (q.z - p.z);
+    const stretch mx = 0.5f * (q.x + p.x), my = 0.5f * (q.y + p.y), mz = 0.5f * (q.z + p.z);
+    const stretch ax = magnitude(dx), ay = magnitude(dy), az = magnitude(dz);
+    flags met = 0;
+    for (int b = 0; b < BLOCKS; ++b, blocks += 6) {
+        const stretch x = mx - blocks[0], y = my - blocks[1], z = mz - blocks[2];
+        const real ex = blocks[3], ey = blocks[4], ez = blocks[5];
+        met |= (magnitude(x) <= ax + ex) & (magnitude(y) <= ay + ey) & (magnitude(z) <= az + ez)
+            & (magnitude(y * dz - z * dy) <= ey * az + ez * ay) & (magnitude(z * dx - x * dz) <= ez * ax + ex * az)
+            & (magnitude(x * dy - y * dx) <= ex * ay + ey * ax);
+    }
+    return met ? (stretch)(0) : value;
+}
 
 #define OUTER 64.0f
 #define INNER 12.0f
 #define PI 3.14159265f  // M_PI_F may be a double
-// Radius of the circle that carries the eight points, in edges, and that / sqrt(2). Stroud, Approximate Calculation
-// of Multiple Integrals, 1971, C_n 3-1 for n = 4.
-#define RADIUS 0.40824829f
-#define DIAGONAL 0.28867513f
 
-// Patches j .. j + LANES - 1, or one patch in all lanes.
 typedef struct {
-    spots centre, normal, right, down;
+    spots centre, right, down, normal;
 } patch;
+
+#define LOAD_PATCH(item, spread) \
+    {load_spots(geometry, pitch, 0, item, spread), load_spots(geometry, pitch, 1, item, spread), \
+     load_spots(geometry, pitch, 2, item, spread), load_spots(geometry, pitch, 3, item, spread)}
 
 // The centre moved by a part of each edge.
 INLINE spots moved(patch p, real a, real b)
@@ -42,11 +109,6 @@ INLINE spots moved(patch p, real a, real b)
     return (spots){
         p.centre.x + a * p.right.x + b * p.down.x, p.centre.y + a * p.right.y + b * p.down.y,
         p.centre.z + a * p.right.z + b * p.down.z};
-}
-
-INLINE stretch unless_blocked(stretch value, spots p, spots q, global const real *blocks)
-{
-    return ANY(value > 0) && BLOCKS ? (blocked(p, q, blocks) ? (stretch)(0) : value) : value;
 }
 
 // cos cos / (pi r^2) of points p and q; 0 where one is behind the other's plane, or the way is blocked.
@@ -60,12 +122,12 @@ INLINE stretch exchange(spots p, spots p_normal, spots q, spots q_normal, global
     return unless_blocked(facing ? value : (stretch)(0), p, q, blocks);
 }
 
-// The mean over the eight pairs of points. Point k of the rule is at angle k pi / 4 on an ellipse in each
-// patch; it meets point 3 k of the other.
+// The mean over eight pairs of points (Stroud, Approximate Calculation of Multiple Integrals, 1971, C_n 3-1 for
+// n = 4). Point k of the rule is at angle k pi / 4 on an ellipse in each patch; it meets point 3 k of the other.
 INLINE stretch at_eight_points(patch p, patch q, global const real *blocks)
 {
 #define MEET(a, b, u, v) exchange(moved(p, a, b), p.normal, moved(q, u, v), q.normal, blocks)
-    const real u = RADIUS, v = DIAGONAL;
+    const real u = 0.40824829f, v = 0.28867513f;  // radius of the ellipse in edges, and that / sqrt(2)
     const stretch straight = MEET(u, 0, u, 0) + MEET(0, u, 0, -u) + MEET(-u, 0, -u, 0) + MEET(0, -u, 0, u);
     const stretch skew = MEET(v, v, -v, v) + MEET(-v, v, v, v) + MEET(-v, -v, v, -v) + MEET(v, -v, -v, -v);
     return (straight + skew) * 0.125f;
@@ -99,19 +161,13 @@ INLINE stretch nearby(patch p, patch q, stretch sizes, spots d, stretch r2, glob
 // G of patch i and of patches j .. j + LANES - 1.
 INLINE stretch entries(int i, int j, global const real *geometry, int pitch, global const real *blocks)
 {
-    patch p = {spread_spots(geometry, pitch, CENTRE, i), spread_spots(geometry, pitch, NORMAL, i)};
-    patch q = {load_spots(geometry, pitch, CENTRE, j), load_spots(geometry, pitch, NORMAL, j)};
+    const patch p = LOAD_PATCH(i, true), q = LOAD_PATCH(j, false);
     const spots d = between(p.centre, q.centre);
-    global const real *squares = geometry + 3 * SIZE * pitch;
-    const stretch r2 = dot3(d, d), sizes = squares[i] + LOAD_STRETCH(squares + j);
-    const flags close = r2 < OUTER * OUTER * sizes;
+    const stretch sizes = geometry[12 * pitch + i] + LOAD_STRETCH(geometry + 12 * pitch + j), r2 = dot3(d, d);
     const stretch far = exchange(p.centre, p.normal, q.centre, q.normal, blocks);
+    const flags close = r2 < OUTER * OUTER * sizes;
     if (!ANY(close))
         return far;
-    p.right = spread_spots(geometry, pitch, RIGHT, i);
-    p.down = spread_spots(geometry, pitch, DOWN, i);
-    q.right = load_spots(geometry, pitch, RIGHT, j);
-    q.down = load_spots(geometry, pitch, DOWN, j);
     return close ? nearby(p, q, sizes, d, r2, blocks) : far;
 }
 
@@ -125,24 +181,25 @@ kernel void form_factor_weigh(
             z[c * pitch + j] = j < count ? right[j] * x[j * stride + offset + c] : 0;
 }
 
-kernel void form_factor_matvec(
-    PRODUCT_ARGUMENTS, int pitch, global const real *geometry, global const real *blocks, global const real *left,
+static inline void row_sum(
+    real *sum, int i, real left, int pitch, global const real *geometry, global const real *blocks,
     global const real *z)
 {
-    ITEM_ROW;
-    if (!inside)
-        return;
-    stretch part[K];
-    for (int k = 0; k < K; ++k)
-        part[k] = 0;
+    stretch part[K] = {0};
     for (int j = 0; j < pitch; j += LANES) {
-        const stretch g = entries(first + row, j, geometry, pitch, blocks);
+        const stretch g = entries(i, j, geometry, pitch, blocks);
         for (int k = 0; k < K; ++k)
             part[k] = g * LOAD_STRETCH(z + k * pitch + j) + part[k];
     }
     for (int k = 0; k < K; ++k)
-        sum.item[k] = left[first + row] * TOTAL(part[k]);
-    FINISH_ITEMS(sum);
+        sum[k] = left * TOTAL(part[k]);
+}
+
+kernel void form_factor_matvec(
+    PRODUCT_ARGUMENTS, int pitch, global const real *geometry, global const real *blocks, global const real *left,
+    global const real *z)
+{
+    BY_ITEM(row_sum(sum.item, first + row, left[first + row], pitch, geometry, blocks, z));
 }
 
 kernel void form_factor_pairs(
@@ -153,8 +210,34 @@ kernel void form_factor_pairs(
     if (n >= count)
         return;
     // The stretch that the product computes, by the same code, and its lane.
-    const int start = to[n] / LANES * LANES;
-    stretch_items g;
-    g.vector = entries(from[n], start, geometry, pitch, blocks);
-    out[n] = g.item[to[n] - start];
+    const int lane = to[n] % LANES;
+    const stretch g = entries(from[n], to[n] - lane, geometry, pitch, blocks);
+    out[n] = ((const real *)&g)[lane];
+}
+
+// out (columns, rows) = which part of patches from to[row] on, a multiple of LANES, patch from[row] sees: of the rays
+// between their fronts, the share that gets through; 1 where no ray leaves and meets a front. starts and ends hold
+// three rows of `pitch` reals for each ray, normals three. Ray k runs from point k of one patch to point partner(k)
+// of the other, and partner(partner(k)) = k: both directions have the same rays, and the same result to the bit.
+kernel void form_factor_visible(
+    int rows, int pitch, int rays, global const int *from, global const int *to, global const real *starts,
+    global const real *ends, global const real *normals, global const real *blocks, global real *out)
+{
+    const int row = get_global_id(0), column = get_global_id(1) * LANES;
+    if (row >= rows)
+        return;
+    const int i = from[row], j = to[row] + column;
+    const spots p_normal = load_spots(normals, pitch, 0, i, true), q_normal = load_spots(normals, pitch, 0, j, false);
+    const stretch none = 0, one = 1;
+    stretch open = 0, faced = 0;
+    for (int k = 0; k < rays; ++k) {
+        const spots p = load_spots(starts, pitch, k, i, true), q = load_spots(ends, pitch, k, j, false);
+        const spots d = between(p, q);
+        const stretch facing = (dot3(d, p_normal) > GRAZING) & (-dot3(d, q_normal) > GRAZING) ? one : none;
+        faced += facing;
+        open += unless_blocked(facing, p, q, blocks);
+    }
+    const stretch share = faced > 0 ? open / faced : one;
+    for (int lane = 0; lane < LANES; ++lane)
+        out[(size_t)(column + lane) * rows + row] = ((const real *)&share)[lane];
 }

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Krylov methods between two products: inner products of columns, and steps whose coefficients stay on the device.
+// Steps of Krylov methods between two products, whose coefficients stay on the device.
 //
-// Required define, items, groups, partial sums, `slices` and `scratch`: common/columns.h. `state` holds numbers of k
-// columns by rows; from row STATE on the partial sums of squared residuals of SLOTS steps. The parity of `step` says
-// which of two copies a step reads; it writes the other one, since groups that start late still read.
+// Items, groups, partial sums, `slices` and `scratch`: common/columns.h. `state` holds numbers of k columns by rows;
+// from row STATE on the partial sums of squared residuals of SLOTS steps. The parity of `step` says which of two copies
+// a step reads; it writes the other one, since groups that start late still read.
 
 #include "common/columns.h"
 
@@ -17,24 +17,6 @@
 static inline real divided(real a, real b)
 {
     return a / (isfinite(b) ? b : NAN);
-}
-
-// Sums of left * right * weight for pair j = get_group_id(1): 4 bits of `pairs` name two of a, b and c. Where it is 0,
-// left is a[j * rows * k] on, b for the last j, and right is b. `weights` are like b and count where weighted == 1.
-kernel void krylov_pairs(
-    int rows, int k, int pairs, int weighted, global const real *weights, global const real *a,
-    global const real *b, global const real *c, global real *partials, local real *scratch)
-{
-    const share s = columns_share(rows, k);
-    const size_t j = get_group_id(1), count = get_num_groups(1);
-    const int codes = j < 8 ? pairs >> (4 * j) : 0, left = codes & 3, right = codes >> 2 & 3;
-    global const real *x = left == 0 ? a : left == 1 ? b : c, *y = right == 0 ? a : right == 1 ? b : c;
-    if (!pairs) {
-        x = j + 1 < count ? a + j * rows * k : b;
-        y = b;
-    }
-    global real *sums = partials + (get_group_id(0) * count + j) * k;
-    columns_sum(dot_share(x, y, weighted ? weights : 0, s), sums, 0, s, scratch);
 }
 
 // out = w - sum_j h_j V_j, j < count, with h of the partial sums, of which there is one more: w * w. The h are added

@@ -1,12 +1,9 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Pixels in another order, or some of them: out = a (P x) + b y, where row i of P x is row order[i] of x, or 0 where
-// that is negative.
-//
-// Work-items stride through pieces of K right-hand sides (dimension 0) and through pixels (1).
-//
-// Required define: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8.
+// that is negative. Work-items stride through pieces of K right-hand sides (dimension 0) and through pixels (1).
+// Required define: K, see common/lanes.h.
 
-#include "common/pieces.h"
+#include "common/lanes.h"
 
 kernel void ordered_gather(
     int rows, int k, real a, real b, global const int *order, global const real *x, global const real *y,

@@ -8,12 +8,11 @@
 // Work-items stride through pieces of K right-hand sides (dimension 0), columns (1) and rows (2). A launch of
 // pyramid_gather of several levels, first .. last - 1, takes one group a piece, which waits for itself between them.
 //
-// Required define: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8.
-// Layout: the cells of all levels one after another, the finest first, each level row-major, right-hand sides side by
-// side. height and width are the picture's. sums is scratch for as many, of which level 0 is not used, with a spare
-// cell between levels: wide loads reach beyond the last of a level.
+// Required define: K, see common/lanes.h. Layout: the cells of all levels one after another, the finest first, each
+// level row-major, right-hand sides side by side. sums is scratch for as many, of which level 0 is not used, with a
+// spare cell between levels: wide loads reach beyond the last of a level.
 
-#include "common/pieces.h"
+#include "common/lanes.h"
 
 kernel void pyramid_gather(
     int height, int width, int first, int last, int k, real a, real b, global const real *x, global real *sums,

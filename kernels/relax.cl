@@ -6,29 +6,25 @@
 // P_BB is the lower triangle of S_BB with D / omega, or all of it.
 //
 //   relax_strips   CPUs: a panel of many blocks; a work-item takes a block of rows, which is a strip of the panel
-//   relax_rows     GPUs: s_B; a work-group a row. A launch for each block, and one of
-//   relax_correct  GPUs: delta_B = P_BB^-1 s_B; a work-group a row
-//   relax_windows  where relax_strips and relax_rows split the sparse rows; one work-item a row
+//   relax_rows     GPUs: s_B; a work-group a row. A launch for each block, and one of dense_matvec_group for x_B
 //
-// A strip first sums what no other strip changes before its turn: what is outside its panel, and from itself on. The
-// rest, a narrow window of columns, is added strip by strip by the work-item that ends the sums of a strip or by the
-// one that ends the strip before it, whichever is later: none waits. Assumed beyond OpenCL 1.2, true of CPU drivers:
-// mem_fence and atomics order what work-groups of one launch hand on.
+// A strip first sums what no other strip changes before its turn. The rest, a narrow window of columns, is added strip
+// by strip by the item that ends the sums of a strip or the strip before it, whichever is later: none waits. Assumed
+// beyond OpenCL 1.2, true of CPU drivers: mem_fence and atomics order what work-groups of one launch hand on.
 //
 // A row is split at column i where its correction is omega s_i / S_ii at once (`inverses` 0), else at the first column
 // of its block. Sums below and above are apart, so that a sweep also tells the residual r of the x it began with: what
 // it takes from x above, the one before took below, and left in carry = b - that.
 //
-// Required define: K, see common/lanes.h. Optional: PACKED, and DENSE where M is dense: rows of `width` numbers,
-// without pointers, columns and windows. windows[2 row] is the first entry of the window, windows[2 row + 1] that from
-// the split on. A slab has rows of M from `first` on; weights are rows of P_BB^-1, `block` numbers each, or 1 / S_ii.
-// Vectors have `stride` reals a row, of which a launch takes offset .. offset + K - 1, in rows begin .. end of the
-// panel or block from row `start` on. scratch: 2 K reals a work-item. arrivals[0] counts the strips begun, arrivals[i]
-// what strip i waited for; all are 0 between launches.
+// Optional defines: see common/lanes.h, and DENSE: M has rows of `width` numbers, without pointers, columns and
+// windows. windows[2 row] is the first entry of the window, windows[2 row + 1] that from the split on. A slab has rows
+// of M from `first` on; weights are rows of P_BB^-1, `block` numbers each, or 1 / S_ii. Vectors have `stride` reals a
+// row, of which a launch takes offset .. offset + K - 1, in rows begin .. end of the panel or block from row `start`
+// on. scratch: 2 K reals a work-item. arrivals[0] counts the strips begun, arrivals[i] what strip i waited for; all are
+// 0 between launches.
 
 #include "common/product.h"
 #include "common/row_sums.h"
-#include "common/search.h"
 
 #define ARGUMENTS \
     int begin, int end, int first, int start, int stride, int offset, real shift, real scale, int width, \
@@ -36,24 +32,18 @@
     global real *x, global const real *b, global real *s, global real *r, global real *carry
 #define OFFSET (stride = STRIDE(stride), x += offset, b += offset, s += offset, r += offset, carry += offset)
 
-// The entries from .. to of a row, by one work-item in wide loads, and by a work-group side by side (ADD).
-#define ITEM(from) (from) + (int)get_local_id(0)
+// The entries from .. to of a row, by one work-item in wide loads.
+#define ROW_SUM(row, from, to) ((sums){row_sum(SPARSE, columns, VALUES(row), x, stride, from, to)})
 #ifdef DENSE
-#define ROW_SUM(row, from, to) dense_sum(values + (size_t)(row) * width, x, stride, from, to)
-#define ROW_ADD(sum, row, from, to) \
-    dense_add(sum, values + (size_t)(row) * width, x, stride, ITEM(from), to, get_local_size(0))
-#define ROW_BEGIN(row) 0
-#define ROW_END(row) width
-#define WINDOW_BEGIN(row, column) (column)
-#define WINDOW_END(row, column) (column)
+#define SPARSE false
 #else
-#define ROW_SUM(row, from, to) csr_sum(columns, values, x, stride, from, to)
-#define ROW_ADD(sum, row, from, to) csr_add(sum, columns, values, x, stride, ITEM(from), to, get_local_size(0))
-#define ROW_BEGIN(row) pointers[row]
-#define ROW_END(row) pointers[(row) + 1]
-#define WINDOW_BEGIN(row, column) windows[2 * (row)]
-#define WINDOW_END(row, column) windows[2 * (row) + 1]
+#define SPARSE true
 #endif
+#define VALUES(row) (SPARSE ? values : values + (size_t)(row) * width)
+#define ROW_BEGIN(row) (SPARSE ? pointers[row] : 0)
+#define ROW_END(row) (SPARSE ? pointers[(row) + 1] : width)
+#define WINDOW_BEGIN(row, column) (SPARSE ? windows[2 * (row)] : (column))
+#define WINDOW_END(row, column) (SPARSE ? windows[2 * (row) + 1] : (column))
 
 kernel void relax_strips(
     ARGUMENTS, int strips, int all, int block, int inverses, real omega, global const real *weights,
@@ -93,7 +83,8 @@ kernel void relax_strips(
         }
         const int bottom = min(top + block, all);
         for (int i = top; inverses && bottom <= end && i < bottom; ++i) {  // a block may end in the next slab
-            const sums delta = dense_sum(weights + (size_t)i * block, s + top * stride, stride, 0, bottom - top);
+            global const real *inverse = weights + (size_t)i * block;
+            const sums delta = {row_sum(false, 0, inverse, s + top * stride, stride, 0, bottom - top)};
             for (int c = 0; c < K; ++c)
                 x[i * stride + c] += delta.item[c];
         }
@@ -105,44 +96,16 @@ kernel void relax_rows(ARGUMENTS, local real *scratch)
 {
     OFFSET;
     const int row = begin - first + get_group_id(0);  // one group a row exactly: no row is beyond the last
+    const int me = get_local_id(0), items = get_local_size(0), split = WINDOW_END(row, start);
     real sum[2 * K] = {0};
-    ROW_ADD(sum, row, ROW_BEGIN(row), WINDOW_END(row, start));
-    ROW_ADD(sum + K, row, WINDOW_END(row, start), ROW_END(row));
+    row_add(SPARSE, sum, columns, VALUES(row), x, stride, ROW_BEGIN(row) + me, split, items);
+    row_add(SPARSE, sum + K, columns, VALUES(row), x, stride, split + me, ROW_END(row), items);
     group_sums(sum, scratch);
     group_sums(sum + K, scratch + K * get_local_size(0));  // the tree of the other sums may be at work
-    for (int c = 0, j = (first + row) * stride; get_local_id(0) == 0 && c < K; ++c, ++j) {
+    for (int c = 0, j = (first + row) * stride; me == 0 && c < K; ++c, ++j) {
         const real from_x = shift * x[j] + scale * sum[K + c];
         r[j] = carry[j] - from_x;
         carry[j] = b[j] - scale * sum[c];
         s[j] = carry[j] - from_x;
     }
-}
-
-kernel void relax_correct(
-    int start, int count, int block, int stride, int offset, global const real *weights, global real *x,
-    global real *before, global const real *s, local real *scratch)
-{
-    stride = STRIDE(stride);
-    const int i = start + get_group_id(0);
-    real sum[K] = {0};
-    dense_add(
-        sum, weights + (size_t)i * block, s + start * stride + offset, stride, get_local_id(0), count,
-        get_local_size(0));
-    group_sums(sum, scratch);
-    for (int c = 0, j = i * stride + offset; get_local_id(0) == 0 && c < K; ++c, ++j) {
-        before[j] = x[j];
-        x[j] += sum[c];
-    }
-}
-
-kernel void relax_windows(
-    int rows, int first, int block, int panel, int inverses, global const int *pointers,
-    global const int *columns, global int *windows)
-{
-    const int row = get_global_id(0), i = first + row;
-    if (row >= rows)
-        return;
-    const int begin = pointers[row], end = pointers[row + 1];
-    windows[2 * row] = entry_from(columns, begin, end, i - i % panel);
-    windows[2 * row + 1] = entry_from(columns, begin, end, inverses ? i - i % block : i);
 }

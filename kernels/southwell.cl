@@ -8,7 +8,6 @@
 // and items look up where their stretch of r begins in each: no two write one value. `places`: a number an item.
 
 #include "common/real.h"
-#include "common/search.h"
 
 #define ROW_OF(part, parts, n) ((int)((long)(part) * (n) / (parts)))
 
@@ -38,7 +37,14 @@ kernel void southwell_step(
         if (row < 0 || row >= rows)
             continue;
         const real step = scale * delta[part * k + c];
-        int j = entry_from(columns, pointers[row], pointers[row + 1], from);
+        int j = pointers[row];
+        for (int stop = pointers[row + 1], middle; j < stop;) {  // a binary search
+            middle = j + (stop - j) / 2;
+            if (columns[middle] < from)
+                j = middle + 1;
+            else
+                stop = middle;
+        }
         for (; j < pointers[row + 1] && columns[j] < to; ++j)
             r[columns[j] * k + c] -= values[j] * step;
     }

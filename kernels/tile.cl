@@ -1,35 +1,142 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Product of a sparse matrix of tiles with K right-hand sides, and steps of an iteration along one; see
-// common/product.h for the three kernels, their arguments and defines. A tile is WIDTH neighbouring columns of one
+// common/product.h for the two kernels, their arguments and defines. A tile is WIDTH neighbouring columns of one
 // row: one column index for WIDTH numbers, and x is read in wide loads.
 //
-// Required defines besides K: WIDTH: 1 or 8; VALUES, the type of the numbers, see common/tile_sums.h.
+// Required defines besides K: WIDTH: 1 or 8; VALUES, the type of the numbers: 0 float32, 1 float16, 2 int8.
 // Optional: LONG: column indices have 32 bits, not 16.
 // Layout: pointers[rows + 1] counts tiles from 0 within the slab; columns (one a tile, the first of it) and values
 // (WIDTH a tile) follow it, and so do scales (one a tile) where values are int8: they are not read elsewhere.
 // Columns that no nonzero claims hold zeros, and no tile reaches beyond the end of its row.
 
 #include "common/product.h"
-#include "common/tile_sums.h"
+
+#if WIDTH != 1 && WIDTH != 8
+#error "tile.cl needs -DWIDTH=<neighbouring columns of a tile: 1 or 8>"
+#endif
+#ifdef LONG
+typedef int place;
+#else
+typedef ushort place;
+#endif
+#define X(j) (x + columns[j] * stride)
+
+// Numbers as reals, one or eight neighbours, from any address (see LOAD8 in common/real.h).
+#ifdef __clang__
+typedef ushort8 ushort8_packed __attribute__((aligned(2)));
+typedef uchar8 uchar8_packed __attribute__((aligned(1)));
+#define LOAD8_USHORT(p) (*(global const ushort8_packed *)(p))
+#define LOAD8_UCHAR(p) (*(global const uchar8_packed *)(p))
+#else
+#define LOAD8_USHORT(p) vload8(0, p)
+#define LOAD8_UCHAR(p) vload8(0, (global const uchar *)(p))
+#endif
+
+#if VALUES == 0
+typedef real narrow;
+#define WIDEN(p) (*(p))
+#define WIDEN8(p) LOAD8(p)
+#elif VALUES == 1
+// Sign, exponent and fraction move to their places in a float32, whose exponents count from 112 lower. No stored
+// number is subnormal. PoCL compiles vload_half() to a call.
+typedef ushort narrow;
+#define WIDEN(p) (as_float(((int)((uint)*(p) << 16) >> 3) & (int)0x8fffffff) * 0x1p112f)
+#define WIDEN8(p) \
+    (as_float8((as_int8(convert_uint8(LOAD8_USHORT(p)) << 16) >> 3) & (int)0x8fffffff) * 0x1p112f)
+#elif VALUES == 2
+typedef char narrow;
+#define WIDEN(p) ((real)*(p))
+#define WIDEN8(p) convert_float8(as_char8(LOAD8_UCHAR(p)))
+#else
+#error "tile.cl needs -DVALUES=<type of the numbers: 0 float32, 1 float16, 2 int8>"
+#endif
+
+// The scale that the numbers of tile j share: 5 bits of exponent and 3 of fraction.
+#if VALUES == 2
+#define SCALE(j) *as_float(((uint)scales[j] + 112 * 8) << 20)
+#define SCALE8(j) *as_float8((convert_uint8(LOAD8_UCHAR(scales + (j))) + 112 * 8) << 20)
+#else
+#define SCALE(j)
+#define SCALE8(j)
+#endif
+
+// Every `step`-th number from number `n` of the tiles on.
+static inline void tile_add(
+    real *sum, global const place *columns, global const narrow *values, global const uchar *scales,
+    global const real *x, int stride, int n, int end, int step)
+{
+    for (; n < end; n += step) {
+        const real v = WIDEN(values + n) SCALE(n / WIDTH);
+        const int i = (columns[n / WIDTH] + n % WIDTH) * stride;
+        for (int c = 0; c < K; ++c)
+            sum[c] = v * x[i + c] + sum[c];
+    }
+}
+
+static inline lanes tile_sum(
+    global const place *columns, global const narrow *values, global const uchar *scales, global const real *x,
+    int stride, int j, int end)
+{
+    lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;  // four sums hide the latency of the addition
+#if WIDTH == 1
+#define PRODUCT(j) ((lanes)(WIDEN(values + (j)) SCALE(j)) * LOAD(X(j)))
+#if K == 1
+    real8 eight = 0;
+    for (; j + 8 <= end; j += 8)
+        eight += WIDEN8(values + j) SCALE8(j)
+            * (real8)(*X(j), *X(j + 1), *X(j + 2), *X(j + 3), *X(j + 4), *X(j + 5), *X(j + 6), *X(j + 7));
+    s0 = sum8(eight);
+#endif
+    for (; j + 4 <= end; j += 4) {
+        s0 = PRODUCT(j) + s0;
+        s1 = PRODUCT(j + 1) + s1;
+        s2 = PRODUCT(j + 2) + s2;
+        s3 = PRODUCT(j + 3) + s3;
+    }
+    for (; j < end; ++j)
+        s0 = PRODUCT(j) + s0;
+#else
+#define TILE(j) (WIDEN8(values + (j) * 8) SCALE(j))
+#if K == 1
+    if (stride == 1) {
+        real8 t0 = 0, t1 = 0, t2 = 0, t3 = 0;
+        for (; j + 4 <= end; j += 4) {
+            t0 = TILE(j) * LOAD8(X(j)) + t0;
+            t1 = TILE(j + 1) * LOAD8(X(j + 1)) + t1;
+            t2 = TILE(j + 2) * LOAD8(X(j + 2)) + t2;
+            t3 = TILE(j + 3) * LOAD8(X(j + 3)) + t3;
+        }
+        for (; j < end; ++j)
+            t0 = TILE(j) * LOAD8(X(j)) + t0;
+        s0 = sum8((t0 + t1) + (t2 + t3));
+    }
+#endif
+    for (; j < end; ++j) {  // the K values of a pixel lie side by side: one wide load a number
+        global const real *y = X(j);
+        const real8 v = TILE(j);
+        s0 = (lanes)(v.s0) * LOAD(y) + s0;
+        s1 = (lanes)(v.s1) * LOAD(y + stride) + s1;
+        s2 = (lanes)(v.s2) * LOAD(y + 2 * stride) + s2;
+        s3 = (lanes)(v.s3) * LOAD(y + 3 * stride) + s3;
+        s0 = (lanes)(v.s4) * LOAD(y + 4 * stride) + s0;
+        s1 = (lanes)(v.s5) * LOAD(y + 5 * stride) + s1;
+        s2 = (lanes)(v.s6) * LOAD(y + 6 * stride) + s2;
+        s3 = (lanes)(v.s7) * LOAD(y + 7 * stride) + s3;
+    }
+#endif
+    return (s0 + s1) + (s2 + s3);
+}
 
 #define SLAB_ARGUMENTS \
     global const int *pointers, global const place *columns, global const narrow *values, global const uchar *scales
-#define ADD(first, step) \
-    tile_add( \
-        sum.item, columns, values, scales, x + offset, stride, pointers[row] * WIDTH + first, \
-        pointers[row + 1] * WIDTH, step)
 
 kernel void tile_matvec(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
-{
-    BY_ITEM(ADD(0, 1));
-}
-
-kernel void tile_matvec_stream(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
     BY_ITEM(sum.vector = tile_sum(columns, values, scales, x + offset, stride, pointers[row], pointers[row + 1]));
 }
 
 kernel void tile_matvec_group(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {
-    BY_GROUP(ADD(me, items));
+    const int row_begin = pointers[get_group_id(0)] * WIDTH, end = pointers[get_group_id(0) + 1] * WIDTH;
+    BY_GROUP(tile_add(sum.item, columns, values, scales, x + offset, stride, row_begin + me, end, items));
 }

@@ -1,10 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Vectors: what a solver does between two products, one work-item an element where nothing is added up.
-// Layout: k right-hand sides are row-major, count reals in all. ADJACENT: see common/columns.h; 1 if left out.
+// Layout: k right-hand sides are row-major, count reals in all. Items and partial sums: common/columns.h.
 
-#ifndef ADJACENT
-#define ADJACENT 1
-#endif
 #include "common/columns.h"
 
 kernel void vector_fill(int count, real value, global real *out)
@@ -30,16 +27,25 @@ kernel void vector_scale_rows(int count, int k, global const real *d, global con
         out[i] = d[i / k] * x[i];
 }
 
-// Sums of x y over the rows of each column, to sums (groups, k) from `first` on; items as common/columns.h has them.
-kernel void vector_dot(
-    int rows, int k, global const real *x, global const real *y, global real *sums, int first, local real *scratch)
+// Sums of left * right * weight over the rows of each column, for pair j = get_group_id(1), to partial sums from
+// `first` on: 4 bits of `pairs` name two of a, b and c. Where it is 0, left is a[j * rows * k] on, b for the last j,
+// and right is b. `weights` are like b and count where weighted == 1.
+kernel void vector_dots(
+    int rows, int k, int first, int pairs, int weighted, global const real *weights, global const real *a,
+    global const real *b, global const real *c, global real *partials, local real *scratch)
 {
     const share s = columns_share(rows, k);
-    columns_sum(dot_share(x, y, 0, s), sums + first + get_group_id(0) * k, 0, s, scratch);
+    const size_t j = get_group_id(1), count = get_num_groups(1);
+    const int codes = j < 8 ? pairs >> (4 * j) : 0, left = codes & 3, right = codes >> 2 & 3;
+    global const real *x = left == 0 ? a : left == 1 ? b : c, *y = right == 0 ? a : right == 1 ? b : c;
+    if (!pairs) {
+        x = j + 1 < count ? a + j * rows * k : b;
+        y = b;
+    }
+    global real *sums = partials + first + (get_group_id(0) * count + j) * k;
+    columns_sum(dot_share(x, y, weighted ? weights : 0, s), sums, 0, s, scratch);
 }
 
-#define LOAD1(a) (*(a))
-#define STORE1(v, a) (*(a) = (v))
 #define STEP(number, LOAD, STORE, i)                                                                \
     {                                                                                               \
         const number direction = LOAD(d + i), residual = LOAD(r + i) - LOAD(p + i);                 \

@@ -4,6 +4,7 @@
 //   walk_rows      a walk starts at a pixel and scores b at every step; sums over the samples of the pixel
 //   walk_columns   over the rows of R^T and one more, that of b, from which all walks start: a walk scores its weight
 //                  at the pixel where it ends; one record a sample
+//   walk_tables    the alias tables that both draw from; one work-item a row
 //
 // A step goes from i to j with probability |R_ij| / |R_i| and multiplies the weight by sign(R_ij) |R_i|; a row without
 // entries ends the walk. After step k it goes on with probability steps[k].y / 2^22; steps[k].x is c_k over the
@@ -14,8 +15,11 @@
 // wait for each other. Random numbers are a function of pixel, sample, step, stream and seed, samples are summed in
 // order, and arithmetic is + and * without contraction: no bit depends on WALKS, launches or devices above 2^-126.
 //
-// Layout: common/table.h. Chunk c of a pixel holds samples first + c CHUNK up to `end`. b is row-major with `stride`
-// columns, of which offset .. offset + K - 1 are taken, of one channel after the other. Out: (units, K) sums, squares.
+// Layout: a row has a record (x, y: place of its first entry, low word first; z: entries, 0 where there is nothing to
+// draw; w: its sum |R_i|, the bits of a real). An entry is one load of 64 bits:
+//   threshold 18 | own column 22, sign 1 | alias column 22, sign 1
+// Chunk c of a pixel holds samples first + c CHUNK up to `end`. b is row-major with `stride` columns, of which
+// offset .. offset + K - 1 are taken, of one channel after the other. Out: (units, K) sums, squares.
 
 #pragma OPENCL FP_CONTRACT OFF
 
@@ -23,21 +27,11 @@
 #error "walk.cl needs -DCHUNK, -DWALKS, -DK=<columns of b>, -DCHANNELS=<1 or 3>, -DLINKED=<0 or 1>"
 #endif
 
-#if WALKS % 4 == 0  // random numbers of four walks are made side by side
-typedef ulong4 words;
-#define LANES 4
-#define LOAD_WORDS(p) convert_ulong4(vload4(0, p))
-#define STORE_WORDS(v, p) vstore4(v, 0, p)
-#else
-typedef ulong words;
-#define LANES 1
-#define LOAD_WORDS(p) ((ulong) * (p))
-#define STORE_WORDS(v, p) (*(p) = (v))
-#endif
-
 #include "common/real.h"
-#include "common/table.h"
 
+#define THRESHOLD_BITS 18
+#define TARGET_BITS 23  // a column and its sign
+#define TARGET_MASK ((1u << TARGET_BITS) - 1)
 #define GO_ON_BITS 22
 #define SLOT_BITS 42  // the rest of 64
 
@@ -60,35 +54,33 @@ typedef struct {
 
 // The first half of a block of Philox4x32-10 (Salmon, Moraes, Dror and Shaw, Parallel Random Numbers: As Easy as 1, 2,
 // 3, SC 2011) of the counter (x, y, z, w).
-static inline words philox(words x, words y, words z, words w, ulong seed)
+static inline void philox(walks *walk, uint stream, ulong seed)
 {
-    for (uint round = 0; round < 10; ++round) {
-        const words a = 0xD2511F53ul * x, b = 0xCD9E8D57ul * z;
-        x = (b >> 32) ^ y ^ (ulong)((uint)seed + round * 0x9E3779B9u);
-        z = (a >> 32) ^ w ^ (ulong)((uint)(seed >> 32) + round * 0xBB67AE85u);
-        y = b & 0xfffffffful;
-        w = a & 0xfffffffful;
+    ulong x[WALKS], y[WALKS], z[WALKS], w[WALKS];
+    for (int i = 0; i < WALKS; ++i) {
+        x[i] = walk->pixel[i];
+        y[i] = walk->next[i] - 1;
+        z[i] = walk->step[i];
+        w[i] = stream;
     }
-    return y << 32 | x;
+    for (uint round = 0; round < 10; ++round)
+        for (int i = 0; i < WALKS; ++i) {
+            const ulong a = 0xD2511F53ul * x[i], b = 0xCD9E8D57ul * z[i];
+            x[i] = (b >> 32) ^ y[i] ^ (ulong)((uint)seed + round * 0x9E3779B9u);
+            z[i] = (a >> 32) ^ w[i] ^ (ulong)((uint)(seed >> 32) + round * 0xBB67AE85u);
+            y[i] = b & 0xfffffffful;
+            w[i] = a & 0xfffffffful;
+        }
+    for (int i = 0; i < WALKS; ++i)
+        walk->word[i] = y[i] << 32 | x[i];
 }
 
-static inline ulong first_entry(uint4 record)
-{
-    return (ulong)record.y << 32 | record.x;
-}
+#define FIRST_ENTRY(record) ((ulong)(record).y << 32 | (record).x)
 
 // A uniform choice of the entries of a row, by the upper bits of a word.
 static inline ulong slot(uint4 record, ulong word)
 {
-    return first_entry(record) + ((word >> GO_ON_BITS) * record.z >> SLOT_BITS);
-}
-
-// The column and sign of one entry of the row with this record.
-static inline uint draw(uint4 record, global const ulong *entries, ulong word)
-{
-    const ulong entry = entries[slot(record, word)], place = (word >> GO_ON_BITS) * record.z;
-    const uint fraction = (uint)(place >> (SLOT_BITS - THRESHOLD_BITS)) & ((1u << THRESHOLD_BITS) - 1);
-    return (uint)(fraction < (uint)(entry >> (2 * TARGET_BITS)) ? entry >> TARGET_BITS : entry) & TARGET_MASK;
+    return FIRST_ENTRY(record) + ((word >> GO_ON_BITS) * record.z >> SLOT_BITS);
 }
 
 static inline void set_out(walks *walk, int units, int chunks, uint first, uint end, global const uint *pixels)
@@ -118,28 +110,28 @@ static inline int draw_steps(
             walk->weight[c][w] = starts ? 1 : walk->weight[c][w];
         busy |= walk->alive[w];
     }
-    for (int w = 0; w < WALKS; w += LANES) {
-        const words x = LOAD_WORDS(walk->pixel + w), sample = LOAD_WORDS(walk->next + w) - 1;
-        STORE_WORDS(philox(x, sample, LOAD_WORDS(walk->step + w), stream, seed), walk->word + w);
-    }
+    philox(walk, stream, seed);
     for (int w = 0; w < WALKS; ++w) {
         walk->record[w] = rows[walk->row[w]];
         FETCH(entries + slot(walk->record[w], walk->word[w]));
     }
     for (int w = 0; w < WALKS; ++w) {
-        walk->target[w] = draw(walk->record[w], entries, walk->word[w]);
-        walk->factor[0][w] = walk->record[w].z ? as_float(walk->record[w].w) : 0;
+        const uint4 record = walk->record[w];
+        const ulong entry = entries[slot(record, walk->word[w])], place = (walk->word[w] >> GO_ON_BITS) * record.z;
+        const uint fraction = (uint)(place >> (SLOT_BITS - THRESHOLD_BITS)) & ((1u << THRESHOLD_BITS) - 1);
+        const bool own = fraction < (uint)(entry >> (2 * TARGET_BITS));
+        walk->target[w] = (uint)(own ? entry >> TARGET_BITS : entry) & TARGET_MASK;
+        walk->factor[0][w] = record.z ? as_float(record.w) : 0;
     }
 #if LINKED
     for (int w = 0; w < WALKS; ++w)
-        FETCH(links + first_entry(walk->record[w]) + (walk->target[w] >> 1));
+        FETCH(links + FIRST_ENTRY(walk->record[w]) + (walk->target[w] >> 1));
     for (int w = 0; w < WALKS; ++w) {
         const uint4 record = walk->record[w];
-        const uint4 link = record.z ? links[first_entry(record) + (walk->target[w] >> 1)] : (uint4)(0);
-        const real factors[3] = {as_float(link.y), as_float(link.z), as_float(link.w)};
+        const uint4 link = record.z ? links[FIRST_ENTRY(record) + (walk->target[w] >> 1)] : (uint4)(0);
         walk->target[w] = link.x << 1;
         for (int c = 0; c < CHANNELS; ++c)
-            walk->factor[c][w] = factors[c];
+            walk->factor[c][w] = as_float(c == 0 ? link.y : c == 1 ? link.z : link.w);
     }
 #endif
     for (int w = 0; w < WALKS; ++w) {
@@ -177,7 +169,7 @@ kernel void walk_rows(
     real score[WALKS][K] = {{0}};
     float2 sums[WALKS][K] = {{0}};
     set_out(&walk, units, chunks, first, end, pixels);
-    while (draw_steps(&walk, seed, stream, rows, entries, links, b, stride)) {
+    while (draw_steps(&walk, seed, stream, rows, entries, links, b, stride))
         for (int w = 0; w < WALKS; ++w) {
             if (!walk.alive[w])
                 continue;
@@ -193,7 +185,6 @@ kernel void walk_rows(
                 score[w][c] = 0;
             }
         }
-    }
     for (int unit = get_global_id(0) * WALKS, w = 0; w < WALKS && unit < units; ++w, ++unit)
         for (int c = 0; c < K; ++c)
             out[unit * K + c] = sums[w][c];
@@ -206,7 +197,7 @@ kernel void walk_columns(
 {
     walks walk = {{0}};
     set_out(&walk, units, units, first, end, pixel);
-    while (draw_steps(&walk, seed, stream, rows, entries, 0, 0, 0)) {
+    while (draw_steps(&walk, seed, stream, rows, entries, 0, 0, 0))
         for (int w = 0; w < WALKS; ++w) {
             real worth[CHANNELS] = {0};
             if (!walk.alive[w] || move(&walk, w, steps, worth))
@@ -217,5 +208,100 @@ kernel void walk_columns(
             walk.alive[w] = 0;
             walk.row[w] = walk.pixel[w];
         }
+}
+
+// Alias tables for drawing the entries of a row in proportion to |R_ij| (eq. 25): Walker's (1974), by one sweep over
+// light and heavy entries with the mass that the heavy one has left (L. Huebschle-Schneider and P. Sanders, Parallel
+// Weighted Random Sampling, ESA 2019), in integers. A row is scaled by the power of two that makes its sum C as large
+// as its length n allows; each of n bins has room for C, and entry t has the mass n |R_it|. Rounding moves less than
+// 2^-18 of a row's probability, in total variation, in rows of up to 2^20 entries.
+
+#define BIT_LENGTH(x) (64 - (int)clz((ulong)(x)))
+
+// |value| 2^(150 + shift) of the bits of a real, rounded to the nearest integer.
+static inline ulong scaled(uint value, int shift)
+{
+    const uint bits = value & 0x7fffffffu, exponent = bits >> 23;
+    const ulong significand = exponent ? (bits & 0x7fffffu) | 0x800000u : bits;
+    const int left = (int)max(exponent, 1u) + shift;
+    if (left >= 0)
+        return significand << left;
+    return left < -25 ? 0 : ((significand >> (-left - 1)) + 1) >> 1;
+}
+
+static inline ulong row_sum(global const uint *values, uint n, int shift)
+{
+    ulong sum = 0;
+    for (uint t = 0; t < n; ++t)
+        sum += scaled(values[t], shift);
+    return sum;
+}
+
+#define TARGET(t) ((ulong)(columns ? (uint)columns[t] : t) << 1 | values[t] >> 31)
+#define MASS(t) (n * scaled(values[t], shift))
+#define NEXT(t, test) \
+    do \
+        ++t; \
+    while (t < n && !(MASS(t) test capacity))
+
+static inline void fill_bins(
+    global const uint *values, global const int *columns, uint n, int shift, ulong capacity, global ulong *out)
+{
+    uint light = ~0u, heavy = ~0u;
+    NEXT(light, <=);
+    NEXT(heavy, >);
+    ulong left = heavy < n ? MASS(heavy) : 0;
+    while (light < n || heavy < n) {
+        uint own, other;
+        ulong mass = capacity;
+        if (heavy < n && left > capacity) {  // the light one's bin is filled up by the heavy one
+            own = light, other = heavy;
+            mass = MASS(light);
+            left -= capacity - mass;
+            NEXT(light, <=);
+        } else if (heavy < n) {  // what the heavy one has left is its own bin, filled up by the next
+            own = other = heavy;
+            mass = left;
+            NEXT(heavy, >);
+            if (heavy < n) {
+                left += MASS(heavy) - capacity;
+                other = heavy;
+            }
+        } else {  // no mass is lost on the way: these are full
+            own = other = light;
+            NEXT(light, <=);
+        }
+        ulong threshold = ((mass << THRESHOLD_BITS) + capacity / 2) / capacity;
+        if (threshold >> THRESHOLD_BITS) {
+            other = own;
+            threshold = 0;
+        }
+        out[own] = threshold << (2 * TARGET_BITS) | TARGET(own) << TARGET_BITS | TARGET(other);
     }
+}
+
+// Row `row` of a slab has its record at first + row; of dense rows `pointers` and `columns` are 0.
+kernel void walk_tables(
+    int rows, int first, ulong base, int width, global const int *pointers, global const int *columns,
+    global const uint *values, global uint4 *records, global ulong *entries)
+{
+    const int row = get_global_id(0);
+    if (row >= rows)
+        return;
+    const ulong begin = pointers ? (ulong)pointers[row] : (ulong)row * width, start = base + begin;
+    const uint n = pointers ? pointers[row + 1] - pointers[row] : width;
+    values += begin;
+    columns = columns ? columns + begin : 0;
+    uint largest = 0, sum = 0;
+    for (uint t = 0; t < n; ++t)
+        largest = max(largest, values[t] & 0x7fffffffu);
+    if (largest) {  // the sum gets as many bits as fit: n C must be below 2^63, C 2^18 as well
+        const int rough = 7 - (int)max(largest >> 23, 1u);  // the largest entry becomes a number of 31 bits
+        const int spare = min(45, 63 - BIT_LENGTH(n)) - 1 - BIT_LENGTH(row_sum(values, n, rough) + n);
+        const ulong capacity = row_sum(values, n, rough + spare);
+        fill_bins(values, columns, n, rough + spare, capacity, entries + start);
+        const real total = ldexp(convert_float(capacity), -150 - rough - spare);  // may be infinite
+        sum = total < 0x1p-126f ? 0 : as_uint(total);
+    }
+    records[first + row] = (uint4)((uint)start, (uint)(start >> 32), sum ? n : 0, sum);
 }

@@ -4,28 +4,26 @@
 //
 // A level halves both sides at once: from the values that the filters reach, two by two are made, or two by 2 PAIRS.
 // Items stride through pieces of K right-hand sides (dimension 0), pairs of columns (1) and of rows (2). A launch of
-// one level takes any number of groups; one of several, first .. last - 1, takes one group a piece, which waits for
-// itself between levels: for small pictures.
+// several levels, first .. last - 1, takes one group a piece, which waits for itself between levels.
 //
-// Required defines: K, the right-hand sides that an item handles together: 1, 2, 3, 4 or 8; TAPS, the length of the
-// filters, even; PAIRS, of columns together: 1, or 8 where K is 1 and one item takes all of a row.
-// Layout: a picture is row-major, its k right-hand sides side by side. Coefficients stand as PyWavelets'
-// coeffs_to_array puts them: of each side the approximation first, ceil(n / 2) of n. taps[2 * TAPS] is the
-// low-pass filter, then the high-pass one, in the order of the samples. near holds the approximations of the levels
-// 1 .. levels - 1 as pictures of their own, that of level i + 1 from pixel starts[i] on.
+// Required defines: K, see common/lanes.h; TAPS and PAIRS. Layout: a picture is row-major, its k right-hand sides side
+// by side. Coefficients stand as PyWavelets' coeffs_to_array puts them: of each side the approximation first,
+// ceil(n / 2) of n. taps[2 * TAPS] is the low-pass filter, then the high-pass one, in the order of the samples. near
+// holds the approximations of the levels 1 .. levels - 1, that of level i + 1 from pixel starts[i] on.
 //
 // A side that is `level` times halved has n = ceil(pixels / 2^level) samples, the last of which may stand for fewer
 // pixels than the others. It stays out of the filters; where an odd number of whole ones is left, the last two turn
 // into one of the approximation and a detail, by a rotation that takes a constant to the approximation alone.
 // Orthonormal, and a constant has one coefficient on any grid.
 
-#include "common/pieces.h"
+#include "common/lanes.h"
 
 #if !defined(TAPS) || !defined(PAIRS)
-#error "wavelet.cl needs -DTAPS=<length of the filters: 2, 4, 6, ...> and -DPAIRS=<of columns together: 1 or 8>"
+#error "wavelet.cl needs -DTAPS=<length of the filters: 2, 4, ...>, -DPAIRS=<of columns: 1, or 8 where K is 1, on CPUs>"
 #endif
 
 #define HALF (TAPS / 2)
+#define WRAPPED(i, n) (((i) % (n) + (n)) % (n))
 #define FIRST ((HALF + 1) % 2)  // where the samples of pair 0 begin that need the same coefficients
 
 // PAIRS neighbours, of samples every second one. At the edges all lanes hold the same, and the first one counts.
@@ -64,11 +62,6 @@ static inline side side_at(int pixels, int level)
     return a;
 }
 
-static inline int wrapped(int i, int n)
-{
-    return (i % n + n) % n;
-}
-
 // Term t of pair m. Of analysis: sample `low`, and its weights in approximation and detail. Of synthesis:
 // approximation `low`, detail `high`, and the weights of both in the first sample and in the second.
 typedef struct {
@@ -82,7 +75,7 @@ INLINE term split_term(side a, int m, int t, bool inside, constant real *taps)
     if (inside)
         return v;
     if (m < a.regular) {
-        v.low = wrapped(v.low, 2 * a.regular);
+        v.low = WRAPPED(v.low, 2 * a.regular);
         return v;
     }
     const bool two = a.n % 2 == 0;
@@ -99,7 +92,7 @@ INLINE term join_term(side a, int m, int t, bool inside, constant real *taps)
     if (inside)
         return v;
     if (m < a.regular) {
-        v.low = wrapped(i, a.regular);
+        v.low = WRAPPED(i, a.regular);
         v.high = a.pairs + v.low;
         return v;
     }

@@ -22,7 +22,7 @@ def finite(name: str, array: np.ndarray) -> np.ndarray:
     """Return `array` unchanged; refuse NaN and Inf with their number and first place."""
     # The sum is finite in almost every good case and reads the array once, without a mask.
     with np.errstate(over="ignore", invalid="ignore"):
-        if array.size == 0 or np.isfinite(np.sum(array, dtype=np.float64)):
+        if array.size == 0 or np.isfinite(np.sum(array)):
             return array
     bad = np.argwhere(~np.isfinite(array)).tolist()
     if bad:

@@ -42,8 +42,7 @@ def as_path(path: Any, name: str = "path") -> Path:
     try:
         return Path(path)
     except TypeError:
-        kind = type(path).__name__
-        raise InputTypeError(f"{name} is {path!r}; it must be a str or a path, not {kind}") from None
+        raise InputTypeError(f"{name} is {path!r}; it must be a str or a path") from None
 
 
 def refuse_appended(path: Path, comment: bytes) -> None:
@@ -143,17 +142,12 @@ def _written(path: str | os.PathLike[str]) -> Iterator[Path]:
         for folder in reversed(made):
             with contextlib.suppress(OSError):  # no longer empty: somebody else's by now
                 folder.rmdir()
-        if not isinstance(error, OSError) or isinstance(error, LtclError) or _elsewhere(error, target):
+        if not isinstance(error, OSError) or isinstance(error, LtclError):
             raise
+        place = Path(error.filename) if isinstance(error.filename, (str, Path)) else target
+        if not (place.is_relative_to(target.parent) or target.is_relative_to(place)):
+            raise  # about another file, which the block read
         raise _refusal(shown, "cannot be written", error) from error
-
-
-def _elsewhere(error: OSError, target: Path) -> bool:
-    """Whether an error is about a file that the block read, and not about `target` or a parent of it."""
-    if not isinstance(error.filename, (str, Path)):
-        return False
-    place = Path(error.filename)
-    return not (place.is_relative_to(target.parent) or target.is_relative_to(place))
 
 
 def _refusal(path: Path, what: str, error: Exception) -> FileError:

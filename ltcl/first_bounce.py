@@ -21,7 +21,7 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.device import Device
 from ltcl.errors import ConvergenceError, InputError, InputTypeError
-from ltcl.operators import Operator, interreflections
+from ltcl.operators import interreflections
 from ltcl.solvers import solve
 
 logger = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ _TOGETHER = 32  # probes in one solve
 
 
 def find(
-    matrices: Sequence[Any], requested: Any, device: Callable[[], Device], probes: int, seed: int
+    matrices: Sequence[Any], requested: Any, device: Callable[[], Device], probes: int = 128, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """F of each channel, (channels, N) float64, and the standard error of an estimate; of any sign."""
     n: int = matrices[0].shape[0]
@@ -95,34 +95,29 @@ def _estimate(
     """F and its standard error, (channels, N) float64 each; F is 0 where diag(T) is not positive."""
     F0 = np.maximum([_diagonal(T) for T in matrices], 0.0)
     F, error = np.zeros_like(F0), np.zeros_like(F0)
+    signs = np.random.default_rng(seed).choice(np.array([-1, 1], np.float32), (F0.shape[1], probes))
+    together = np.split(signs, range(_TOGETHER, probes, _TOGETHER), axis=1)
     for channel, S in enumerate(interreflections(matrices, F0, device)):
-        samples, left = _samples(S.as_it_stands(), probes, seed)
-        mean = samples.mean(axis=1, dtype=np.float64)
+        try:
+            solutions = [solve(S.as_it_stands(), z, "chebyshev", rtol=_RTOL) for z in together]
+        except ConvergenceError as failed:
+            raise InputError(
+                f"first_bounce is 'estimate', whose solves end at a residual {failed.solution.residual:.2g}: "
+                "T is far from that of a diffuse scene; give 'diagonal' or an array (N,)"
+            ) from failed
+        samples = signs * np.hstack([s.x for s in solutions])  # z_i (S^-1 z)_i, (N, probes)
+        mean, left = samples.mean(axis=1, dtype=np.float64), max(s.residual for s in solutions)
         spread = np.hypot(samples.std(axis=1, ddof=1, dtype=np.float64) / np.sqrt(probes), left)
         np.divide(F0[channel], mean, out=F[channel], where=mean > 0)
         np.divide(F[channel] * spread, mean, out=error[channel], where=mean > 0)
     return F, error
 
 
-def _samples(S: Operator, probes: int, seed: int) -> tuple[np.ndarray, float]:
-    """z_i (S^-1 z)_i of random signs z, (N, probes), and the largest relative residual of the solves."""
-    signs = np.random.default_rng(seed).choice(np.array([-1, 1], np.float32), (S.shape[0], probes))
-    some = np.split(signs, range(_TOGETHER, probes, _TOGETHER), axis=1)
-    try:
-        solutions = [solve(S, z, "chebyshev", rtol=_RTOL) for z in some]
-    except ConvergenceError as error:
-        raise InputError(
-            f"first_bounce is 'estimate', whose solves end at a residual of {error.solution.residual:.2g}: T "
-            "is far from that of a diffuse scene; give 'diagonal' or an array (N,)"
-        ) from error
-    return signs * np.hstack([s.x for s in solutions]), max(s.residual for s in solutions)
-
-
 def mask_dark(
     F: np.ndarray, grid: tuple[int, int], on_dark: str, may_mask: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """F with 0, and True (N,), where some channel's is not positive; refused unless it may be masked."""
-    dark: np.ndarray = np.any(F <= 0.0, axis=0)
+    dark: np.ndarray = np.any(F <= 1e-300, axis=0)  # 0 as well, whose inverse is no number
     pixels = np.flatnonzero(dark)
     if len(pixels) == len(dark):
         raise InputError(
@@ -132,7 +127,10 @@ def mask_dark(
     if not len(pixels) or may_mask:
         return np.where(dark, 0.0, F), dark
     first = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
-    advice = ("give on_dark='mask' to leave these pixels unlit", "mask this LinearOperator yourself")
+    advice = (
+        "give on_dark='mask' to leave these pixels unlit",
+        "make a Transport of an array with on_dark='mask', or mask this LinearOperator yourself",
+    )
     raise InputError(
         f"first_bounce is zero or negative at {len(pixels)} of {len(dark)} pixels (row, column): {first}"
         f"{', ...' if len(pixels) > 8 else ''}; it must be positive; {advice[on_dark == 'mask']}"

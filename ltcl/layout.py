@@ -24,7 +24,7 @@ UNITS = (  # of a warning
     "it is taken as linear light in the units of T; divide by %d if it is linear light; if it is an sRGB "
     "picture, read the file with ltcl.images.read"
 )
-_BLOCK = 2048  # pixels that are transposed at once: caches hold them
+_BLOCK = 4096  # pixels that are transposed at once: caches hold them
 _LARGEST_CONDITION = 1e6  # of a mixing: beyond, float32 has hardly a digit left
 
 
@@ -37,25 +37,27 @@ class Layout:
     colour: bool
 
     def pack(self, columns: Sequence[np.ndarray], grid: tuple[int, int]) -> np.ndarray:
-        """The picture whose right-hand sides are `columns`, one (N, k) a channel."""
+        """The picture whose right-hand sides are `columns`, one (N, k) a channel, or (3 N, k) of three."""
         frames, n = self.frames or 1, grid[0] * grid[1]
+        if len(columns[0]) != n:
+            columns = np.split(columns[0], 3)
         if len(columns) == 1:
-            values = np.reshape(columns[0], (n, frames, 3 if self.colour else 1)).transpose(1, 0, 2)
+            values = np.reshape(columns[0], (n, frames, 3 if self.colour else 1)).transpose(1, 0, 2).copy()
         else:
             values = np.empty((frames, n, 3), np.result_type(*columns))
-            step = _BLOCK if frames > 1 else n
-            for start in range(0, n, step):
+            for start in range(0, n, _BLOCK):
+                rows = slice(start, start + _BLOCK)
                 for channel, column in enumerate(columns):
-                    values[:, start : start + step, channel] = column[start : start + step].T
+                    values[:, rows, channel] = column[rows].T
         pixels = (n,) if self.flat else grid
         shape = (() if self.frames is None else (frames,)) + pixels + ((3,) if self.colour else ())
-        return np.ascontiguousarray(values).reshape(shape)
+        return values.reshape(shape)
 
 
 def unpack(name: str, picture: Any, grid: tuple[int, int], channels: int) -> tuple[list[np.ndarray], Layout]:
     """Cut a picture (N,), (h, w), (h, w, 3), or frames, into the right-hand sides (N, k) of each channel.
 
-    A grey picture serves all three channels. A warning where it holds the codes of a picture file.
+    Copies; a grey picture serves all three channels. A warning where it holds the codes of a picture file.
     """
     array = checks.finite(name, checks.real(name, picture))
     if array.dtype.kind in "iu" and array.size and array.max() > 1:
@@ -67,23 +69,21 @@ def unpack(name: str, picture: Any, grid: tuple[int, int], channels: int) -> tup
     n = grid[0] * grid[1]
     values = array.reshape(layout.frames or 1, n, -1)  # (frames, N, 1 or 3)
     if channels == 1:
-        return [np.ascontiguousarray(values.transpose(1, 0, 2)).reshape(n, -1)], layout
-    colours = [min(channel, values.shape[2] - 1) for channel in range(3)]
-    return [np.ascontiguousarray(values[..., colour].T) for colour in colours], layout
+        return [np.array(values.transpose(1, 0, 2), order="C").reshape(n, -1)], layout
+    columns = [np.empty((n, len(values)), values.dtype) for _ in range(3)]
+    for channel, column in enumerate(columns):
+        column[...] = values[..., min(channel, values.shape[2] - 1)].T
+    return columns, layout
 
 
 def _layout(name: str, array: np.ndarray, grid: tuple[int, int], channels: int) -> Layout:
     n = grid[0] * grid[1]
-    for shape, flat, colour in (((n,), True, False), (grid, False, False), ((*grid, 3), False, True)):
+    for shape, flat, colour in (((n,), True, False), ((*grid, 3), False, True), (grid, False, False)):
         if array.shape == shape:
             return Layout(flat, None, colour or channels == 3)
-    for shape, colour in ((grid, False), ((*grid, 3), True)):
-        if array.ndim > 2 and array.shape[1:] == shape and len(array):
-            return Layout(False, len(array), colour or channels == 3)
-    h, w = grid
-    raise InputError(
-        f"{name} has shape {array.shape}; it must be ({h}, {w}), ({h}, {w}, 3) or frames of these"
-    )
+        if not flat and array.shape[1:] == shape and len(array):
+            return Layout(flat, len(array), colour or channels == 3)
+    raise InputError(f"{name} has shape {array.shape}; it must be {grid}, {(*grid, 3)} or frames of these")
 
 
 def to_light(columns: Sequence[np.ndarray], F: np.ndarray, mixing: np.ndarray | None) -> list[np.ndarray]:
@@ -105,18 +105,16 @@ def matrices(value: Any, name: str = "matrix") -> tuple[Any, ...]:
     if len(channels) not in (1, 3):
         shape = f"shape {value.shape}" if isinstance(value, np.ndarray) else f"{len(channels)} channels"
         raise InputError(f"{name} has {shape}; it must be (M, N), or three of these for RGB, (3, M, N)")
-    names = [name] if len(channels) == 1 else [f"{name}[{channel}]" for channel in range(3)]
-    return _checked(name, dict(zip(names, channels, strict=True)))
+    return _checked(name, {f"{name}[{c}]" if channels[1:] else name: T for c, T in enumerate(channels)})
 
 
 def blocks(value: Any) -> tuple[tuple[Any, ...], ...] | None:
     """3 x 3 checked matrices of one shape, or None where `value` is no nested sequence or (3, 3, M, N)."""
-    rows = list(value) if isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) == 4 else []
-    nested = [isinstance(row, (list, tuple)) or getattr(row, "ndim", 0) == 3 for row in rows]
-    sizes = [len(row) if many else 1 for row, many in zip(rows, nested, strict=True)]
-    if not any(many and any(map(_is_matrix, row)) for row, many in zip(rows, nested, strict=True)):
+    rows = value if isinstance(value, (list, tuple)) or getattr(value, "ndim", 0) == 4 else []
+    rows = [row if isinstance(row, (list, tuple)) or getattr(row, "ndim", 0) == 3 else [] for row in rows]
+    if not any(any(map(_is_matrix, row)) for row in rows):
         return None
-    if sizes != [3, 3, 3]:
+    if (sizes := [len(row) or 1 for row in rows]) != [3, 3, 3]:
         raise InputError(f"matrix has rows of {sizes} matrices; it must be 3 x 3 of them, or 3, or one")
     named = {f"matrix[{c}][{d}]": block for c, row in enumerate(rows) for d, block in enumerate(row)}
     checked = _checked("matrix", named)
@@ -130,9 +128,8 @@ def mixing(value: Any, channels: int, coupled: Any) -> np.ndarray:
         raise InputError(f"mixing is given, but T has {kind}; it is for a T of 3 channels")
     M = checks.finite("mixing", checks.shape("mixing", checks.real("mixing", value), (3, 3)))
     M = M.astype(np.float64)
-    if not (condition := float(np.linalg.cond(M))) < _LARGEST_CONDITION:
-        most = f"{_LARGEST_CONDITION:g}"
-        raise InputError(f"mixing has the condition number {condition:.3g}; it must be below {most}")
+    if not (condition := float(np.linalg.cond(M))) < (most := _LARGEST_CONDITION):
+        raise InputError(f"mixing has the condition number {condition:.3g}; it must be below {most:g}")
     return M
 
 

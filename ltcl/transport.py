@@ -35,10 +35,10 @@ class Transport:
     Parameters
     ----------
     matrix : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3 for RGB, or 3 x 3 of them
-        T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j; pixels
-        are row-major. matrix[c][d] is what camera channel c sees of projector channel d; such a T has no S of
-        one channel, it relights and compensates. Of an operator S diag(F), as compressed transports are, S is
-        used as it stands. Arrays are kept, not copied: they must not be changed afterwards.
+        T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j, row-major.
+        matrix[c][d] is what camera channel c sees of projector channel d; such a T has no S, it relights and
+        compensates. Of an operator S diag(F), as compressed ones are, S is used as it stands. Arrays are
+        kept, not copied: they must not be changed afterwards.
     grid : (h, w)
         Of the projector; N = h * w.
     first_bounce : "diagonal", "exact", "estimate" or array (N,) or (3, N)
@@ -56,8 +56,8 @@ class Transport:
         Of the projector's colours, for a T of 3 channels: the light that channel c of T answers to is
         mixing[c] @ (red, green, blue) of the pattern.
     probes, seed : int
-        Of the estimate, whose error falls as 1 / sqrt(probes), each of about 20 products; at least 2. Compare
-        `first_bounce_error` with F - diag(T): with few, bounces may be worse than with the diagonal.
+        Of the estimate, at least 2 probes of about 20 products each; its error falls as 1 / sqrt(probes).
+        Compare `first_bounce_error` with F - diag(T): with few, bounces may be worse than with the diagonal.
 
     Attributes
     ----------
@@ -100,8 +100,8 @@ class Transport:
         seed: int = 0,
     ) -> None:
         self.blocks = layout.blocks(matrix)
-        diagonal = None if self.blocks is None else [self.blocks[c][c] for c in range(3)]
-        self.matrices = layout.matrices(matrix) if diagonal is None else tuple[Any, ...](diagonal)
+        diagonal = [row[c] for c, row in enumerate(self.blocks or ())]
+        self.matrices = tuple[Any, ...](diagonal or layout.matrices(matrix))
         self.channels = len(self.matrices)
         self.mixing = None if mixing is None else layout.mixing(mixing, self.channels, self.blocks)
         self.shape: tuple[int, int] = self.matrices[0].shape
@@ -120,14 +120,13 @@ class Transport:
         if (own := device_of(self.blocks or [self.matrices], device)) is not None:
             self.device = own
         self._F: np.ndarray | None = None  # (channels, N)
-        self._is_diagonal = isinstance(first_bounce, str) and first_bounce == "diagonal"
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
         if self.is_square:
             F, error = _first_bounce.find(self.matrices, first_bounce, lambda: self.device, probes, seed)
             may_mask = on_dark == "mask" and all(map(maskable, self.matrices))
             self._F, self.masked = _first_bounce.mask_dark(F, self.grid, on_dark, may_mask)
             self.first_bounce_error = error[0] if error is not None and self.channels == 1 else error
-        elif not self._is_diagonal:
+        elif not isinstance(first_bounce, str) or first_bounce != "diagonal":
             kind = self.shape if self.blocks is None else "of 3 x 3 blocks"
             raise InputError(f"first_bounce is given, but T is {kind}; only a square T of channels has one")
 
@@ -211,7 +210,7 @@ class Transport:
 
     @cached_property
     def operators(self) -> tuple[Operator, ...]:
-        """T of each channel on the device, or one `Coupled` of all; see `join`."""
+        """T of each channel on the device, or one `Coupled` of all, channel below channel."""
         if self.blocks is not None:
             return (Coupled([[as_operator(T, self.device) for T in row] for row in self.blocks]),)
         own = tuple(self._operator(channel) for channel in range(self.channels))
@@ -222,40 +221,28 @@ class Transport:
         T = self.matrices[channel]
         if self._F is not None and not self.masked.any() and not isinstance(T, Operator):
             F = self._F[channel]
-            if self._is_diagonal or (
-                hasattr(T, "diagonal") and np.all(np.asarray(T.diagonal()) >= _CANCELLATION * F)
-            ):
+            if hasattr(T, "diagonal") and np.all(np.asarray(T.diagonal()) >= _CANCELLATION * F):
                 return ScaledColumns(self.systems[channel], F)
         return as_operator(T, self.device)
-
-    def join(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """What `operators` take, of one (N, k) a channel: the same, or all below each other, (3 N, k)."""
-        return [np.concatenate(columns)] if self.couples else list(columns)
-
-    def split(self, joined: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The reverse of `join`."""
-        return np.split(joined[0], 3) if self.couples else list(joined)
 
     def __matmul__(self, pattern: Any) -> np.ndarray:
         """Relight: the picture (float32) under `pattern`, frames and colours as in `ltcl.relight`."""
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
-        pictures = [T.matmat(x) for T, x in zip(self.operators, self.join(columns), strict=True)]
-        return shape.pack(self.split(pictures), self.camera_grid)
+        columns = [np.concatenate(columns)] if self.couples else columns
+        pictures = [T.matmat(x) for T, x in zip(self.operators, columns, strict=True)]
+        return shape.pack(pictures, self.camera_grid)
 
     def to_light(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 at masked pixels."""
         return layout.to_light(columns, self._require_first_bounce(), self.mixing)
 
     def _require_first_bounce(self) -> np.ndarray:
-        if self.blocks is not None:
-            raise InputError(
-                "T has blocks between colours, no S of one channel; it can relight and compensate"
-            )
         if self._F is None:
             projector, camera = (f"{h} x {w}" for h, w in (self.grid, self.camera_grid))
+            maps = f"maps a projector of {projector} pixels to a camera of {camera}"
             raise InputError(
-                f"T maps a projector of {projector} pixels to a camera of {camera}; S = T F^-1 needs both on "
-                "one grid, this T can only relight and compensate"
+                f"T {maps if self.blocks is None else 'has blocks between colours'}; S = T F^-1 needs one "
+                "grid and no blocks, this T can only relight and compensate"
             )
         return self._F
 
@@ -298,9 +285,9 @@ def require_inverse(T: Transport, inverse: Any, rtol: float | None, **others: An
     deviation = float(max(misses) / np.linalg.norm(v))
     allowed = inverse.error + T.error * (1.0 + inverse.error) + _ROUNDING
     if not deviation <= allowed:
-        most = f"{deviation:.2g}, which may be {checks.upwards(allowed)} at most"
         raise InputError(
-            f"inverse is not that of T: light comes back off by {most}; make it with ltcl.invert(T)"
+            f"inverse is not that of T: light comes back off by {deviation:.2g}, which may be "
+            f"{checks.upwards(allowed)} at most; make it with ltcl.invert(T)"
         )
     T._inverses.add(inverse)
 
@@ -314,8 +301,8 @@ def default_rtol(least: float, T: Transport, exact: Any = None, inverse: Inverse
 def to_arrays(T: Transport) -> dict[str, np.ndarray]:
     """The arrays of a compressed T, whose every channel is S diag(d), by name: files and pickles hold these.
 
-    Those of `ltcl.operators.stored`, grid (2,), first_bounce (channels, N), mixing (3, 3) where colours mix,
-    and columns_0, ... (N,) of channels with another d than the first bounce.
+    Those of `ltcl.operators.stored`, grid (2,), first_bounce (channels, N), mixing (3, 3) if any, and
+    columns_0, ... (N,) of channels with another d than the first bounce.
     """
     systems = [S for S in map(made_with, T.matrices) if S is not None]
     if not T.is_square or len(systems) < T.channels:

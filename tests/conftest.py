@@ -50,6 +50,14 @@ def small_device(device: Device) -> Device:
     return small
 
 
+@pytest.fixture(scope="module", params=["cpu", "gpu"])
+def shaped(request: pytest.FixtureRequest, device: Device) -> Device:
+    """The same hardware; kernels are launched as on a CPU or as on a GPU."""
+    other = Device(device.description)
+    other.kind = request.param
+    return other
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Captures that are not part of the project; they lie beside the checkout, where they exist."""

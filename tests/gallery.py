@@ -32,12 +32,6 @@ def bounces(n: int, rho: float, seed: int = 0) -> np.ndarray:
     return (R * (rho / np.abs(np.linalg.eigvals(R)).max())).astype(np.float32)
 
 
-def two_pixels(a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
-    """S = [[1, a], [b, 1]] of two pixels that light each other, and its inverse in closed form."""
-    inverse = np.array([[1.0, -a], [-b, 1.0]]) / (1.0 - a * b)
-    return np.array([[1.0, a], [b, 1.0]]), inverse
-
-
 def _stretches() -> scipy.sparse.csr_array:
     """Runs of neighbours around 16 and 32 long, at odd starts, whole and with one pixel missing."""
     A = np.zeros((24, 97), np.float32)
@@ -75,14 +69,6 @@ SPARSE = {
     "strong rows": _strong_rows(),
 }
 
-DENSE = {
-    "1x1": np.array([[0.5]], np.float32),
-    "53x7": signed(53, 7),
-    "7x53": signed(7, 53),
-    "1x300": signed(1, 300),
-    "300x1": signed(300, 1),
-    "32x32": signed(32, 32),
-    "65x129": signed(65, 129),
-    "9x63": signed(9, 63),
-    "zeros": np.zeros((17, 9), np.float32),
-}
+_SHAPES = ((53, 7), (7, 53), (1, 300), (300, 1), (32, 32), (65, 129), (9, 63))
+DENSE = {f"{rows}x{columns}": signed(rows, columns) for rows, columns in _SHAPES}
+DENSE |= {"1x1": np.array([[0.5]], np.float32), "zeros": np.zeros((17, 9), np.float32)}

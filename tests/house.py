@@ -22,6 +22,7 @@ from ltcl.device import Device
 ROOT = Path(__file__).resolve().parents[1]
 CORE = 11_500
 
+_TASKS = [f"ltcl/{name}" for name in ("compensation", "separation.py", "relighting.py", "analysis.py")]
 # Lines at most, by the folders and modules that they are of: the Python of the core, and what belongs to it.
 BUDGETS: dict[str, tuple[int, list[str]]] = {
     "device": (900, ["ltcl/device"]),
@@ -29,19 +30,16 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "solvers": (2800, ["ltcl/solvers"]),
     "theory and diagnostics": (1100, ["ltcl/theory", "ltcl/diagnostics.py"]),
     "compression": (1500, ["ltcl/compression"]),
-    "compensation, separation, relighting, analysis": (
-        1300,
-        ["ltcl/compensation", "ltcl/separation.py", "ltcl/relighting.py", "ltcl/analysis.py"],
-    ),
+    "compensation, separation, relighting, analysis": (1300, _TASKS),
     "transport and the rest": (1300, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
 _TESTS = (
-    "analysis checks compensation diagnostics exact files first_bounce interrupts layers layout products "
-    "public_calls relighting report separation transport warnings"
+    "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
+    "separation transport warnings"
 )
 _BENCHES = (
-    "_boxes _corner _harness _kept _peers _ways claims csr dense4k launches products relax "
+    "_boxes _coefficients _corner _harness _peers _ways claims csr dense4k launches products relax "
     "resolution131k solve video walk"
 )
 BESIDE: dict[str, tuple[int, list[str]]] = {
@@ -55,17 +53,8 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     "benches of the core": (2000, [f"bench/{name}.py" for name in _BENCHES.split()]),
 }
 
-# Where a budget is not met yet: lines, files and frames reached, which nothing may exceed again.
-REACHED: dict[str, int] = {
-    "operators": 2693,
-    "solvers": 3108,
-    "transport and the rest": 1324,
-    "kernels": 2358,
-    "tests of the core": 10797,
-    "benches of the core": 2151,
-    "core": 11856,
-    "compensate back": 19,
-}
+# Where a budget is not met yet: what is reached, which nothing may exceed again.
+REACHED: dict[str, int] = {"kernels": 2056}
 
 
 def lines(places: list[str]) -> int:

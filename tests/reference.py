@@ -1,40 +1,35 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """NumPy twins, in float64, of every OpenCL kernel, and how far float32 may stray from them.
 
-A twin is named after its kernel; the `_stream` and `_group` variants of a kernel have the same twin.
+A twin is named after its kernel; the `_group` variant of a kernel has the same twin.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from fractions import Fraction
-from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 UNIT = 2.0**-24  # largest relative error of rounding to float32
 _LEAVES = 4096  # work-items among which the dot product spreads its rows, where there are that many
 
 
 def csr_matvec(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """A x, row by row; x is (N,) or (N, k)."""
-    rows, values = itertools.pairwise(pointers), np.asarray(values, np.float64)
-    return np.array([values[start:stop] @ x[columns[start:stop]] for start, stop in rows])
+    """A x; x is (N,) or (N, k)."""
+    matrix = (np.asarray(values, np.float64), columns, pointers)
+    return scipy.sparse.csr_array(matrix, shape=(len(pointers) - 1, len(x))) @ x
 
 
 def tile_matvec(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray, x: np.ndarray) -> np.ndarray:
     """A x; columns are the first of each tile, values (tiles, width)."""
-    sums = np.zeros((len(pointers) - 1, *x.shape[1:]))
-    for row, (start, stop) in enumerate(itertools.pairwise(pointers)):
-        for tile in range(start, stop):
-            sums[row] += values[tile] @ x[columns[tile] : columns[tile] + values.shape[1]]
-    return sums
+    width = values.shape[1]
+    places = columns[:, None] + np.arange(width)
+    return csr_matvec(pointers * width, places.ravel(), values.ravel(), x)
 
 
-def dense_matvec(
-    matrix: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
-) -> np.ndarray:
+def dense_matvec(matrix, x, scale: float = 1.0, add: np.ndarray | None = None) -> np.ndarray:
     """out = scale * (A x) + add."""
     out = scale * (np.asarray(matrix, np.float64) @ np.asarray(x, np.float64))
     return out if add is None else out + add
@@ -63,11 +58,9 @@ def vector_dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.atleast_1d(np.sum(np.asarray(x, np.float64) * np.asarray(y, np.float64), axis=0))
 
 
-def vector_step(
-    p, x, r, d, keep: float, gain: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def vector_step(p, x, r, d, keep: float, gain: float) -> tuple[np.ndarray, ...]:
     """x + d, r - p, keep d + gain (r - p), and the squares of r - p added up, (k,)."""
-    p, x, r, d = (np.asarray(v, np.float64) for v in (p, x, r, d))
+    p, x, r, d = _float64(p, x, r, d)
     return x + d, r - p, keep * d + gain * (r - p), vector_dot(r - p, r - p)
 
 
@@ -76,24 +69,13 @@ def vector_sums(sums: np.ndarray) -> np.ndarray:
     return np.sum(np.asarray(sums, np.float64), axis=1)
 
 
-def relax_rows(
-    S: np.ndarray, split: np.ndarray, x: np.ndarray, y: np.ndarray, b: np.ndarray, carry: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def relax_rows(S: np.ndarray, split: np.ndarray, x, y, b, carry) -> tuple[np.ndarray, np.ndarray]:
     """r and the next carry of a sweep from x to y, with row i split before column split[i]."""
     lower = np.where(np.arange(len(S)) < split[:, None], S, 0.0)
     return carry - (S - lower) @ x, b - lower @ y
 
 
-def relax_strips(
-    S: np.ndarray,
-    block: int,
-    omega: float | None,
-    x: np.ndarray,
-    b: np.ndarray,
-    carry: np.ndarray,
-    *,
-    in_place: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def relax_strips(S, block: int, omega, x, b, carry, *, in_place: bool) -> tuple[np.ndarray, ...]:
     """The next iterate, r and the next carry; of block Gauss-Seidel where omega is None."""
     y = block_gauss_seidel(S, x, b, block) if omega is None else sor(S, x, b, omega)
     i = np.arange(len(S))
@@ -109,30 +91,23 @@ def relax_windows(M: np.ndarray, block: int, panel: int, *, inverses: bool) -> n
     """The first entry of each row from its panel on, and from its block or its diagonal on, (N, 2)."""
     i = np.arange(len(M))
     edges = np.stack([i - i % panel, i - i % block if inverses else i], axis=1)
-    counts = [[np.count_nonzero(row[:edge]) for edge in pair] for row, pair in zip(M, edges, strict=True)]
-    starts = np.concatenate([[0], np.cumsum(np.count_nonzero(M, axis=1))[:-1]])
-    return starts[:, None] + np.array(counts)
+    before = np.cumsum(np.pad(M != 0, ((0, 0), (1, 0))), axis=1)  # entries of a row, left of each column
+    starts = np.cumsum(before[:, -1]) - before[:, -1]
+    return starts[:, None] + np.take_along_axis(before, edges, axis=1)
 
 
-def block_gauss_seidel(
-    S: np.ndarray, x: np.ndarray, b: np.ndarray, block: int, sweeps: int = 1
-) -> np.ndarray:
+def block_gauss_seidel(S: np.ndarray, x, b, block: int, sweeps: int = 1, omega: float = 1.0) -> np.ndarray:
     """Sweeps of block Gauss-Seidel as in a textbook, block after block in place."""
     x = np.array(x, np.float64)
-    for _ in range(sweeps):
-        for start in range(0, len(x), block):
-            B = slice(start, start + block)
-            x[B] += np.linalg.solve(S[B, B], b[B] - S[B] @ x)
+    for start in [*range(0, len(x), block)] * sweeps:
+        B = slice(start, start + block)
+        x[B] = relax_correct(omega * np.linalg.inv(S[B, B]), b[B] - S[B] @ x, x[B])
     return x
 
 
-def sor(S: np.ndarray, x: np.ndarray, b: np.ndarray, omega: float = 1.0, sweeps: int = 1) -> np.ndarray:
-    """Sweeps of SOR as in a textbook, row after row in place; with omega = 1 of Gauss-Seidel."""
-    x = np.array(x, np.float64)
-    for _ in range(sweeps):
-        for i in range(len(x)):
-            x[i] += omega * (b[i] - S[i] @ x) / S[i, i]
-    return x
+def sor(S: np.ndarray, x, b, omega: float = 1.0, sweeps: int = 1) -> np.ndarray:
+    """Sweeps of SOR, row after row in place; with omega = 1 of Gauss-Seidel."""
+    return block_gauss_seidel(S, x, b, 1, sweeps, omega)
 
 
 def southwell_step(S: np.ndarray, parts: int, x: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -157,73 +132,17 @@ def philox(counters: np.ndarray, seed: int) -> np.ndarray:
     return np.stack(c, axis=1).astype(np.uint32)
 
 
-def _scaled(values: np.ndarray, shift: int) -> list[int]:
-    """|value| 2^shift rounded half up, exactly."""
-    exact = (Fraction(float(abs(value))) * Fraction(2) ** shift for value in values)
-    return [math.floor(value + Fraction(1, 2)) for value in exact]
+def walk_tables(columns: np.ndarray, values: np.ndarray, n: int) -> tuple[int, np.float32, np.ndarray]:
+    """Entries that count, |R_i|, and the chance to draw each column with each sign, (n, 2)."""
+    sizes = np.abs(values.astype(np.float64))
+    exact, chances = math.fsum(sizes), np.zeros((n, 2))
+    if np.float32(exact) < np.finfo(np.float32).tiny:
+        return 0, np.float32(0), chances
+    np.add.at(chances, (columns, np.signbit(values).astype(int)), sizes / exact)
+    return len(values), np.float32(exact), chances
 
 
-def _integers(values: np.ndarray) -> tuple[list[int], Fraction]:
-    """The row scaled by a power of two so that its sum has as many bits as fit, and its sum unscaled."""
-    n, largest = len(values), float(np.max(np.abs(values)))
-    exponent = max(math.frexp(largest)[1], -125)  # of the smallest normal float32
-    budget = min(45, 63 - n.bit_length())
-    rough = 31 - exponent
-    shift = rough + budget - 1 - (sum(_scaled(values, rough)) + n).bit_length()
-    scaled = _scaled(values, shift)
-    return scaled, Fraction(sum(scaled)) / Fraction(2) ** shift
-
-
-def _alias(n: int, masses: list[int], capacity: int, targets: list[int]) -> list[int]:
-    """Table entries by one sweep, as Huebschle-Schneider and Sanders describe it, algorithm 4."""
-    light = [t for t in range(n) if masses[t] <= capacity] + [n]
-    heavy = [t for t in range(n) if masses[t] > capacity] + [n]
-    i = j = 0
-    left = masses[heavy[0]] if heavy[0] < n else 0
-    bins = [0] * n
-
-    def put(own: int, mass: int, other: int) -> None:
-        threshold = (mass * 2**18 + capacity // 2) // capacity
-        whole = threshold == 2**18
-        bins[own] = (0 if whole else threshold) << 46 | targets[own] << 23 | targets[own if whole else other]
-
-    while heavy[j] < n:
-        if left > capacity:
-            put(light[i], masses[light[i]], heavy[j])
-            left -= capacity - masses[light[i]]
-            i += 1
-        else:
-            following = heavy[j + 1]
-            put(heavy[j], left, following if following < n else heavy[j])
-            left += masses[following] - capacity if following < n else 0
-            j += 1
-    for t in light[i:-1]:
-        put(t, capacity, t)
-    return bins
-
-
-def alias_rows(columns: np.ndarray, values: np.ndarray) -> tuple[int, np.float32, list[int]]:
-    """Entries that count, |R_i| and the table of one row."""
-    n = len(values)
-    if not np.any(values):
-        return 0, np.float32(0), []
-    scaled, exact = _integers(values)
-    total = np.float32(float(exact))
-    count = n if total >= np.finfo(np.float32).tiny else 0
-    targets = [int(c) << 1 | int(np.signbit(v)) for c, v in zip(columns, values, strict=True)]
-    table = _alias(n, [n * mass for mass in scaled], sum(scaled), targets)
-    return count, total if count else np.float32(0), table
-
-
-def walk(
-    tables: tuple[Any, ...],
-    steps: np.ndarray,
-    b: np.ndarray | None,
-    pixels: np.ndarray,
-    samples: np.ndarray,
-    seed: int,
-    stream: int,
-) -> tuple[np.ndarray, np.ndarray]:
+def walk(tables, steps, b, pixels, samples, seed: int, stream: int) -> tuple[np.ndarray, np.ndarray]:
     """Walks from pixels[w], sample samples[w], all at once: scores (w, k) float32, and ends (w,).
 
     `tables` are records, entries, channels and links or None; column j of b is of channel j % channels. steps
@@ -258,16 +177,7 @@ def walk(
     return scores, row
 
 
-def walk_rows(
-    tables: tuple[Any, ...],
-    steps: np.ndarray,
-    b: np.ndarray,
-    pixels: np.ndarray,
-    samples: np.ndarray,
-    seed: int,
-    stream: int,
-    chunk: int,
-) -> np.ndarray:
+def walk_rows(tables, steps, b, pixels, samples, seed: int, stream: int, chunk: int) -> np.ndarray:
     """Sum and sum of squares of each chunk, (P, chunks, k, 2) float32."""
     count = len(samples)
     which = np.repeat(pixels, count), np.tile(samples, len(pixels))
@@ -278,9 +188,7 @@ def walk_rows(
     return np.stack(in_order, axis=1)
 
 
-def walk_columns(
-    tables: tuple[Any, ...], steps: np.ndarray, source: int, samples: np.ndarray, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
+def walk_columns(tables, steps, source: int, samples, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Where samples from row `source` end, and what they bring there, float32."""
     scores, ends = walk(tables, steps, None, np.full(len(samples), source), samples, seed, 0)
     return ends, scores[:, 0]
@@ -309,9 +217,7 @@ def _linked(links: np.ndarray, records: np.ndarray, target: np.ndarray) -> tuple
     return link[:, 0].astype(np.int64) << 1, np.ascontiguousarray(link[:, 1:]).view(np.float32)
 
 
-def form_factor_pair(
-    p: np.ndarray, q: np.ndarray, n: np.ndarray, m: np.ndarray, clip: bool = True
-) -> np.ndarray:
+def form_factor_pair(p, q, n, m, clip: bool = True) -> np.ndarray:
     """cos cos / (pi r^2) of all points p (M, 3) with normals n and points q (N, 3) with normals m: (M, N)."""
     d = q[None] - p[:, None]
     r2 = (d**2).sum(axis=2)
@@ -325,9 +231,7 @@ def form_factor_pairs(G: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray
     return G[i, j]
 
 
-def form_factor_entries(
-    geometry: np.ndarray, blocks: np.ndarray, outer: float = 64, inner: float = 12
-) -> np.ndarray:
+def form_factor_entries(geometry, blocks, outer: float = 64, inner: float = 12) -> np.ndarray:
     """G (N, N) of what the kernel reads: geometry (13, N), blocks (B, 6); see `kernels/form_factor.cl`."""
     centre, right, down, normal = (geometry[3 * k : 3 * k + 3].T.astype(np.float64) for k in range(4))
     angle = np.arange(8) * np.pi / 4
@@ -339,17 +243,15 @@ def form_factor_entries(
 
     eight = sum(between(points[k], points[3 * k % 8]) for k in range(8)) / 8
     one = between(centre, centre)
+
     # Half the second derivative along each edge times its variance, 1 / 12, by differences.
-    curved, step = form_factor_pair(centre, centre, normal, normal, clip=False), 1e-2
-    middle = curved.copy()
-    for edge in (right, down):
-        for end in (-step * edge, step * edge):
-            curved += (form_factor_pair(centre + end, centre, normal, normal, clip=False) - middle) / (
-                24 * step**2
-            )
-            curved += (form_factor_pair(centre, centre + end, normal, normal, clip=False) - middle) / (
-                24 * step**2
-            )
+    def smooth(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return form_factor_pair(p, q, normal, normal, clip=False)
+
+    curved, step = smooth(centre, centre), 1e-2
+    ends = [move for edge in (step * right, step * down) for move in (-edge, edge)]
+    bends = [smooth(centre + e, centre) + smooth(centre, centre + e) - 2 * curved for e in ends]
+    curved = curved + sum(bends) / (24 * step**2)
     curved *= ~blocked(centre[:, None], centre[None], blocks)
     d = centre[None] - centre[:, None]
     height = np.einsum("mnc,mc->mn", d, normal)
@@ -366,9 +268,7 @@ def form_factor_weigh(right: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (right * np.asarray(x, np.float64).T).reshape(-1, len(right))
 
 
-def form_factor_matvec(
-    G: np.ndarray, left: np.ndarray, right: np.ndarray, x: np.ndarray, scale: float, add: np.ndarray | None
-) -> np.ndarray:
+def form_factor_matvec(G, left, right, x, scale: float, add: np.ndarray | None) -> np.ndarray:
     """out = scale * diag(left) G diag(right) x + add."""
     return dense_matvec(left[:, None] * G * right, x, scale, add)
 
@@ -392,9 +292,7 @@ def blocked(p: np.ndarray, q: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     return result
 
 
-def visibility_rows(
-    starts: np.ndarray, ends: np.ndarray, normals: np.ndarray, blocks: np.ndarray
-) -> np.ndarray:
+def form_factor_visible(starts, ends, normals, blocks: np.ndarray) -> np.ndarray:
     """Of the rays from starts to ends (rays, 3, N) before both normals (3, N), the share that meet no box."""
     faced, count = np.zeros((2, starts.shape[2], ends.shape[2]))
     for a, b in zip(starts.astype(np.float64), ends.astype(np.float64), strict=True):
@@ -413,9 +311,7 @@ def gamma(roundings: float) -> float:
     return roundings * UNIT / (1.0 - roundings * UNIT)
 
 
-def product_error(
-    matrix: np.ndarray, x: np.ndarray, scale: float = 1.0, add: np.ndarray | None = None
-) -> np.ndarray:
+def product_error(matrix, x, scale: float = 1.0, add: np.ndarray | None = None) -> np.ndarray:
     """Largest error of float32 in each value of out = scale * (A x) + add, in whatever order it sums.
 
     A sum of n products passes through n roundings at most, `scale` and `add` bring two each and a composed
@@ -437,22 +333,18 @@ def dot_error(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return gamma(roundings) * vector_dot(np.abs(x), np.abs(y))
 
 
-def krylov_pairs(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray) -> np.ndarray:
+def vector_dots(pairs: list[tuple[np.ndarray, np.ndarray]], weights: np.ndarray) -> np.ndarray:
     """sum_i weights_i x_i y_i of every column for each pair."""
     return np.stack([np.sum(weights.astype(np.float64) * x * y, axis=0) for x, y in pairs])
 
 
-def krylov_subtract(
-    V: np.ndarray, w: np.ndarray, h: np.ndarray, square: np.ndarray | None = None
-) -> np.ndarray:
+def krylov_subtract(V, w, h, square: np.ndarray | None = None) -> np.ndarray:
     """w - sum_j h_j v_j with h (J, k); of length 1 where `square`, <w, w> of orthonormal v_j, is given."""
     left = w - np.einsum("jk,jnk->nk", h, V, dtype=np.float64)
     return left if square is None else left / np.sqrt(square - np.sum(h.astype(np.float64) ** 2, axis=0))
 
 
-def krylov_cg(
-    sums: np.ndarray, previous: np.ndarray, last: np.ndarray, moves: np.ndarray, *vectors: np.ndarray
-) -> tuple[np.ndarray, ...]:
+def krylov_cg(sums, previous, last, moves, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
     """alpha (k,), then p, q, x and r after a step, of w, p, q, x and r before; sums <r, r> and <w, r>."""
     (square, product), (w, p, q, x, r) = sums, (v.astype(np.float64) for v in vectors)
     beta = square / previous
@@ -467,9 +359,7 @@ def krylov_half(rho: np.ndarray, sigma: np.ndarray, r: np.ndarray, v: np.ndarray
     return r - rho / sigma * v.astype(np.float64)
 
 
-def krylov_bicgstab(
-    sums: np.ndarray, rho: np.ndarray, alpha: np.ndarray, *vectors: np.ndarray
-) -> tuple[np.ndarray, ...]:
+def krylov_bicgstab(sums, rho, alpha, *vectors: np.ndarray) -> tuple[np.ndarray, ...]:
     """The next rho (k,), then x, r and p of s, t, v, p and x; sums <t, s>, <t, t>, <r*, s> and <r*, t>."""
     (ts, tt, shadow_s, shadow_t), (s, t, v, p, x) = sums, (u.astype(np.float64) for u in vectors)
     omega = ts / tt
@@ -479,28 +369,16 @@ def krylov_bicgstab(
     return following, x + alpha * p + omega * s, r, r + beta * (p - omega * v)
 
 
-def bounded_look(
-    lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray, h: np.ndarray
-) -> np.ndarray:
+def bounded_look(lower, upper, x, g, h) -> np.ndarray:
     """Gap and z.h of every column, (2, k); bounds are (N,), the rest (N, k)."""
-    lower, upper, x, g, h = (np.asarray(part, np.float64) for part in (lower, upper, x, g, h))
-    lower, upper = lower[:, None], upper[:, None]
+    lower, upper, x, g, h = _float64(lower[:, None], upper[:, None], x, g, h)
     gap = np.maximum(g * (x - lower), g * (x - upper))
     return np.stack([gap.sum(axis=0), (_free(lower, upper, x, g) * h).sum(axis=0)])
 
 
-def bounded_direction(
-    alpha: np.ndarray,
-    beta: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    x: np.ndarray,
-    g: np.ndarray,
-    d: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+def bounded_direction(alpha, beta, lower, upper, x, g, d) -> tuple[np.ndarray, np.ndarray]:
     """d (N, k); then g.d, d.d and the largest share of the way to a bound of every column, (3, k)."""
-    lower, upper, x, g, d = (np.asarray(part, np.float64) for part in (lower, upper, x, g, d))
-    lower, upper = lower[:, None], upper[:, None]
+    lower, upper, x, g, d = _float64(lower[:, None], upper[:, None], x, g, d)
     z = _free(lower, upper, x, g)
     step = np.clip(x + alpha * np.where(z == 0, 0, z + beta * d), lower, upper) - x
     way = np.where(step > 0, upper, lower) - x
@@ -508,17 +386,13 @@ def bounded_direction(
     return step, np.stack([(g * step).sum(axis=0), (step * step).sum(axis=0), share.max(axis=0)])
 
 
-def bounded_weigh(w: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """w v, w w v and the sums of squares of w v, column by column, of (n, k)."""
-    w, v = np.asarray(w, np.float64), np.asarray(v, np.float64)
-    return w * v, w * w * v, np.sum((w * v) ** 2, axis=0)
-
-
-def bounded_move(
-    step: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: np.ndarray, x: np.ndarray
-) -> np.ndarray:
+def bounded_move(step, lower, upper, d, x) -> np.ndarray:
     """x + step d, clipped, with (k,) steps."""
     return np.clip(np.asarray(x, np.float64) + step * d, lower[:, None], upper[:, None])
+
+
+def _float64(*arrays: np.ndarray) -> list[np.ndarray]:
+    return [np.asarray(array, np.float64) for array in arrays]
 
 
 def _free(lower: np.ndarray, upper: np.ndarray, x: np.ndarray, g: np.ndarray) -> np.ndarray:
@@ -569,13 +443,11 @@ def ordered_gather(order: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def pyramid_gather(x: np.ndarray) -> np.ndarray:
     """Sums of pictures (h, w, k) over the cells of all levels, (cells, k), each straight from its pixels."""
-    x = np.asarray(x, np.float64)
     h, w, k = x.shape
-    sums = []
-    for level in range((max(h, w) - 1).bit_length() + 1):
-        corners = itertools.product(range(0, h, 2**level), range(0, w, 2**level))
-        sums += [x[i : i + 2**level, j : j + 2**level].sum(axis=(0, 1)) for i, j in corners]
-    return np.reshape(sums, (-1, k))
+    sizes = [2**level for level in range((max(h, w) - 1).bit_length() + 1)]
+    rows = [np.add.reduceat(np.asarray(x, np.float64), range(0, h, size), axis=0) for size in sizes]
+    cells = [np.add.reduceat(sums, range(0, w, size), axis=1) for sums, size in zip(rows, sizes, strict=True)]
+    return np.concatenate([sums.reshape(-1, k) for sums in cells])
 
 
 def pyramid_spread(grid: tuple[int, int]) -> np.ndarray:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -11,7 +12,9 @@ import pytest
 import scipy.sparse
 
 import ltcl
+from ltcl import report
 from ltcl.errors import InputError
+from ltcl.solvers import Solution, Status
 from ltcl.solvers.solve import ITERATIVE
 from tests.problems import enclosure, lambertian
 
@@ -26,11 +29,9 @@ def transport(scene, device, form=np.asarray):
 def test_norms_and_radius_are_those_of_numpy(device, form):
     scene = lambertian(40, 1.7)
     (channel,) = ltcl.analyze(transport(scene, device, form)).channels
-    assert channel.norm_one == pytest.approx(np.linalg.norm(scene.R, 1), rel=1e-5)
-    assert channel.norm_inf == pytest.approx(np.linalg.norm(scene.R, np.inf), rel=1e-5)
-    assert channel.norm_frobenius == pytest.approx(np.linalg.norm(scene.R), rel=1e-5)
-    assert channel.spectral_radius == pytest.approx(1.7, rel=2e-3)
-    assert channel.albedo == pytest.approx(1.7 / 2.7, rel=2e-3)
+    norms = [np.linalg.norm(scene.R, order) for order in (1, np.inf, None)]
+    assert [channel.norm_one, channel.norm_inf, channel.norm_frobenius] == pytest.approx(norms, rel=1e-5)
+    assert (channel.spectral_radius, channel.albedo) == pytest.approx((1.7, 1.7 / 2.7), rel=2e-3)
     assert channel.first_bounce == pytest.approx((scene.F.min(), np.median(scene.F), scene.F.max()))
     assert channel.bounds == pytest.approx((0.5, scene.S.sum(axis=1).max()), rel=1e-5)
     lower, upper = channel.spectral_radius_bounds
@@ -63,8 +64,8 @@ def test_colour_masks_and_json(device):
     assert len(a.channels) == 3
     assert min(channel.first_bounce[0] for channel in a.channels) > 0.0  # of lit pixels
     assert len(repr(a)) < 100
-    report = json.loads(json.dumps(a.to_dict(), allow_nan=False))
-    assert [channel["products"]["jacobi"] is None for channel in report["channels"]] == [False, False, True]
+    facts = json.loads(json.dumps(a.to_dict(), allow_nan=False))
+    assert [channel["products"]["jacobi"] is None for channel in facts["channels"]] == [False, False, True]
 
 
 @pytest.mark.parametrize("rtol", [0.0, 1e-9, -1.0, 1.0, np.nan, "x", None])
@@ -84,3 +85,15 @@ def test_every_iterative_method_has_an_entry(device):
     (turning,) = ltcl.analyze(one_way).channels
     assert math.isnan(turning.products["gmres"])
     assert math.isfinite(turning.products["jacobi"])
+
+
+def test_a_solution_is_reported_without_its_vector():
+    one = Solution(np.ones(4), Status.MAXITER, 2, 3, (1.0, 0.5, float("inf")), 0.1, "jacobi", "because")
+    (facts,) = report.solution(one)
+    assert (facts["method"], facts["status"], facts["products"]) == ("jacobi", "maxiter", 3)
+    assert (facts["residual"], facts["standard_error"], "x" in facts) == (0.5, None, False)
+    sampled = dataclasses.replace(one, standard_error=np.array([np.nan, 0.1, 0.3]))
+    error = {"largest": 0.3, "median": pytest.approx(0.2), "unknown": 1}
+    facts = json.loads(report.dumps(report.solution((sampled,) * 3)))
+    assert facts[2]["standard_error"] == error
+    assert facts[2]["residuals"] == [1.0, 0.5, None]

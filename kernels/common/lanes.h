@@ -5,7 +5,7 @@
 
 #include "common/real.h"
 
-#ifndef K
+#if K != 1 && K != 2 && K != 3 && K != 4 && K != 8
 #error "lanes.h needs -DK=<right-hand sides of one launch: 1, 2, 3, 4 or 8>"
 #endif
 
@@ -16,31 +16,43 @@
 #endif
 
 // The values of one pixel as one vector.
-#if K == 8
-typedef real8 lanes;
-#define LOAD(x) LOAD8(x)
-#define STORE(v, x) STORE8(v, x)
-#elif K == 4
-typedef real4 lanes;
-#define LOAD(x) LOAD4(x)
-#define STORE(v, x) STORE4(v, x)
-#elif K == 3
+#if K == 3
 typedef real4 lanes;  // the fourth lane is never stored; every ltcl buffer ends in 16 spare bytes for it
 #define LOAD(x) LOAD4(x)
 #define STORE(v, x) (STORE2((v).lo, x), (x)[2] = (v).s2)
-#elif K == 2
-typedef float2 lanes;
-#define LOAD(x) LOAD2(x)
-#define STORE(v, x) STORE2(v, x)
-#elif K == 1
-typedef real lanes;
-#define LOAD(x) (*(x))
-#define STORE(v, x) (*(x) = (v))
 #else
-#error "K must be 1, 2, 3, 4 or 8"
+typedef OF(real, K) lanes;
+#define LOAD(x) OF(LOAD, K)(x)
+#define STORE(v, x) OF(STORE, K)(v, x)
 #endif
 
 typedef union {
     lanes vector;
     real item[sizeof(lanes) / sizeof(real)];
 } sums;  // of a row, one for each right-hand side
+
+// Right-hand sides `at` .. at + K - 1, of which the first `skip` are those of the piece before.
+typedef struct {
+    int at, skip;
+} piece;
+
+// Piece p of at least K right-hand sides.
+static inline piece piece_of(int p, int k)
+{
+    const int at = min(K * p, k - K);
+    piece q = {at, K * p - at};
+    return q;
+}
+
+// out = a v + b y at i .. i + K - 1, but for the first `skip` of them. Where b is 0, y is not read.
+INLINE void put(global real *out, int i, lanes v, int skip, real a, real b, global const real *y)
+{
+    sums items;
+    items.vector = b != 0 ? a * v + b * LOAD(y + i) : a * v;
+    if (skip == 0) {
+        STORE(items.vector, out + i);
+        return;
+    }
+    for (int c = skip; c < K; ++c)
+        out[i + c] = items.item[c];
+}

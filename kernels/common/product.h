@@ -6,34 +6,16 @@
 //                  iterate += x;  r -= S x;  next = keep x + gain r;  and the squares of the new r, summed over a
 //                  work-group, to partials[group_at + group]: the norm of a residual costs no launch of its own
 //
-// Three kernels of a format do the same; the device layer times them and takes the fastest:
+// <format>_matvec takes one work-item a row, in wide loads: for CPUs, and for short rows. <format>_matvec_group takes
+// one work-group a row, its items side by side along it: for GPUs. Each is BY_ITEM or BY_GROUP of a statement that adds
+// item `me` of `items`' share of row `row` to `sum`.
 //
-//   <format>_matvec         one work-item a row, as it reads in a textbook
-//   <format>_matvec_stream  one work-item a row, in wide loads; for CPUs
-//   <format>_matvec_group   one work-group a row, its items side by side along the row; for GPUs
-//
-// Each is BY_ITEM or BY_GROUP of a statement that adds item `me` of `items`' share of row `row` to `sum`.
 // Required define: K, see common/lanes.h. Optional: STEP, and PACKED, see there.
 // Layout: a slab of `rows` rows, the first of which is row `first` of the matrix. x, y, out, iterate, r and next
 // are row-major with `stride` reals a row, and a launch works on their columns offset .. offset + K - 1. partials has
-// a row of `stride` reals for each group. y is not read where b is 0, nor x[row] where c is 0; y may be out.
-// `scratch` holds K reals a work-item.
+// a row of `stride` reals for each group. y may be out. `scratch` holds K reals a work-item.
 
 #include "common/lanes.h"
-#include "common/reduce.h"
-
-#ifdef STEP
-#define PRODUCT_ARGUMENTS \
-    int rows, int first, int stride, int offset, real a, real c, real keep, real gain, int group_at, \
-    global const real *x, global real *iterate, global real *r, global real *next, global real *partials
-#define PRODUCT_NAMES \
-    rows, first, stride, offset, a, c, keep, gain, group_at, x, iterate, r, next, partials
-#else
-#define PRODUCT_ARGUMENTS \
-    int rows, int first, int stride, int offset, real a, real b, real c, global const real *x, \
-    global const real *y, global real *out
-#define PRODUCT_NAMES rows, first, stride, offset, a, b, c, x, y, out
-#endif
 
 // The sum over a work-group of each of K values, in one tree; valid in every item.
 static inline void group_sums(real *value, local real *scratch)
@@ -46,6 +28,16 @@ static inline void group_sums(real *value, local real *scratch)
 }
 
 #ifdef STEP
+#define PRODUCT_ARGUMENTS \
+    int rows, int first, int stride, int offset, real a, real c, real keep, real gain, int group_at, \
+    global const real *x, global real *iterate, global real *r, global real *next, global real *partials
+#define PRODUCT_NAMES \
+    rows, first, stride, offset, a, c, keep, gain, group_at, x, iterate, r, next, partials
+#define SUM_SQUARES group_sums(sum.item, scratch)
+#define KEEP_SQUARES \
+    for (int k = 0; k < K && get_local_id(0) == 0; ++k) \
+        partials[(group_at + (int)get_group_id(0)) * stride + offset + k] = sum.item[k]
+
 // The step of one row; `sum` becomes the squares of its residual.
 static inline void finish_row(PRODUCT_ARGUMENTS, int row, real *sum)
 {
@@ -58,40 +50,31 @@ static inline void finish_row(PRODUCT_ARGUMENTS, int row, real *sum)
         sum[k] = left * left;
     }
 }
-
-static inline void keep_squares(PRODUCT_ARGUMENTS, const real *squares)
-{
-    for (int k = 0; k < K && get_local_id(0) == 0; ++k)
-        partials[(group_at + (int)get_group_id(0)) * stride + offset + k] = squares[k];
-}
-#define SUM_SQUARES(sum) group_sums(sum.item, scratch)
-#define KEEP_SQUARES(sum) keep_squares(PRODUCT_NAMES, sum.item)
 #else
+#define PRODUCT_ARGUMENTS \
+    int rows, int first, int stride, int offset, real a, real b, real c, global const real *x, \
+    global const real *y, global real *out
+#define PRODUCT_NAMES rows, first, stride, offset, a, b, c, x, y, out
+#define SUM_SQUARES
+#define KEEP_SQUARES
+
 static inline void finish_row(PRODUCT_ARGUMENTS, int row, const real *sum)
 {
     for (int k = 0; k < K; ++k)
         finish((first + row) * stride + offset + k, sum[k], a, b, c, x, y, out);
 }
-#define SUM_SQUARES(sum)
-#define KEEP_SQUARES(sum)
 #endif
 
-#define ITEM_ROW \
+#define BY_ITEM(row_sum) \
     stride = STRIDE(stride); \
     const int row = get_global_id(0); \
-    const bool inside = row < rows; \
-    sums sum = {0}
-#define FINISH_ITEMS(sum) \
-    if (inside) \
-        finish_row(PRODUCT_NAMES, row, sum.item); \
-    SUM_SQUARES(sum); \
-    KEEP_SQUARES(sum)
-
-#define BY_ITEM(row_sum) \
-    ITEM_ROW; \
-    if (inside) \
+    sums sum = {0}; \
+    if (row < rows) { \
         row_sum; \
-    FINISH_ITEMS(sum)
+        finish_row(PRODUCT_NAMES, row, sum.item); \
+    } \
+    SUM_SQUARES; \
+    KEEP_SQUARES
 
 #define BY_GROUP(row_sum) \
     stride = STRIDE(stride); \
@@ -101,4 +84,4 @@ static inline void finish_row(PRODUCT_ARGUMENTS, int row, const real *sum)
     group_sums(sum.item, scratch); \
     if (me == 0) \
         finish_row(PRODUCT_NAMES, row, sum.item); \
-    KEEP_SQUARES(sum)
+    KEEP_SQUARES

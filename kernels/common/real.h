@@ -5,13 +5,13 @@
 // compilers contract a * b + c where the device has the instruction. PoCL 3.0 compiles vload8 to a call, too: twice
 // as slow as the load that Clang makes of a vector type whose alignment is lowered.
 
-#ifndef LTCL_REAL_H
-#define LTCL_REAL_H
-
-typedef float real;
+typedef float real, real1;
 typedef float2 real2;
 typedef float4 real4;
 typedef float8 real8;
+
+#define PASTE(name, n) name##n
+#define OF(name, n) PASTE(name, n)  // the one of n values: OF(real, 8) is real8
 
 // INLINE: for what works on several values at once; a call would pass each of them through memory.
 #ifdef __clang__
@@ -26,9 +26,11 @@ typedef real8 real8_packed __attribute__((aligned(4)));
 #define STORE_WIDE(n, v, p) vstore##n(v, 0, p)
 #define INLINE static inline
 #endif
+#define LOAD1(p) (*(p))
 #define LOAD2(p) LOAD_WIDE(2, p)
 #define LOAD4(p) LOAD_WIDE(4, p)
 #define LOAD8(p) LOAD_WIDE(8, p)
+#define STORE1(v, p) (*(p) = (v))
 #define STORE2(v, p) STORE_WIDE(2, v, p)
 #define STORE4(v, p) STORE_WIDE(4, v, p)
 #define STORE8(v, p) STORE_WIDE(8, v, p)
@@ -46,4 +48,16 @@ static inline real sum8(real8 v)
     return (h.s0 + h.s1) + (h.s2 + h.s3);
 }
 
-#endif
+// Sum and largest over a work-group as a binary tree: the same order every time, any group size. All items call it.
+// values[j], j < period, becomes the sum of values[j], values[j + period], ... below count, or the largest of them.
+static inline void fold(local real *values, int count, int period, int largest)
+{
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int rows = (count + period - 1) / period; rows > 1; rows = (rows + 1) / 2) {
+        const int upper = (rows + 1) / 2 * period;  // rounds up, so the rows need not be a power of two
+        for (int j = get_local_id(0); j + upper < count; j += get_local_size(0))
+            values[j] = largest ? fmax(values[j], values[j + upper]) : values[j] + values[j + upper];
+        count = upper;
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+}

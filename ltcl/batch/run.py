@@ -111,10 +111,11 @@ class Run:
         with _of(frames):
             pictures = np.stack([batch.pictures[place] for place in places])
             done = compensate(self.T, pictures, gain=gain, **self.options)
+        appearances = done.appearance if self.output.appearance else done.pattern  # not written then
         with ThreadPoolExecutor(_WRITERS) as writers:
             written = [
                 writers.submit(self.output.write, frame.number, pattern, seen, gain)
-                for frame, pattern, seen in zip(frames, done.pattern, done.appearance, strict=True)
+                for frame, pattern, seen in zip(frames, done.pattern, appearances, strict=True)
             ]
         for each in written:
             each.result()

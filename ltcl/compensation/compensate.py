@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from ltcl import checks, layout
 from ltcl.compensation import gain as gains
 from ltcl.compensation import problem as problems
-from ltcl.compensation.problem import Columns, Limits, Problem, systems
+from ltcl.compensation.problem import Columns, Limits, Problem, join, systems
 from ltcl.errors import ConvergenceError, InputError
 from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
 from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
@@ -34,23 +35,17 @@ _EXPLAINED = 3.0  # times the root mean square of an error: few of a solve's are
 class Compensation:
     """Result of `ltcl.compensate`. Pictures are linear, float32, of the frames and colours of `desired`.
 
+    Those of the camera, `appearance`, `target` and `out_of_reach`, are made when they are asked for.
+
     Attributes
     ----------
     pattern : array
         Linear projector light within the bounds, on the projector's grid; 0 at masked pixels.
-    appearance : array
-        T pattern + background: what the camera will see, on its grid.
     gain : float
         The target was gain * desired.
     clipped : float
         Fraction of pattern values that are at a bound and would lower the error beyond it; masked pixels do
         not count.
-    target : array
-        gain * desired.
-    out_of_reach : array
-        target - appearance where the projector's limits keep the scene too dark (positive) or too bright
-        (negative). 0 where nothing is clipped, and where weight * abs(target - appearance) is at most 3 times
-        what ``max(rtol ||W target||, atol)`` of this frame and colour makes in the root mean square.
     error : float
         ``||W (appearance - target)|| / ||W target||`` of all frames and colours together, with T as it is, or
         `exact` where that was given; see `transport_error`.
@@ -71,19 +66,51 @@ class Compensation:
     """
 
     pattern: np.ndarray
-    appearance: np.ndarray
     gain: float
     clipped: float
-    target: np.ndarray
-    out_of_reach: np.ndarray
     error: float
     gap: float
     frame_errors: np.ndarray
     frame_clipped: np.ndarray
     solution: Solution | tuple[Solution, ...]
     limited: tuple[Bounded, ...]
-    transport_error: float = 0.0
-    rtol: float = 1e-2
+    transport_error: float
+    rtol: float
+    _shape: layout.Layout
+    _grid: tuple[int, int]  # of the camera
+    _target: Columns
+    _missing: Columns  # target - appearance
+    _seen: Columns | None  # the appearance, where that is what was computed
+    _weights: Columns | None
+    _explained: list[np.ndarray] | None  # (k,), of what is missing, by the tolerance; None: all of it
+
+    @cached_property
+    def appearance(self) -> np.ndarray:
+        """T pattern + background: what the camera will see, on its grid."""
+        if self._seen is not None:
+            return self._picture(self._seen)
+        return self._picture([d - r for d, r in zip(self._target, self._missing, strict=True)])
+
+    @cached_property
+    def target(self) -> np.ndarray:
+        """gain * desired."""
+        return self._picture(self._target)
+
+    @cached_property
+    def out_of_reach(self) -> np.ndarray:
+        """target - appearance where the projector keeps the scene too dark (positive) or bright (negative).
+
+        0 where nothing is clipped, and where weight * abs(target - appearance) is at most 3 times what
+        ``max(rtol ||W target||, atol)`` of this frame and colour makes in the root mean square.
+        """
+        if self._explained is None:
+            return np.zeros_like(self.target)
+        weights = self._weights or [np.ones((1, 1), np.float32)] * len(self._missing)
+        columns = zip(self._missing, weights, self._explained, strict=True)
+        return self._picture([np.where(np.abs(w * r) > most, r, 0.0) for r, w, most in columns])
+
+    def _picture(self, columns: Columns) -> np.ndarray:
+        return self._shape.pack(columns, self._grid).astype(np.float32, copy=False)
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.pattern.shape))
@@ -113,7 +140,7 @@ def compensate(
     ----------
     T : Transport
         With more or fewer camera than projector pixels, or blocks between colours, it works too, in the
-        least-squares sense and without `method`.
+        least-squares sense and without `method`. F = diag(T) is a valid choice for any opaque scene.
     desired : (h, w), (h, w, 3), or frames of these
         Wanted radiance at each camera pixel, in the units of T.
     bounds : (low, high)
@@ -159,10 +186,6 @@ def compensate(
         A solve did not reach `rtol` in `maxiter` steps, or not at all. Within the bounds, where float32 is
         too coarse to prove it, the best that was found comes back, and `gap` tells what is proved.
 
-    Notes
-    -----
-    F = diag(T) is a valid choice here for any opaque scene: compensation does not depend on it.
-
     Examples
     --------
     >>> import ltcl, numpy
@@ -175,7 +198,8 @@ def compensate(
     """
     require(T, square=False)
     low_high, requested = checks.interval("bounds", bounds), problems.gain(gain, loss)
-    limits = Limits.in_float32(low_high, T.join([T.masked] * T.channels)[0])
+    count = 1 if T.couples else T.channels
+    limits = Limits.in_float32(low_high, join([T.masked] * T.channels, count)[0])
     d, shape = layout.unpack("desired", desired, T.camera_grid, T.channels)
     dark = problems.background(background, T, shape, d)
     W, unit = problems.weights(weights, T, shape, d)
@@ -189,7 +213,7 @@ def compensate(
 
     def undo(targets: Columns) -> tuple[Solution, ...]:
         """S^-1 of one target a system: one solution a channel."""
-        targets = T.split(targets)
+        targets = targets if len(targets) == T.channels else np.split(targets[0], 3)
         if inverse is not None:
             return tuple(inverse.solve(b, channel) for channel, b in enumerate(targets))
         return solve_each(
@@ -198,19 +222,20 @@ def compensate(
 
     problem = Problem(
         systems(true),
-        T.join(d),
-        T.join(dark),
-        None if W is None else T.join(W),
+        join(d, count),
+        join(dark, count),
+        None if W is None else join(W, count),
         limits,
         {**rules, "atol": rules["atol"] / unit},
         unit,
     )
+    error = true.error
     start = _start(T, problem, undo, requested, loss, exactly=weights is None)
     problems.check_range(problem, start.gain)
-    light, limited = _within(problem, start, options.get("throw", True), clamp)
-    c = _result(true, problem, shape, start, light, limited)
-    if requested is not None and c.clipped > 0.0:
-        problems.warn_of_units(desired, float(c.target.max()), float(c.appearance.max()))
+    within = _within(problem, start, shape.frames or 1, options.get("throw", True), clamp)
+    c = _result(true, problem, shape, start, *within, transport_error=error)
+    if requested is not None and c.clipped > 0.0 and np.asarray(desired).dtype.kind == "f":
+        problems.warn_of_units(c._target, c._seen or [])
     return c
 
 
@@ -243,8 +268,10 @@ def _start(
             return _Start(*gains.within_loss(problem, loss))
         return _Start(gain, [np.zeros((len(scale), k)) for _, scale in problem.systems])
 
+    F = np.atleast_2d(T.first_bounce)
+
     def light(direct: Columns) -> Columns:
-        return T.join(T.to_light(direct))
+        return join(layout.to_light(direct, F, T.mixing), len(problem.systems))
 
     if gain is not None:
         solutions = undo(problem.target(gain))
@@ -272,20 +299,30 @@ def _combined(both: Solution, gain: float, k: int) -> Solution:
 
 
 def _within(
-    problem: Problem, start: _Start, throw: bool, clamp: bool
-) -> tuple[Columns, list[Bounded | None]]:
-    """Light within the limits, and the solve that it took of each system, None where it took none."""
+    problem: Problem, start: _Start, frames: int, throw: bool, clamp: bool
+) -> tuple[Columns, list[Bounded], np.ndarray]:
+    """Light within the limits, the solves that it took, and the share of its values, (frames,), at a bound.
+
+    That is of values that want to go beyond it, and of pixels that are lit.
+    """
+    limits = problem.limits
     light: Columns = []
-    limited: list[Bounded | None] = []
+    limited: list[Bounded] = []
+    shares = np.zeros(frames)
     for which, free in enumerate(start.light):
-        nearest, solution = problem.limits.clip(free), None
-        if not clamp and (not start.meets or problem.limits.exceeded(free) is not None):
+        nearest, beyond = limits.clip(free), limits.exceeded(free)
+        if not clamp and (not start.meets or beyond is not None):
             nearest, solution = problem.nearest(which, start.gain, nearest)
             if throw and solution.status is Status.MAXITER:
                 raise ConvergenceError(str(solution), solution)
+            limited.append(solution)
+            at_bound = (nearest <= limits.low) | (nearest >= limits.high)
+            beyond = solution.held & at_bound & ~limits.masked[:, None]
         light.append(nearest)
-        limited.append(solution)
-    return light, limited
+        if beyond is not None:
+            counts = np.reshape([np.count_nonzero(column) for column in beyond.T], (frames, -1))
+            shares += counts.mean(axis=1) / np.count_nonzero(~limits.masked)
+    return light, limited, shares / len(light)
 
 
 def _result(
@@ -294,72 +331,53 @@ def _result(
     shape: layout.Layout,
     start: _Start,
     light: Columns,
-    limited: list[Bounded | None],
+    limited: list[Bounded],
+    frame_clipped: np.ndarray,
+    transport_error: float,
 ) -> Compensation:
-    target = problem.scaled(start.gain)
-    solved = tuple(solution for solution in limited if solution is not None)
-    solutions, frames = start.solutions or solved, shape.frames or 1
-    frame_clipped = _clipped(light, start.light, limited, problem.limits, frames)
+    target, frames = problem.scaled(start.gain), len(frame_clipped)
     clipped = float(np.mean(frame_clipped))
-    missing = [one.rest for one in start.solutions if one.rest is not None]
-    if clipped or solved or len(missing) < T.channels or problem.limits.masked.any():
-        queued = [A.apply(A.device.upload(p)) for A, p in zip(T.operators, light, strict=True)]
-        seen = [T_p.get() for T_p in queued]
+    missing, seen = [one.rest for one in start.solutions if one.rest is not None], None
+    if clipped or limited or len(missing) < T.channels or problem.limits.masked.any():
+        seen = [A.apply(A.device.upload(p)) for A, p in zip(T.operators, light, strict=True)]
+    pattern = shape.pack(light, T.grid)  # while the device works
+    norms = problem.norms(target)
+    if seen is None:  # the light of the solve as it is, whose residual is what is missing
+        missing = join(missing, len(problem.systems))
+    else:
+        seen = [T_p.get() for T_p in seen]
         if not problem.is_dark:
             seen = [T_p + dark for T_p, dark in zip(seen, problem.dark, strict=True)]
         missing = [d - c for d, c in zip(target, seen, strict=True)]
-    else:  # the light of the solve as it is, whose residual is what is missing
-        missing = T.join(missing)
-        seen = [d - r for d, r in zip(target, missing, strict=True)]
-    sizes, errors = (problem.norms(columns, frames) for columns in (target, missing))
+    sizes, errors = (_of_frames(columns, frames) for columns in (norms, problem.norms(missing)))
     size, error = float(np.linalg.norm(sizes)) or 1.0, float(np.linalg.norm(errors))
-    least = np.linalg.norm([np.linalg.norm(solution.least / problem.unit) for solution in solved])
-
-    def picture(columns: Columns, grid: tuple[int, int]) -> np.ndarray:
-        return shape.pack(T.split(columns), grid).astype(np.float32, copy=False)
-
-    shown = picture(target, T.camera_grid)
-    beyond = picture(_beyond(problem, missing, target), T.camera_grid) if clipped else np.zeros_like(shown)
+    least = np.linalg.norm([np.linalg.norm(solution.least / problem.unit) for solution in limited])
+    rtol, atol = problem.rules["rtol"], problem.rules["atol"]
+    pixels = target[0].shape[0]
+    explained = [_EXPLAINED * np.maximum(rtol * norm, atol) / np.sqrt(pixels) for norm in norms]
+    solutions = start.solutions or tuple(limited)
     return Compensation(
-        pattern=picture(light, T.grid),
-        appearance=picture(seen, T.camera_grid),
+        pattern=pattern,
         gain=start.gain,
         clipped=clipped,
-        target=shown,
-        out_of_reach=beyond,
         error=error / size,
         gap=max(error - float(least), 0.0) / size,
         frame_errors=errors / np.where(sizes > 0, sizes, 1.0),
         frame_clipped=frame_clipped,
         solution=solutions[0] if len(solutions) == 1 else solutions,
-        limited=solved,
-        transport_error=T.error,
-        rtol=problem.rules["rtol"],
+        limited=tuple(limited),
+        transport_error=transport_error,
+        rtol=rtol,
+        _shape=shape,
+        _grid=T.camera_grid,
+        _target=target,
+        _missing=missing,
+        _seen=seen,
+        _weights=problem.weights,
+        _explained=explained if clipped else None,
     )
 
 
-def _clipped(
-    light: Columns, free: Columns, limited: list[Bounded | None], limits: Limits, frames: int
-) -> np.ndarray:
-    """Share of values at a bound that want to go beyond it, (frames,), of pixels that are lit."""
-    shares = np.zeros(frames)
-    for p, unlimited, solution in zip(light, free, limited, strict=True):
-        if solution is None:
-            beyond = limits.exceeded(unlimited)
-        else:
-            beyond = solution.held & ((p <= limits.low) | (p >= limits.high))
-        if beyond is not None:
-            lit = beyond[~limits.masked]
-            shares += lit.reshape(len(lit), frames, -1).mean(axis=(0, 2))
-    return shares / len(light)
-
-
-def _beyond(problem: Problem, missing: Columns, target: Columns) -> Columns:
-    """What is missing, without what the tolerance of a solve explains."""
-    rtol, atol = problem.rules["rtol"], problem.rules["atol"]
-    beyond = []
-    for r, wr, wd in zip(missing, problem.weighted(missing), problem.weighted(target), strict=True):
-        norms = np.sqrt(np.einsum("mk,mk->k", wd, wd, dtype=np.float64))
-        allowed = np.maximum(rtol * norms, atol) / np.sqrt(len(r))
-        beyond.append(np.where(np.abs(wr) > _EXPLAINED * allowed, r, 0.0))
-    return beyond
+def _of_frames(norms: list[np.ndarray], frames: int) -> np.ndarray:
+    """(frames,), of the norms of their columns, which lie side by side."""
+    return np.linalg.norm(np.concatenate([n.reshape(frames, -1) for n in norms], axis=1), axis=1)

@@ -92,7 +92,7 @@ class Search:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self.size = float(problem.norms(problem.desired, 1)[0])
+        self.size = float(np.linalg.norm(problem.norms(problem.desired)))
         if self.size == 0.0:
             raise InputError(
                 "gain is 'auto', but desired is 0 everywhere that weights count: no gain is too large"

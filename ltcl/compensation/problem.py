@@ -3,7 +3,7 @@
 
 Where T = S F, A is S and the scale F: columns near 1, so that few products are needed. Elsewhere the columns
 of T are brought to norm 1. Colour channels are one system each, or all of them one where T couples them: then
-(3 N, k) arrays hold channel below channel, as `Transport.join` puts them.
+(3 N, k) arrays hold channel below channel, as `join` puts them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator, ScaledColumns, as_operator
 from ltcl.solvers.bounded import Bounded, minimise
-from ltcl.solvers.solve import KINDS, METHODS
+from ltcl.solvers.solve import METHODS, OPTIONS
 from ltcl.transport import Transport
 
 logger = logging.getLogger(__name__)
@@ -67,17 +67,17 @@ class Limits:
         """Light (N, k) moved within the bounds, as float32."""
         with np.errstate(over="ignore"):  # becomes infinite, and then the bound
             light = np.clip(light.astype(np.float32), np.float32(self.low), np.float32(self.high))
-        light[self.masked] = 0.0
+        if self.masked.any():
+            light[self.masked] = 0.0
         return light
 
     def exceeded(self, light: np.ndarray) -> np.ndarray | None:
         """Where light is outside by more than rounding; None where it is nowhere."""
         slack = _SLACK * (self.high - self.low)
-        if self.low - slack <= light.min() and light.max() <= self.high + slack:
-            return None
-        beyond = ~((light >= self.low - slack) & (light <= self.high + slack))
-        beyond &= ~self.masked[:, None]
-        return beyond if beyond.any() else None
+        within = light >= self.low - slack
+        within &= light <= self.high + slack
+        within |= self.masked[:, None]
+        return None if within.all() else ~within
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +104,10 @@ class Problem:
             return pictures
         return [w * c for w, c in zip(self.weights, pictures, strict=True)]
 
-    def norms(self, pictures: Columns, frames: int) -> np.ndarray:
-        """Of all channels of each frame together, weighted, (frames,); frames side by side."""
-        squares = np.zeros(frames)
-        for picture in self.weighted(pictures):
-            values = picture.reshape(len(picture), frames, -1)  # (M, frames, colours)
-            squares += np.einsum("mfc,mfc->f", values, values, dtype=np.float64)
-        return np.sqrt(squares)
+    def norms(self, pictures: Columns) -> list[np.ndarray]:
+        """Of each column, weighted, (k,) float64 of each system."""
+        weighted = self.weighted(pictures)
+        return [np.sqrt(np.einsum("mk,mk->k", c, c, dtype=np.float64)) for c in weighted]
 
     def scaled(self, gain: float) -> Columns:
         """gain * desired."""
@@ -151,6 +148,11 @@ class Problem:
         return limits.clip(light), solution
 
 
+def join(channels: Columns, systems: int) -> Columns:
+    """One (N, k) a channel as so many systems take them."""
+    return channels if len(channels) == systems else [np.concatenate(channels)]
+
+
 def systems(T: Transport) -> tuple[System, ...]:
     """The systems of T, uploaded here if they were not yet."""
     if T.is_square and not T.couples:
@@ -171,12 +173,8 @@ def _squared_columns(matrix: Any, device: Device) -> np.ndarray:
     columns = matrix.shape[1]
     if isinstance(matrix, np.ndarray):
         return np.einsum("ij,ij->j", matrix, matrix, dtype=np.float64)
-    if isinstance(matrix, scipy.sparse.csr_array) or hasattr(matrix, "row_blocks"):
-        blocks = [(0, matrix)] if isinstance(matrix, scipy.sparse.csr_array) else matrix.row_blocks()
-        total = np.zeros(columns)
-        for _, block in blocks:
-            total += np.bincount(block.indices, block.data.astype(np.float64) ** 2, minlength=columns)
-        return total
+    if isinstance(matrix, scipy.sparse.csr_array):
+        return np.bincount(matrix.indices, matrix.data.astype(np.float64) ** 2, minlength=columns)
     A = as_operator(matrix, device)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (A.shape[0], _PROBES))
     return np.mean(np.square(A.T @ signs, dtype=np.float64), axis=1)
@@ -202,7 +200,7 @@ def check_range(problem: Problem, gain: float) -> None:
     column = max(float(scale.max()) for _, scale in problem.systems)
     pictures = {
         "T reaches": column,
-        "desired reaches": gain * max(float(np.abs(d).max()) for d in problem.desired),
+        "desired reaches": gain * max(max(float(d.max()), -float(d.min())) for d in problem.desired),
         f"light of {light:.3g}, as bounds allow it, makes": light * column,
     }
     least, most = _PICTURES
@@ -213,11 +211,12 @@ def check_range(problem: Problem, gain: float) -> None:
             )
 
 
-def warn_of_units(value: Any, target: float, appearance: float) -> None:
+def warn_of_units(target: Columns, appearance: Columns) -> None:
     """A warning where the largest value of the target is far beyond that of the best appearance."""
-    if target > _FAR * appearance and np.asarray(value).dtype.kind == "f":
+    highest, reached = (max(float(c.max()) for c in columns) for columns in (target, appearance))
+    if highest > _FAR * reached:
         units = layout.UNITS % 255
-        logger.warning("desired reaches %.3g, the scene %.3g at most; %s", target, appearance, units)
+        logger.warning("desired reaches %.3g, the scene %.3g at most; %s", highest, reached, units)
 
 
 def background(value: Any, T: Transport, shape: layout.Layout, like: Columns) -> Columns:
@@ -248,17 +247,14 @@ def rules(T: Transport, method: str, rtol: float, options: dict[str, Any]) -> di
     checks.one_of("method", method, METHODS)
     if not T.is_square and method != "auto":
         raise InputError(f"method is {method!r}, but this T has no S for it to solve; it must be 'auto'")
-    own = dataclasses.fields(KINDS[method]) if method != "auto" else ()
-    known = [*_OPTIONS, *(["x0"] if T.is_square else []), *(field.name for field in own)]
+    known = [*_OPTIONS, *(["x0"] if T.is_square else []), *OPTIONS.get(method, ())]
     for name in options:
-        if name in known and name != "pixels":  # a picture needs all of them
-            continue
-        others = [key for key, kind in KINDS.items() if name in (f.name for f in dataclasses.fields(kind))]
-        if others and name != "pixels":
-            others = " and ".join(map(repr, others))
-            raise InputTypeError(f"{name} is an option of method={others}, but method is {method!r}")
-        has = ", ".join([*_OWN, *known])
-        raise InputTypeError(f"unknown option {name!r}; compensate with method {method!r} has {has}")
+        if name not in known or name == "pixels":  # a picture needs all of them
+            owners = [key for key, own in OPTIONS.items() if name in own]
+            theirs = f"{name} is an option of method={' and '.join(map(repr, owners))}"
+            problem = theirs if owners and name != "pixels" else f"unknown option {name!r}"
+            has = ", ".join([*_OWN, *known])
+            raise InputTypeError(f"{problem}; compensate with method {method!r} has {has}")
     rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
     atol = checks.number("atol", options.get("atol", 0.0), least=0.0)
     if rtol == 0.0 and atol == 0.0:
@@ -275,7 +271,7 @@ def _alike(name: str, value: Any, T: Transport, shape: layout.Layout, like: Colu
     columns, own = layout.unpack(name, value, T.camera_grid, T.channels)
     # (M, frames, colours): one frame or one grey serves all.
     have, want = (
-        (len(like[0]), part.frames or 1, 3 if part.colour and T.channels == 1 else 1) for part in (own, shape)
+        (len(like[0]), one.frames or 1, 3 if one.colour and T.channels == 1 else 1) for one in (own, shape)
     )
     try:
         return [np.broadcast_to(c.reshape(have), want).reshape(c.shape[0], -1) for c in columns]

@@ -13,6 +13,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from ltcl import checks
+from ltcl import first_bounce as _first_bounce
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.operators import Dense, Host, Operator
@@ -170,8 +171,11 @@ def validate_inputs(
         if channel.shape != (n, n):
             raise InputError(f"T has shape {channel.shape}; it must be square, (N, N), to have an S")
         channel.rows(0, 1)  # of rows that end with the matrix nobody sees that one too many was given
-    grid, F = checks.grid("grid", grid, n), _first_bounce(rows, first_bounce)
-    device = device if isinstance(device, Device) else open_device(device)
+    grid, device = checks.grid("grid", grid, n), device if isinstance(device, Device) else open_device(device)
+    if isinstance(first_bounce, str):
+        raise InputError(f"first_bounce is {first_bounce!r}, but T is rows; give an array (N,), or None")
+    F, _ = _first_bounce.find(rows, "diagonal" if first_bounce is None else first_bounce, lambda: device)
+    F, _ = _first_bounce.mask_dark(F, grid, "mask", may_mask=False)
     R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
     return Inputs([Problem(one, Host(device, one), grid) for one in R], F, grid, _dense_nbytes(F))
 
@@ -194,23 +198,6 @@ def of_transport(T: Transport, memory: int | None = None) -> Inputs:
 def _dense_nbytes(F: np.ndarray) -> int:
     """Of T in float32, of its first bounces (channels, N)."""
     return 4 * F.size * F.shape[1]
-
-
-def _first_bounce(rows: list[Rows], first_bounce: Any) -> np.ndarray:
-    """(channels, N) float64."""
-    n = rows[0].shape[0]
-    if first_bounce is None:
-        F = np.stack([channel.diagonal() for channel in rows])
-    else:
-        F = checks.finite("first_bounce", checks.real("first_bounce", first_bounce)).astype(np.float64)
-        F = np.broadcast_to(checks.shape("first_bounce", F, (n,), (len(rows), n)), (len(rows), n))
-    dark = np.flatnonzero(np.any(F <= 0.0, axis=0))
-    if len(dark):
-        raise InputError(
-            f"first_bounce is zero or negative at {len(dark)} of {n} pixels, the first {dark[0]}; it must be "
-            "positive; make a Transport with on_dark='mask' of it"
-        )
-    return F
 
 
 def rows_at_once(values: int, memory: int | None = None) -> int:

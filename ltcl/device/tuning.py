@@ -87,7 +87,7 @@ def factorization_flops() -> float:
         matrix = np.random.default_rng(0).standard_normal((_FACTORIZED, _FACTORIZED))
         return 2 / 3 * _FACTORIZED**3 / _time(lambda: scipy.linalg.lu_factor(matrix), lambda: None)
 
-    key = (platform.node(), f"{os.cpu_count()} cores", f"scipy {scipy.__version__}", "factorization")
+    key = (platform.node(), f"{os.cpu_count()} cores", f"scipy {scipy.__version__}", "LU, flops")
     return _measured(key, FLOPS, measure)
 
 

@@ -141,8 +141,8 @@ def scale_rows(d: Array, x: Array, out: Array) -> Array:
 def dot(x: Array, y: Array) -> np.ndarray:
     """<x_c, y_c> of every column c, as (k,) float64; waits for the device."""
     _same_shape(x, y)
-    sums = x.device.empty((_plan("vector_dot", x).groups, x.columns))
-    _reduce("vector_dot", x, x, y, sums, 0)
+    sums = x.device.empty((_plan("vector_dots", x).groups, x.columns))
+    _reduce("vector_dots", x, 0, 0b0100, 0, x, x, y, y, sums)
     return sums.get().sum(axis=0, dtype=np.float64)
 
 
@@ -162,11 +162,11 @@ def norms(*xs: Array) -> np.ndarray:
 def queue_dot(x: Array, y: Array, out: Array, slot: int) -> None:
     """Row `slot` of `out` (slots, k) = <x_c, y_c> of every column c; does not wait."""
     _same_shape(x, y)
-    if (groups := _plan("vector_dot", x).groups) == 1:
-        _reduce("vector_dot", x, x, y, out, slot * x.columns)
+    if (groups := _plan("vector_dots", x).groups) == 1:
+        _reduce("vector_dots", x, slot * x.columns, 0b0100, 0, x, x, y, y, out)
     else:
         sums = x.device.empty((1, groups, x.columns))
-        _reduce("vector_dot", x, x, y, sums, 0)
+        _reduce("vector_dots", x, 0, 0b0100, 0, x, x, y, y, sums)
         queue_sum_partials(sums, 1, out, slot)
 
 
@@ -205,7 +205,7 @@ def _plan(name: str, x: Array) -> _Plan:
     """For vectors (rows,) or (rows, k), or for partial sums (slots, rows, k), made once for each size."""
     device, (rows, k) = x.device, (*x.shape, 1)[:2] if len(x.shape) < 3 else x.shape[1:]
     if (name, rows, k) not in device.reductions:
-        kernel = _kernel(device, name)
+        kernel = kernel_of(device, name)
         group = kernel.group((16 if k <= 16 else 64) if device.is_cpu else 256)
         most = max(64, 4 * device.compute_units)  # enough for a large GPU, few enough for one last group
         groups = 1 if name == "vector_sums" else -(-rows * k // (group * _VALUES[device.is_cpu]))
@@ -220,12 +220,13 @@ def _reduce(name: str, x: Array, *arguments: float | Array, across: int = 1) -> 
 
 
 def _elementwise(out: Array, name: str, *arguments: float | Array) -> Array:
-    _kernel(out.device, name)(out.size, 256, out.size, *arguments, out)
+    kernel_of(out.device, name)(out.size, 256, out.size, *arguments, out)
     return out
 
 
-def _kernel(device: Device, name: str) -> Kernel:
-    return device.kernel("vector", name, **({} if device.is_cpu else {"ADJACENT": 0}))
+def kernel_of(device: Device, name: str) -> Kernel:
+    """A kernel of a file that includes `common/columns.h`."""
+    return device.kernel(name.partition("_")[0], name, **({} if device.is_cpu else {"ADJACENT": 0}))
 
 
 def _same_shape(*arrays: Array) -> None:

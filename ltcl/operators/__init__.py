@@ -50,8 +50,7 @@ def as_operator(matrix: Any, device: Device | None = None) -> Operator:
     Parameters
     ----------
     matrix : Operator (returned as it is), (M, N) array, scipy.sparse matrix or array, or LinearOperator
-    device : Device, optional
-        The best one when not given.
+    device : Device, the best one when not given
 
     Examples
     --------

@@ -53,8 +53,6 @@ class Operator(scipy.sparse.linalg.LinearOperator):
 
     Attributes
     ----------
-    device : Device
-    shape : (M, N)
     error : float
         Bound on the 2-norm of what a compressed operator dropped; 0 for exact ones.
     solution_error : float
@@ -73,12 +71,6 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         self.device = device
         self._parts: tuple[Operator | Array | None, ...] = parts  # what it is made of
         self._row_sums: np.ndarray | None = None
-
-    def __getstate__(self) -> Any:
-        raise InputTypeError(
-            f"{type(self).__name__} lies on a device and cannot be pickled; pickle its Transport or "
-            "Inverse, or what to_dense() gives"
-        )
 
     @property
     def nbytes(self) -> int:
@@ -116,20 +108,10 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         add_scale: float = 1.0,
         shift: float = 0.0,
     ) -> Array:
-        """Queue ``out = scale (A x) + add_scale add + shift x``; returns `out`.
+        """Queue ``out = scale (A x) + add_scale add + shift x``; returns `out`, made when not given.
 
-        Parameters
-        ----------
-        x : Array, (N,) or (N, k)
-        out, add : Array, (M,) or (M, k), optional
-            `out` is made when not given; it must not be `x`, but may be `add`.
-        scale, add_scale, shift : float
-            `shift` needs a square operator.
-
-        Raises
-        ------
-        InputError
-            Shapes that do not fit.
+        x is (N,) or (N, k), `add` and `out` are (M,) or (M, k); `out` may be `add`, but not `x`. `shift`
+        needs a square operator. InputError for shapes that do not fit.
         """
         epilogue = Epilogue(float(scale), 0.0 if add is None else float(add_scale), add, float(shift))
         out = self._checked(x, out, epilogue)
@@ -190,8 +172,8 @@ class Operator(scipy.sparse.linalg.LinearOperator):
 
     def __reduce__(self) -> Any:
         raise InputTypeError(
-            f"a {type(self).__name__} lies on a device and cannot be pickled; pickle the Transport, or "
-            "S.to_dense()"
+            f"{type(self).__name__} lies on a device and cannot be pickled; pickle its Transport or "
+            "Inverse, or what to_dense() gives"
         )
 
     # What SciPy asks for: NumPy in, NumPy out. It makes the other products of these.
@@ -300,11 +282,7 @@ class Transposed(Operator):
 
 
 def widths(columns: int) -> list[tuple[int, int]]:
-    """Launches of k right-hand sides, as (offset, width) pairs.
-
-    >>> widths(11)
-    [(0, 8), (8, 3)]
-    """
+    """Launches of k right-hand sides, as (offset, width) pairs: (0, 8) and (8, 3) of 11."""
     pieces, offset = [], 0
     while offset < columns:
         width = next(w for w in WIDTHS if w <= columns - offset)

@@ -29,14 +29,10 @@ class Basis(Operator):
 
     Attributes
     ----------
-    grid : (h, w)
-        Of the pictures; N = h * w pixels, row-major.
-    name : str
-        As `ltcl.operators.basis` takes it.
-    orthonormal : bool
-        Whether W W^T = W^T W = I, so that synthesis undoes analysis and keeps norms.
-    isometric : bool
-        Whether W W^T = I at least, so that synthesis keeps norms.
+    grid : (h, w) of the pictures; N = h * w pixels, row-major
+    name : str, as `ltcl.operators.basis` takes it
+    orthonormal, isometric : bool
+        Whether synthesis undoes analysis, W W^T = W^T W = I; whether it keeps norms, W W^T = I.
     """
 
     orthonormal = True
@@ -88,8 +84,6 @@ class SubsetBasis(Basis):
 
     Parameters
     ----------
-    device : Device
-    grid : (h, w)
     places : (M,) of int
         Pixels, row-major, or coefficients of W; InputError where there are none, or one twice.
     of : Basis, optional
@@ -145,12 +139,8 @@ class Pyramid(Basis):
     """A quad-tree: sums over the cells of all levels, (M, N), the finest first (`kernels/pyramid.cl`).
 
     Level 0 is the pixels; a cell of each further level covers 2 x 2 of the one before, fewer at the edges,
-    until one cell is left: the basis of transports that were scanned adaptively. Not orthonormal.
-
-    Attributes
-    ----------
-    cells : tuple of (rows, columns)
-        Of each level, ceil(h / 2^level) x ceil(w / 2^level), row-major one behind the other.
+    until one cell is left: the basis of transports that were scanned adaptively. Not orthonormal. `cells`
+    holds (rows, columns) of each level, whose cells are row-major one behind the other.
 
     Examples
     --------
@@ -202,8 +192,8 @@ def multiresolution_order(grid: Any, levels: int) -> np.ndarray:
     """An order of 2-D wavelet coefficients in which those of one place and size stand together, (N,) int64.
 
     From coarse to fine, in each level row by row, the details of a place side by side: rows of W R W^T then
-    have their large entries in runs, which `Tiles` of 8 hold in a fifth fewer bytes (diffuse dihedral,
-    N = 4608, db2, 30 numbers a row). Coefficients are in the layout of a `Wavelet` of so many `levels`.
+    have their large entries in runs, which `Tiles` of 8 hold in a fifth fewer bytes. Coefficients are in the
+    layout of a `Wavelet` of so many `levels`.
 
     >>> multiresolution_order((2, 4), 1).tolist()
     [0, 1, 2, 4, 6, 3, 5, 7]

@@ -28,10 +28,9 @@ class IdentityPlus(Operator):
     ----------
     R : Operator, (N, N)
     sign : 1 or -1
-    weights : (N,), optional
-        See `Operator`; all positive.
+    weights : (N,), optional, all positive, see `Operator`
     solution_error : float
-        See `Operator`: ``||S^-1|| ||E||`` with E what was dropped; infinite where nothing is known.
+        ``||S^-1|| ||E||`` with E what was dropped; infinite where nothing is known.
 
     Examples
     --------
@@ -81,12 +80,7 @@ class IdentityPlus(Operator):
 class ScaledColumns(Operator):
     """A diag(d) - diag(shift): T = S F (eq. 3) of S and the first bounce, R = T F^-1 - I of T.
 
-    Parameters
-    ----------
-    A : Operator, (M, N)
-    d : (N,)
-    shift : float or (N,)
-        Needs a square A where it is not 0.
+    A is (M, N), d (N,), shift a number or (N,), which needs a square A where it is not 0.
     """
 
     def __init__(self, A: Operator, d: np.ndarray, shift: Any = 0.0) -> None:
@@ -134,7 +128,7 @@ class Compressed(Operator):
     """R = W_out^T C W_in, (M, N): a sparse core C between two bases; a side without one is of pixels.
 
     W on the right alone are the wavelet rows of the paper (section 6). Where both are one isometric basis, R
-    has the norm, the spectrum (and 0 with it) and the solves of its core; see `ltcl.solvers.refinement`.
+    has the norm, the spectrum (and 0 with it) and the solves of its core; see `ltcl.solvers.solve`.
 
     Parameters
     ----------
@@ -144,7 +138,6 @@ class Compressed(Operator):
     error : float, optional
         Bound on the 2-norm of what was dropped; that of the core when not given.
     diagonal : (min(M, N),), optional
-        Of R; `known_diagonal` once it was given or computed.
 
     Examples
     --------
@@ -220,12 +213,7 @@ class Compressed(Operator):
 class Coupled(Operator):
     """picture_c = sum_j T_cj light_j with light_j = sum_i M_ji x_i, channel below channel: (3 M, 3 N).
 
-    Parameters
-    ----------
-    blocks : 3 x 3 Operators or None
-        T_cj, (M, N); None is zero.
-    mixing : (3, 3), optional
-        M; the identity when not given.
+    `blocks` are 3 x 3 operators (M, N), None of zeros; `mixing` is M, (3, 3), or the identity.
 
     Examples
     --------

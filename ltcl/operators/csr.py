@@ -2,8 +2,7 @@
 """Compressed sparse rows: float32 values, 32-bit column indices, y = A x by `kernels/csr.cl`.
 
 A transposed product uses A^T in the same format, made at the first one: twice the memory, but the same bits
-at every call, which scattered additions would not give. Of a matrix that comes in blocks of rows the host
-keeps row pointers alone: diagonal and norms have all blocks read again.
+at every call, which scattered additions would not give.
 """
 
 from __future__ import annotations
@@ -69,7 +68,6 @@ class CSR(RowOperator):
 
     Parameters
     ----------
-    device : Device
     matrix : scipy.sparse matrix or array, (M, N)
         InputError where it is malformed or not finite, MemoryLimitError where the device has no room for it.
     pattern : Pattern, optional
@@ -135,14 +133,13 @@ class CSR(RowOperator):
 class RowBlocks(CSR):
     """A sparse (M, N) matrix on the device, uploaded block by block; refuses what `CSR` refuses.
 
+    The host keeps row pointers alone: diagonal and norms have all blocks read again.
+
     Parameters
     ----------
-    device : Device
     shape : (M, N)
-    blocks : function
-        Gives (first row, csr_array) of all blocks, in order.
-    nnz : int
-        Nonzeros there are at most.
+    blocks : function that gives (first row, csr_array) of all blocks, in order
+    nnz : int, nonzeros there are at most
 
     Examples
     --------

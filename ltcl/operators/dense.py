@@ -15,7 +15,6 @@ from ltcl.errors import InputError
 from ltcl.operators.base import Epilogue, widths
 from ltcl.operators.rows import RowOperator, Slab, cut
 
-_STRIP = 256  # columns of a work-item of a transposed product on a CPU, as in kernels/dense.cl
 _CHUNKS, _CHUNK_ROWS = 64, 32  # of a transposed product: enough groups for a large GPU, none too short
 
 
@@ -24,7 +23,6 @@ class Dense(RowOperator):
 
     Parameters
     ----------
-    device : Device
     matrix : (M, N) array of real numbers
         InputError where some are not finite, MemoryLimitError where the device has no room for it.
 
@@ -38,9 +36,7 @@ class Dense(RowOperator):
     """
 
     file = "dense"
-    given: tuple[np.ndarray, np.ndarray, np.ndarray] | None = (
-        None  # (A, d, e): it is A / d - diag(e), rounded to float32
-    )
+    given: tuple[np.ndarray, ...] | None = None  # (A, d, e): it is A / d - diag(e), rounded to float32
 
     def __init__(self, device: Device, matrix: Any) -> None:
         host = checks.real("matrix", matrix)
@@ -49,9 +45,10 @@ class Dense(RowOperator):
         checks.finite("matrix", host)
         super().__init__(device, host.shape)
         device.require(4 * host.size, f"a dense matrix {host.shape}")
-        self.defines = {"LANES": 8 if device.is_cpu else 1}
+        self.defines = {"STRIP": 256 if device.is_cpu else 1}
         rows, width = host.shape
         cuts = cut(device, np.full(rows, 4 * max(width, 1)), "the dense matrix")
+        self._ones: Array | None = None
         self.slabs = [Slab(a, b - a, (width, device.upload(host[a:b]))) for a, b in cuts]
 
     def blocks(self) -> Iterator[tuple[int, np.ndarray]]:
@@ -69,27 +66,25 @@ class Dense(RowOperator):
         """Of what `to_arrays` gave; what does not fit together is refused."""
         return cls(device, arrays["matrix"])
 
-    def _bound(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Callable[[], object]:
-        if transpose:
-            return functools.partial(self._transposed_product, x, out, epilogue)
-        return super()._bound(x, out, epilogue, False)
+    def _bound_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:
+        return functools.partial(self._transposed_product, x, out, epilogue)
 
     def _transposed_product(self, x: Array, out: Array, epilogue: Epilogue) -> None:
         """Slab by slab, in chunks of rows where there are more work-items to feed than columns."""
-        lanes = self.defines["LANES"]
-        items, group = (-(-self.shape[1] // _STRIP), 1) if lanes > 1 else (self.shape[1], 64)
+        strip = self.defines["STRIP"]
+        items, group = -(-self.shape[1] // strip), 1 if strip > 1 else 64
         for slab in self.slabs:
-            chunks = 1 if lanes > 1 else max(1, min(_CHUNKS, -(-slab.rows // _CHUNK_ROWS)))
+            chunks = 1 if strip > 1 else max(1, min(_CHUNKS, -(-slab.rows // _CHUNK_ROWS)))
             a, b, y, c = epilogue
             y = out if y is None else y
-            sums, numbers = out, (a, b, c)
-            if chunks > 1:
-                sums, numbers = self.device.empty((chunks, *out.shape)), (a, 0.0, 0.0)
+            sums = out if chunks == 1 else self.device.empty((chunks, *out.shape))
             for offset, width in widths(x.columns):
                 kernel = self.kernel("dense_rmatvec", width, x.columns)
                 place = (slab.rows, slab.first, x.columns, offset)
-                kernel((items, chunks), (group, 1), *place, *numbers, x, y, sums, *slab.arguments)
+                kernel((items, chunks), (group, 1), *place, a, b, c, x, y, sums, *slab.arguments)
             if chunks > 1:
-                kernel = self.kernel("dense_rmatvec_sum", 1, 1)
-                kernel(out.size, 256, out.size, chunks, b, c, x, y, out, sums)
+                self._ones = self._ones or self.device.upload(np.ones(_CHUNKS))
+                place = (chunks, 0, 1, 0, 1.0, 0.0, 0.0)
+                kernel = self.kernel("dense_rmatvec", 1, 1)
+                kernel((out.size, 1), (64, 1), *place, self._ones, out, out, out.size, sums)
             epilogue = Epilogue(a, 1.0, out)  # the following slabs add to what the first has written

@@ -30,7 +30,6 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
         T of each channel, checked. Of S diag(F) that S is taken as it is.
     F : (channels, N)
         First bounces; 0 where a projector pixel is masked, whose column of R is then 0.
-    device : Device
 
     Returns
     -------

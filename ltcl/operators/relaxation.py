@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Methods that read the rows of S = shift I + scale M: sweeps (`kernels/relax.cl`), steps (`southwell.cl`).
 
-A sweep is a blocked forward substitution, x_B += P_BB^-1 (b - S x)_B with the x of the moment, block after
-block: a parallel product of the rows of B with all that is outside it, then what is inside. A CPU takes many
-small blocks in one launch and substitutes row after row; a GPU takes two launches a block and keeps P_BB^-1.
+A sweep is a blocked forward substitution, x_B += P_BB^-1 (b - S x)_B with the x of the moment: a CPU takes
+many small blocks in one launch and substitutes by rows; a GPU takes two launches a block and keeps P_BB^-1.
 """
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,21 +63,15 @@ class Rows:
             P = self.shift * np.eye(len(P)) + self.scale * P.astype(np.float64)
             if omega is not None:
                 P = np.tril(P, -1) + np.diag(P.diagonal() / omega)
-            inverses[B, : len(P)] = _inverse(P, method, start)
+            with contextlib.suppress(np.linalg.LinAlgError):
+                inverse = inverses[B, : len(P)] = np.linalg.inv(P)
+                if np.linalg.norm(P, 1) * np.linalg.norm(inverse, 1) < 1.0 / np.finfo(np.float64).eps:
+                    continue  # NaN is not
+            raise InputError(
+                f"method={method!r} inverts blocks of S; that of rows {start} to {start + len(P) - 1} is "
+                "singular: choose another block= or use method='direct'"
+            )
         return inverses
-
-
-def _inverse(P: np.ndarray, method: str, start: int) -> np.ndarray:
-    try:
-        inverse = np.linalg.inv(P)
-        if np.linalg.norm(P, 1) * np.linalg.norm(inverse, 1) < 1.0 / np.finfo(np.float64).eps:  # NaN is not
-            return inverse
-    except np.linalg.LinAlgError:
-        pass
-    raise InputError(
-        f"method={method!r} inverts blocks of S; that of rows {start} to {start + len(P) - 1} is singular: "
-        "choose another block= or use method='direct'"
-    )
 
 
 def host(M: CSR | Dense) -> Any:
@@ -110,14 +104,22 @@ class Relaxation:
                 weights = rows.inverse_blocks(self.block, omega, method)
             else:
                 weights = rows.inverse_diagonal(method)
-            self.weights = device.upload(weights.astype(np.float32))
-        self.windows = [self.weights for _ in M.slabs]  # of a dense matrix they are not read
-        if isinstance(M, CSR):
-            self.windows = [device.empty((slab.rows, 2), np.int32) for slab in M.slabs]
-            kernel = rows.kernel("relax", "relax_windows", K=1)
-            for slab, windows in zip(M.slabs, self.windows, strict=True):
-                place = (slab.rows, slab.first, self.block, self.panel, int(self.inverses))
-                kernel(slab.rows, 64, *place, *slab.arguments[:2], windows)
+            weights = weights.astype(np.float32)
+        # A CPU reads them as one array, a GPU block by block.
+        parts = np.split(weights, 1 if device.is_cpu else range(self.block, n, self.block))
+        self.weights = [device.upload(part[..., : len(part)]) for part in parts]
+        self.windows = [s.arguments[1] if isinstance(M, Dense) else self._windows(s) for s in M.slabs]
+
+    def _windows(self, slab: Slab) -> Array:
+        """Where `kernels/relax.cl` splits the sparse rows of a slab, (rows, 2), by binary searches."""
+        pointers, columns = slab.arguments[0].get().astype(np.int64), slab.arguments[1].get()
+        row = slab.first + np.arange(slab.rows, dtype=np.int32)
+        split = np.stack([row - row % self.panel, row - row % self.block if self.inverses else row], axis=1)
+        low, high = (np.stack([ends, ends], axis=1) for ends in (pointers[:-1], pointers[1:]))
+        for bit in reversed(range(int(np.diff(pointers).max(initial=0)).bit_length())):
+            last = low + ((1 << bit) - 1)  # taken if the row goes on so far, left of the split
+            low += ((last < high) & (columns.take(last, mode="clip") < split)) * (1 << bit)
+        return self.rows.M.device.upload(low, np.int32)
 
 
 class Sweeps:
@@ -132,11 +134,13 @@ class Sweeps:
         """Queue one sweep."""
         how, (n, k) = self.relaxation, (self.x.shape[0], self.x.columns)
         rows, in_strips = how.rows, self.x.device.is_cpu
+        if not in_strips:
+            self.before.copy_from(self.x)
         for offset, width in widths(k):
             defines = {"K": width, "PACKED": 1} if width == k else {"K": width}
-            sums, correct = (
-                rows.kernel("relax", f"relax_{name}", **defines)
-                for name in ("strips" if in_strips else "rows", "correct")
+            sums = rows.kernel("relax", "relax_strips" if in_strips else "relax_rows", **defines)
+            correct = (
+                sums if in_strips else sums.device.kernel("dense", "dense_matvec_group", STRIP=1, **defines)
             )
             group = min(sums.group(self.group), correct.group(self.group))
             local = self.x.device.local(2 * width * group)
@@ -149,20 +153,17 @@ class Sweeps:
                     if begin < end and in_strips:
                         strips = -(-end // how.block) - begin // how.block
                         more = (strips, n, how.block, int(how.inverses), how.omega or 1.0)
-                        sums(strips, 1, *arguments, *more, how.weights, self._arrivals, self.before)
+                        sums(strips, 1, *arguments, *more, *how.weights, self._arrivals, self.before)
                     elif begin < end:
                         sums((end - begin) * group, group, *arguments, local)
                 if not in_strips:
-                    count = min(how.block, n - start)
-                    place = (start, count, how.block, k, offset, how.weights)
-                    correct(count * group, group, *place, self.x, self.before, self.s, local)
+                    rest = min(how.block, n - start)
+                    place = (rest, 0, k, start * k + offset, 1.0, 1.0, 0.0, self.s, self.x, self.x, rest)
+                    correct(rest * group, group, *place, how.weights[start // how.block], local)
 
 
 def relaxation(S: Operator, method: str, block: int | None = None, omega: float | None = 1.0) -> Relaxation:
-    """Gauss-Seidel and SOR or, where `omega` is None, block Gauss-Seidel.
-
-    Made at the first call and kept with the matrix of S; another omega takes the place of the one before.
-    """
+    """Gauss-Seidel and SOR, or block Gauss-Seidel without omega; kept with the matrix of S, for one omega."""
     rows = readable(S, method)
     kept, key = rows.M.relaxations, (rows.shift, rows.scale, block, omega is None)
     if key not in kept or kept[key].omega != omega:

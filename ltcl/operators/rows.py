@@ -21,7 +21,6 @@ from ltcl.device.kernels import Kernel, Launch
 from ltcl.errors import MemoryLimitError
 from ltcl.operators.base import PLAIN, Epilogue, Norms, Operator, Stepper, widths
 
-_WORTH_TIMING = 1 << 20  # bytes; below, a CPU takes as long to launch a product as to make it
 _KEEP, _GAIN, _GROUP_AT = 6, 7, 8  # arguments of a step that change, see kernels/common/product.h
 
 
@@ -116,11 +115,11 @@ class RowOperator(Operator):
 
     def variants(self) -> dict[str, Variant]:
         """The kernels and work-groups that make a product here, the default first."""
-        item = Variant("", 16 if self.device.is_cpu else 64, shared=False)
         if self.device.is_cpu:
-            return {"stream": Variant("_stream", 16, shared=False), "item": item}
+            return {"item": Variant("", 16, shared=False)}
         groups = [size for size in (32, 64, 128, 256) if size <= self.device.max_group]
-        return {**{f"group{size}": Variant("_group", size, shared=True) for size in groups}, "item": item}
+        shared = {f"group{size}": Variant("_group", size, shared=True) for size in groups}
+        return shared | {"item": Variant("", 64, shared=False)}
 
     def fastest(self, x: Array, width: int) -> Variant:
         """The variant for products with `width` of the right-hand sides `x`, timed at the first call."""
@@ -131,7 +130,7 @@ class RowOperator(Operator):
 
     def _measure(self, x: Array, width: int) -> Variant:
         variants, slab = self.variants(), max(self.slabs, key=lambda slab: slab.nbytes)
-        if self.device.is_cpu and slab.nbytes < _WORTH_TIMING:
+        if len(variants) == 1:
             return next(iter(variants.values()))
         # Timed on the real matrix, into an array nobody needs: `out` may be an operand.
         spare = self.device.empty((self.shape[0], *x.shape[1:]))
@@ -160,13 +159,16 @@ class RowOperator(Operator):
 
     def _bound(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> Callable[[], object]:
         if transpose:
-            return self.transposed_copy()._bound(x, out, epilogue, False)
+            return self._bound_transpose(x, out, epilogue)
         launches = [
             self._launch(self.fastest(x, width), slab, x, out, offset, width, epilogue)
             for offset, width in widths(x.columns)
             for slab in self.slabs
         ]
         return launches[0] if len(launches) == 1 else lambda: [launch() for launch in launches]
+
+    def _bound_transpose(self, x: Array, out: Array, epilogue: Epilogue) -> Callable[[], object]:
+        return self.transposed_copy()._bound(x, out, epilogue, False)
 
     def stepper(self, x: Array, r: Array, slots: int = 8, a: float = 1.0, c: float = 0.0) -> Stepper:
         """Steps of one launch each; see `Operator.stepper`."""

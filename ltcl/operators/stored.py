@@ -2,12 +2,11 @@
 """Bases by name; operators S = I + R and bases as plain arrays, which files hold, and made of such again.
 
     system_0.sign, .solution_error, .weights    of each channel; weights where S has them
-    system_0.R.kind                             "csr", "dense", "tiles" or "compressed"
-    system_0.R.error                            of what was dropped
+    system_0.R.kind, .error                     "csr", "dense", "tiles" or "compressed"; of what was dropped
     system_0.R.core.kind, ...                   of "compressed", with .out and .into: bases, -1 of pixels
     basis_0.name, ...                           as `Basis.to_arrays` has it; one that is shared is there once
 
-Nothing is believed that these say: constructors check every size and index, before anything is uploaded.
+Constructors check every size and index, before anything is uploaded.
 """
 
 from __future__ import annotations
@@ -48,15 +47,7 @@ def to_arrays(systems: Sequence[IdentityPlus]) -> Arrays:
 
 
 def from_arrays(device: Device, arrays: Mapping[str, np.ndarray]) -> tuple[IdentityPlus, ...]:
-    """The S of all channels, of what `to_arrays` gave; arrays that do not fit each other are refused.
-
-    >>> import ltcl
-    >>> device = ltcl.open_device()
-    >>> S = IdentityPlus(Dense(device, [[0.0, 0.5], [0.5, 0.0]]), solution_error=0.01)
-    >>> (again,) = from_arrays(device, to_arrays([S]))
-    >>> again.to_dense().tolist(), again.solution_error
-    ([[1.0, 0.5], [0.5, 1.0]], 0.01)
-    """
+    """The S of all channels, of what `to_arrays` gave; arrays that do not fit each other are refused."""
     bases = functools.cache(
         lambda number: None if number == -1 else basis_of(device, under(arrays, f"basis_{number}"))
     )
@@ -141,11 +132,8 @@ def basis_of(device: Device, arrays: Mapping[str, Any]) -> Basis:
     if missing := sorted({"name", "grid"} - set(arrays)):
         raise InputError(f"the arrays of a basis lack {' and '.join(missing)}; compress again")
     name, grid, levels = str(arrays["name"]), tuple(np.ravel(arrays["grid"]).tolist()), arrays.get("levels")
-    W = (
-        basis(device, grid, name)
-        if levels is None
-        else Wavelet(device, grid, name, np.asarray(levels).tolist())
-    )
+    levels = None if levels is None else np.asarray(levels).tolist()
+    W = basis(device, grid, name) if levels is None else Wavelet(device, grid, name, levels)
     if "places" in arrays:
         return SubsetBasis(device, grid, arrays["places"], W)
     if W is None:

@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Sparse matrices as rows of tiles of narrow numbers, y = A x by `kernels/tile.cl`.
 
-A tile is 1 or 8 neighbouring columns of a row under one column index, of 16 bits where the matrix has no more
-columns than that: an entry takes 1.4 to 6 bytes where compressed sparse rows take 8. Tiles are laid greedily
-from left to right, each beginning at the first nonzero that none before holds: there is no layout of fewer.
-The numbers are rounded to nearest,
-
-    a = unit * scale of the tile * code
-
-float32 stands as it is. The others share a power of two, `unit`, that brings the largest near the top of
-float16: subnormal numbers, which are left out since some devices take them for zeros, are below 2^-28 of the
-largest. Codes of int8 share a scale in a tile, of 5 bits of exponent and 3 of fraction, so that such a number
-has 11 significant bits at most: float16 holds it exactly.
+A tile is 1 or 8 neighbouring columns of a row under one column index, of 16 bits where that suffices: entries
+take 1.4 to 6 bytes where compressed sparse rows take 8. Tiles are laid greedily from left to right, each
+beginning at the first nonzero that none before holds: there is no layout of fewer. Numbers are rounded to
+nearest, a = unit * scale of the tile * code. `unit`, a power of two, brings the largest near 2^15:
+subnormal numbers, which are left out since some devices take them for zeros, are below 2^-28 of the largest.
+Codes of int8 share a scale of 5 bits of exponent and 3 of fraction: float16 holds such a number exactly.
 """
 
 from __future__ import annotations
@@ -31,7 +26,7 @@ from ltcl.errors import InputError
 from ltcl.operators.rows import RowOperator, Slab, cut
 
 WIDTHS = (1, 8)
-# In the order of VALUES in kernels/common/tile_sums.h.
+# In the order of VALUES in kernels/tile.cl.
 PRECISIONS: dict[str, Any] = {"float32": np.float32, "float16": np.float16, "int8": np.int8}
 _EXACT = {"float32": "float32", "float16": "float16", "int8": "float16"}  # holds its numbers without scales
 _LEAST = 2.0**-14  # of float16 that is not subnormal
@@ -110,18 +105,13 @@ class Tiles(RowOperator):
 
     Parameters
     ----------
-    device : Device
     matrix : scipy.sparse matrix or array, (M, N)
         Or what `pack` made of one. Refused as by `CSR`; InputError where a value is infinite in float32, too.
     width : 1 or 8
         Neighbouring columns of a tile; 1 is for scattered nonzeros.
     precision : str
-        "float32", "float16" (11 significant bits) or "int8" (7, with a scale a tile).
-
-    Attributes
-    ----------
-    quantisation, error : float
-        Frobenius norm of what rounding changed, and a bound on its 2-norm.
+        "float32", "float16" (11 significant bits) or "int8" (7, with a scale a tile). `quantisation` and
+        `error` are the Frobenius norm of what rounding changed, and a bound on its 2-norm.
 
     Examples
     --------

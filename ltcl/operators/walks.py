@@ -3,17 +3,14 @@
 
     y_i = sum over k = 1 .. of c_k (R^k b)_i      (eq. 22 and 23 without the term of k = 0)
 
-A step goes from i to j with chance p(j | i) = |R_ij| / |R_i|, |R_i| = sum_j |R_ij| (eq. 25), the sign kept
-with the column: one load of 8 bytes, from tables that `kernels/alias.cl` builds once. `Linked` tables step by
-other chances p and multiply the weight by R_ij / p(j | i), from a second load. So channels share a walk; of
-all p
+A step goes from i to j with chance p(j | i) = |R_ij| / |R_i|, |R_i| = sum_j |R_ij| (eq. 25), by alias tables
+that `kernels/walk.cl` builds. `Linked` tables step by other chances p and multiply the weight by
+R_ij / p(j | i), from a second load. So channels share a walk; of all p
 
     p(j | i) = P_ij / |P_i|,  P_ij^2 = mean over channels c of (R_cij / |R_ci|)^2
 
 has the least sum of the second moments of a step, each in units of those that the channel has by itself.
-
-The seed, i and s determine the random numbers of sample s of pixel i: results are the same to the bit on
-every device, however launches are split, and whether other pixels are asked for or not.
+Results are the same to the bit on every device, however launches are split, whatever pixels are asked for.
 """
 
 from __future__ import annotations
@@ -35,6 +32,7 @@ from ltcl.operators.relaxation import host, readable
 
 CHUNK = 64  # samples that are summed on the device
 _COLUMNS = 1 << 22  # that an entry of 64 bits can tell apart
+_PLAIN = {"CHANNELS": 1, "CHUNK": CHUNK, "WALKS": 1, "K": 1, "LINKED": 0}
 _HOST_BYTES = 64  # an entry, while linked tables are made
 _CERTAIN = 1 << 22  # chances to go on, of as many
 _NEVER = 64  # walks of a length whose chance is below 2^-64 are cut: nobody will see one
@@ -44,10 +42,7 @@ _STEPS = 1 << 23  # mean steps of one launch for each compute unit: half a secon
 
 
 class Tables:
-    """What a walk over the rows of M needs, see `kernels/common/table.h`; made by `tables`, which keeps it.
-
-    Of M^T, with `spare` entries, there is room for one more row, see `append`.
-    """
+    """What walks over the rows of M need (`kernels/walk.cl`); with `spare` entries, of M^T and a row more."""
 
     channels = 1
     links: Array | None = None
@@ -86,7 +81,7 @@ class Tables:
         return [_like(R, sums @ abs(rows))]
 
     def _build(self, *arguments: Any) -> None:
-        kernel = self.device.kernel("alias", "alias_rows")
+        kernel = self.device.kernel("walk", "walk_tables", **_PLAIN)
         kernel(arguments[0], 1 if self.device.is_cpu else 64, *arguments, self.records, self.entries)
 
     def _refuse_overflow(self, name: str, rows: slice) -> None:
@@ -101,8 +96,7 @@ class Tables:
 class Linked(Tables):
     """What a walk over three matrices needs, by chances of its own; 24 bytes an entry of any channel.
 
-    `links`, (entries, 4) uint32, hold the column of each entry and the bits of the factors R_cij / p(j | i);
-    `others` are the matrices but the first, which keeps these tables, found by the ids of all.
+    `links`, (entries, 4) uint32, hold the column of each entry and the bits of the factors R_cij / p(j | i).
     """
 
     def __init__(self, Rs: Sequence[CSR | Dense], signs: Sequence[float]) -> None:
@@ -121,7 +115,8 @@ class Linked(Tables):
         values = np.sqrt(P.data / len(Rs))
         places = np.arange(P.nnz) - P.indptr[row]
         super().__init__(CSR(device, scipy.sparse.csr_array((values, places, P.indptr), shape=P.shape)))
-        self.others, self.channels, self._pattern = tuple(Rs[1:]), len(Rs), (P.indices, P.indptr)
+        self._others = tuple(Rs[1:])  # kept alive, since their ids find these tables
+        self.channels, self._pattern = len(Rs), (P.indices, P.indptr)
         self._chances = values.astype(np.float32) / self.sums()[row].astype(np.float64)
         links = np.zeros((P.nnz, 4), np.uint32)
         links[:, 0] = P.indices
@@ -193,11 +188,10 @@ def _like(M: CSR | Dense, host: Any) -> CSR | Dense:
 
 @dataclass(frozen=True)
 class Lengths:
-    """How long walks are, and what they estimate.
+    """How long walks are: coefficients c_1 .. c_L, (L,) float64, and the chance `go_on` of one more step.
 
-    `coefficients`, (L,) float64, are c_1 .. c_L: no walk has more than L steps. `go_on` is the chance q of
-    each other step to be followed by one more. Walks score at every step; those `from_b`, which have a step
-    before, from the row of b to where they start, score where they end (eq. 26), one record a walk.
+    Walks score at every step; those `from_b`, which have a step before, from the row of b to where they
+    start, score where they end (eq. 26), one record a walk.
     """
 
     coefficients: np.ndarray
@@ -206,11 +200,7 @@ class Lengths:
 
     @classmethod
     def geometric(cls, q: float, sign: float, from_b: bool = False) -> Lengths:
-        """Of the series sum of sign^k R^k: p(k) = (1 - q) q^(k-1), which is eq. 24 with q = m / (1 - m).
-
-        >>> Lengths.geometric(0.5, -1.0).coefficients[:3].tolist()
-        [-1.0, 1.0, -1.0]
-        """
+        """Of the series sum of sign^k R^k: p(k) = (1 - q) q^(k-1), which is eq. 24 with q = m / (1 - m)."""
         q = max(1, round(q * _CERTAIN)) / _CERTAIN  # never 0, which would leave terms out
         return cls(sign ** np.arange(1, 2 + int(np.ceil(_NEVER / -np.log2(q)))), q, from_b)
 
@@ -267,8 +257,7 @@ class Walker:
     def rows(self, b: Array, pixels: np.ndarray, samples: int, stream: int = 0) -> Sums:
         """`samples` samples of each of the `pixels`, (P,); those of another stream are independent of them.
 
-        All right-hand sides b, (N,) or (N, k), share the walks. Of walks with three weights column j is of
-        channel j % 3, and there are as many of each.
+        All right-hand sides b, (N,) or (N, k), share the walks; of three channels column j is of j % 3.
         """
         made, device, channels = self.tables, self.tables.device, self.tables.channels
         steps = device.upload(self.lengths.steps(), np.uint32)
@@ -294,10 +283,7 @@ class Walker:
         return Sums(samples, total, squares)
 
     def columns(self, samples: int, stream: int = 0) -> Sums:
-        """Of `samples` walks from b, by `tables_of_columns`, which b was appended to, and lengths `from_b`.
-
-        The sums are those of every pixel, (N,). A sample adds to one of them; it counts as 0 to the others.
-        """
+        """Sums of every pixel, (N,), of walks from b, which was appended to `tables_of_columns`, `from_b`."""
         made, device, n = self.tables, self.tables.device, self.tables.shape[0]
         steps = device.upload(self.lengths.steps(), np.uint32)
         total, squares = np.zeros((2, n))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Orthonormal 2-D wavelets, periodized, of grids of any size (`kernels/wavelet.cl`).
 
-Coefficients stand as PyWavelets arranges them (`coeffs_to_array`), the approximation in the top left corner.
-Where all sides halve evenly they equal those of its ``wavedec2(..., mode="periodization")``. Where one does
-not, PyWavelets repeats the last sample; here it stands for fewer pixels than the others and passes by the
-filters into the approximation: as many coefficients as pixels, and one of a constant picture on every grid.
+Coefficients stand as PyWavelets arranges them (`coeffs_to_array`); where all sides halve evenly they equal
+those of its ``wavedec2(..., mode="periodization")``. Where one does not, PyWavelets repeats the last sample;
+here it stands for fewer pixels than the others and passes by the filters into the approximation: as many
+coefficients as pixels, and one of a constant picture on every grid.
 """
 
 from __future__ import annotations
@@ -28,13 +28,10 @@ class Wavelet(Basis):
 
     Parameters
     ----------
-    device : Device
-    grid : (h, w)
-        Of any sides.
+    grid : (h, w), of any sides
     name : str
         An orthonormal wavelet of PyWavelets, "haar", "db2" (the paper's), "sym8", ...; InputError for others.
-    levels : int, optional
-        How often the approximation is split; until one pixel is left when not given.
+    levels : int, how often the approximation is split; until one pixel is left when not given
 
     Examples
     --------
@@ -87,11 +84,7 @@ class Wavelet(Basis):
 
 
 def filters(name: Any) -> np.ndarray:
-    """Low-pass and high-pass filter of an orthonormal wavelet, (2, taps) float64, in the order of samples.
-
-    >>> filters("haar").round(4).tolist()
-    [[0.7071, 0.7071], [0.7071, -0.7071]]
-    """
+    """Low-pass and high-pass filter of an orthonormal wavelet, (2, taps) float64, in the order of samples."""
     offered = "an orthonormal wavelet of PyWavelets, such as haar, db2, sym8 or coif1"
     if name not in _pywt.wavelist(kind="discrete"):
         raise InputError(f"wavelet is {name!r}; it must be {offered}")

@@ -3,11 +3,8 @@
 
 Row sums tell whether the plain iteration is best. Else a survey is made once in the life of S, three steps of
 GMRES from a random picture: Ritz values estimate the spectrum, residuals how fast Krylov methods converge,
-directions whether S is self-adjoint. Of the methods that fit, the one with the least estimated time is taken:
-
-    products (bytes of S and of vectors / bandwidth) + launches x launch time + waits x wait time,
-
-with bandwidth and times measured once per device.
+directions whether S is self-adjoint. The method with the least estimated time is taken: bytes over bandwidth,
+launches and waits of its products, as measured once per device.
 """
 
 from __future__ import annotations
@@ -26,8 +23,7 @@ from ltcl.device import Device, tuning, vectors
 from ltcl.operators import IdentityPlus, Operator
 from ltcl.operators.rows import RowOperator
 from ltcl.solvers import precision
-from ltcl.solvers.cg import CG
-from ltcl.solvers.gmres import GMRES, KrylovSpace
+from ltcl.solvers.krylov import CG, GMRES, KrylovSpace
 from ltcl.solvers.precision import Direct
 from ltcl.solvers.stationary import Chebyshev, Jacobi, drawn_in
 
@@ -46,19 +42,14 @@ _STEPS = {"jacobi": (4, 1, 0.5), "chebyshev": (4, 1, 0.5), "cg": (9, 3, 0.5), "g
 class Survey:
     """Complex Ritz values of S, an interval around their real parts, within the free bounds, and more.
 
-    `falls` are the relative residuals of GMRES after 0, 1, ... products; `defect` is the part of R that is
+    `residuals` are those of GMRES after 0, 1, ... products, relative; `defect` is the part of R that is
     not self-adjoint in the inner product of `S.weights`, or the plain one: 0 where it is, 1 of a rotation.
     """
 
     ritz: np.ndarray
     spectrum: tuple[float, float]
-    falls: tuple[float, ...]
+    residuals: tuple[float, ...]
     defect: float
-
-    @property
-    def products(self) -> int:
-        """Made for it."""
-        return len(self.falls) - 1
 
     @property
     def in_an_interval(self) -> bool:
@@ -73,20 +64,18 @@ class Survey:
 
     def krylov_products(self, rtol: float) -> float:
         """Products of a Krylov method to `rtol`; infinite where it stalls."""
-        for step, residual in enumerate(self.falls):
-            if residual <= rtol:
-                return float(step)
-        factor = self.falls[-1] / self.falls[-2]
-        if not factor < 1.0:
-            return math.inf
-        return self.products + float(math.ceil(math.log(rtol / self.falls[-1]) / math.log(factor)))
+        if self.residuals[-1] <= rtol:  # they never grow
+            return float(np.argmax(np.array(self.residuals) <= rtol))
+        factor = self.residuals[-1] / self.residuals[-2]
+        missing = math.log(rtol / self.residuals[-1]) / math.log(factor) if factor < 1.0 else math.inf
+        return len(self.residuals) - 1.0 + float(np.ceil(missing))
 
     def __str__(self) -> str:
         real, imaginary = np.real(self.ritz), np.imag(self.ritz)
         least, most = np.min(real, initial=np.inf), np.max(real, initial=-np.inf)
-        turning = "" if self.in_an_interval else f" with imaginary parts up to {np.max(imaginary):.2g}"
-        between = f"eigenvalues of S seen between {least:.2g} and {most:.2g}{turning}"
-        return f"{self.defect:.2g} of R is not self-adjoint, {between} by {self.products} products"
+        rotation = "" if self.in_an_interval else f" with imaginary parts up to {np.max(imaginary):.2g}"
+        spectrum = f"eigenvalues of S seen between {least:.2g} and {most:.2g}{rotation}"
+        return f"{self.defect:.2g} of R is not self-adjoint, {spectrum} by {len(self.residuals) - 1} products"
 
 
 _surveys: weakref.WeakKeyDictionary[Operator, Survey] = weakref.WeakKeyDictionary()
@@ -97,15 +86,13 @@ def survey(S: Operator) -> Survey:
     if S in _surveys:
         return _surveys[S]
     start = S.device.upload(np.random.default_rng(0).uniform(size=S.shape[0]))
-    space, falls = KrylovSpace(S, start, np.ones(1), min(STEPS, S.shape[0])), [1.0]
-    for _ in range(space.steps):
+    space, residuals, ended = KrylovSpace(S, start, np.ones(1), min(STEPS, S.shape[0])), [1.0], False
+    while space.count < space.steps and not ended:
         ended = space.extend()[0]
-        falls.append(float(space.residuals[0]))
-        if ended:
-            break
+        residuals.append(float(space.residuals[0]))
     ritz = space.ritz_values()
     spectrum = drawn_in(theory.free_bounds(S), S, ritz)
-    _surveys[S] = Survey(ritz, spectrum, tuple(falls), _defect(S, space))
+    _surveys[S] = Survey(ritz, spectrum, tuple(residuals), _defect(S, space))
     return _surveys[S]
 
 
@@ -113,20 +100,19 @@ def _defect(S: Operator, space: KrylovSpace) -> float:
     """||G - G^T|| / 2 ||G|| of G = V^T W R V, from S V = V H: products that are made already."""
     steps = space.count
     basis = [dataclasses.replace(space.V.rows(j, 1), shape=S.shape[:1]) for j in range(steps + 1)]
-    products = S.device.empty((steps * (steps + 1), 1))  # <v_i, W v_j>, read in one go
+    gram = S.device.empty((steps * (steps + 1), 1))  # <v_i, W v_j>, read in one go
     weights = None if S.weights is None else S.device.upload(S.weights / np.max(S.weights))
     for j, v in enumerate(basis[:steps]):
         wv = v if weights is None else vectors.scale_rows(weights, v, v.like())
         for i, u in enumerate(basis):
-            vectors.queue_dot(u, wv, products, j * (steps + 1) + i)
-    gram = products.get().reshape(steps, steps + 1).astype(np.float64)
-    G = gram @ (space.H[0, : steps + 1, :steps] - np.eye(steps + 1, steps))
-    whole = 2.0 * float(np.linalg.norm(G))
-    return float(np.linalg.norm(G - G.T)) / whole if whole > 0.0 else 0.0
+            vectors.queue_dot(u, wv, gram, j * (steps + 1) + i)
+    R = space.H[0, : steps + 1, :steps] - np.eye(steps + 1, steps)
+    G = gram.get().reshape(steps, steps + 1).astype(np.float64) @ R
+    return float(np.linalg.norm(G - G.T) / (2.0 * np.linalg.norm(G) or 1.0))
 
 
 class _Candidate(NamedTuple):
-    """A method, the products it will need, and the seconds that they take, roughly."""
+    """A method, and what it needs, roughly."""
 
     method: Any
     products: float
@@ -154,25 +140,25 @@ def plan(S: Operator, rtol: float, columns: int = 1) -> Iterator[tuple[Any, str,
     if not math.isfinite(rho):
         yield GMRES(), "gmres: it needs no bounds, and row sums of S leave float32", 0
         return
-    plain = _iterative(S, columns, Jacobi(), theory.series_products(rho, rtol))
-    free = _iterative(S, columns, Chebyshev(), theory.chebyshev_products(*theory.free_bounds(S), rtol))
+    plain = _candidate(S, columns, Jacobi(), theory.series_products(rho, rtol))
+    free = _candidate(S, columns, Chebyshev(), theory.chebyshev_products(*theory.free_bounds(S), rtol))
     if plain.products <= free.products:
         yield plain.method, f"{plain}, {free}; row sums of R are at most {rho:.2g}", 0
     made_before = S in _surveys
-    seen = survey(S)
-    products = seen.krylov_products(rtol)
-    candidates = [_iterative(S, columns, GMRES(), products)]
-    if seen.in_an_interval:
-        if seen.self_adjoint:
-            candidates.append(_iterative(S, columns, CG(), products + 1))  # which confirms its end
-        products = theory.chebyshev_products(*seen.spectrum, rtol)
-        candidates.append(_iterative(S, columns, Chebyshev(seen.spectrum), products))
+    surveyed = survey(S)
+    products = surveyed.krylov_products(rtol)
+    candidates = [_candidate(S, columns, GMRES(), products)]
+    if surveyed.in_an_interval:
+        if surveyed.self_adjoint:
+            candidates.append(_candidate(S, columns, CG(), products + 1))  # which confirms its end
+        products = theory.chebyshev_products(*surveyed.spectrum, rtol)
+        candidates.append(_candidate(S, columns, Chebyshev(surveyed.spectrum), products))
     if n <= LARGEST_DIRECT and isinstance(S.R if isinstance(S, IdentityPlus) else S, RowOperator):
-        candidates.append(_factorization(S, columns))
-    candidates.sort(key=lambda one: one.seconds)
+        candidates.append(_candidate(S, columns, Direct()))
+    candidates.sort(key=lambda candidate: candidate.seconds)
     first = candidates[0].method
-    reasons = f"{', '.join(map(str, candidates))}; {seen}{' made before' if made_before else ''}"
-    yield first, reasons, 0 if made_before else seen.products
+    reasons = f"{', '.join(map(str, candidates))}; {surveyed}{' made before' if made_before else ''}"
+    yield first, reasons, 0 if made_before else len(surveyed.residuals) - 1
     if not isinstance(first, GMRES):
         yield GMRES(), "gmres: next, as it needs no bounds", 0
     if n <= LARGEST_DIRECT and not isinstance(first, Direct):
@@ -192,17 +178,15 @@ def _measured(device: Device) -> tuple[float, float, float, float]:
     return _speeds[device]
 
 
-def _iterative(S: Operator, columns: int, method: Any, products: float) -> _Candidate:
-    (moved, launches, waits), (bandwidth, launch, wait, _) = _STEPS[method.name], _measured(S.device)
+def _candidate(S: Operator, columns: int, method: Any, products: float = 0) -> _Candidate:
+    """The time of so many products; of a dense factorization, where it is not there yet, and its use."""
+    n, (bandwidth, launch, wait, flops) = S.shape[0], _measured(S.device)
+    if isinstance(method, Direct):
+        factorize = 0.0 if S in precision.factors else 2.0 / 3.0 * n**3
+        read = 16.0 * n * n / bandwidth  # both triangles, and S for the residual
+        return _Candidate(method, 0, (factorize + 4.0 * n * n * columns) / flops + read)
+    moved, launches, waits = _STEPS[method.name]
     passes = math.ceil(columns / _AT_ONCE)
-    nbytes = S.nbytes * passes + 4.0 * S.shape[0] * columns * moved
+    nbytes = S.nbytes * passes + 4.0 * n * columns * moved
     seconds = nbytes / bandwidth + passes * launches * launch + waits * wait
     return _Candidate(method, products, products * seconds)
-
-
-def _factorization(S: Operator, columns: int) -> _Candidate:
-    """A dense factorization, where it is not there yet, and its use."""
-    n, (bandwidth, _, _, flops) = S.shape[0], _measured(S.device)
-    factorize = 0.0 if S in precision.factors else 2.0 / 3.0 * n**3
-    read = 16.0 * n * n / bandwidth  # both triangles, and S for the residual
-    return _Candidate(Direct(), 0, (factorize + 4.0 * n * n * columns) / flops + read)

@@ -2,18 +2,16 @@
 """Least squares within bounds: min ||w (A x - b)|| over lower <= x <= upper, by products with A and A^T.
 
 Projected conjugate directions. With r = w (b - A x), g = -A^T w r, and z = -g but for what the bounds forbid,
-a step is
 
     p = z + beta d,   d' = clip(x + alpha p) - x,   x' = x + lambda d'
 
 with beta that makes p conjugate to the last d, alpha the step of Barzilai and Borwein, and lambda exact along
-d' or as far as the bounds allow. On a face of the box these are conjugate gradients; clipping changes many
-active bounds at once, as projected gradients do (Moré and Toraldo, SIAM J. Optimization 1, 1991, take the two
-in turns). Where the last lambda was short, or 0 as p did not descend, p = z. A step is six launches and two
-products: fewer than FISTA with restarts and MPRGP (Dostál) take.
+d' or as far as the bounds allow: conjugate gradients on a face of the box, while clipping changes many active
+bounds at once, as projected gradients do (Moré and Toraldo, SIAM J. Optimization 1, 1991, take the two in
+turns). Where the last lambda was short, or 0 as p did not descend, p = z. A step is two products.
 
-A certificate comes with the gradient. For all y in the box g.(y - x) >= -gap with the Frank-Wolfe gap
-sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)); hence of the least error ||r*||, by Cauchy and Schwarz,
+A certificate comes with the gradient. With the Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i -
+upper_i)), the least error is by Cauchy and Schwarz
 
     ||r*|| >= r.r* / ||r|| >= ||r|| - gap / ||r||,
 
@@ -32,10 +30,10 @@ from numpy.typing import ArrayLike
 
 from ltcl.device import vectors
 from ltcl.operators import Operator
-from ltcl.solvers.columns import Columns, ratio
+from ltcl.solvers.krylov import Columns, ratio
 from ltcl.solvers.result import Solution, Status
 
-_KERNELS = ("bounded_direction", "bounded_weigh", "bounded_move", "bounded_look")
+_KERNELS = ("bounded_direction", "vector_dots", "bounded_move", "bounded_look")
 _ROUNDING = 2.0**-22  # of ||w b||: an error is not told from the least one by less
 _FAR = 1e30  # in units of b: a bound where none was meant, inside float32
 Box = tuple[np.ndarray, np.ndarray]  # lower, upper (N,)
@@ -62,12 +60,8 @@ class Bounded(Solution):
     gap: float
 
     def __str__(self) -> str:
-        return (
-            f"bounded: {self.status.name.lower()} after {self.iterations} iterations, "
-            f"{self.products} products, relative error {self.residuals[-1]:.2g}, "
-            f"at most {self.gap:.2g} above the least"
-            f"{'' if self.converged else f': {self.status.value}'}"
-        )
+        why = "" if self.converged else f": {self.status.value}"
+        return f"{self._outcome()}, at most {self.gap:.2g} above the least{why}"
 
 
 def minimise(
@@ -85,21 +79,11 @@ def minimise(
 ) -> Bounded:
     """The x within the bounds for which A x is nearest to b; STAGNATED where rounding hides any further gain.
 
-    Parameters
-    ----------
-    A : (M, N) Operator
-        With columns of like size, for instance S.
-    b, weights : (M, k)
-        The weights are not negative; ones when not given.
-    lower, upper : (N,)
-        Finite, of all columns alike; x is within them as float64 numbers, too.
-    x0 : (N, k)
-        Start; what lies outside the bounds is moved there.
-    rtol, atol : float
-        Done when the error, or what it is above the least possible one, is at most
-        ``max(rtol ||w b||, atol)`` in every column. Where b = 0, rtol is of the error at the start.
-    maxiter : int
-    callback : callable(iteration, relative gap), optional
+    A is (M, N) with columns of like size, for instance S; b and the weights w >= 0, ones when not given, are
+    (M, k), the finite bounds (N,), and the start x0 (N, k) is moved within. x is within the bounds as float64
+    numbers, too. Done when the error, or what it is above the least possible one, is at most
+    ``max(rtol ||w b||, atol)`` in every column; where b = 0, rtol is of the error at the start.
+    ``callback(iteration, relative gap)`` hears of each step.
     """
     start = time.perf_counter()
     largest = float(np.max(np.abs(b)))
@@ -138,19 +122,11 @@ def minimise(
     errors, held = np.where(worse, initial, errors), np.where(worse, False, descent.held(x))
     excess = np.where(worse, np.maximum(initial - least + 2.0 * hidden, _ROUNDING * scale), excess)
     x = (np.where(worse, first, x) * unit).astype(np.float32)
-    return Bounded(
-        x=np.clip(x, *(bound[:, None] for bound in inwards(lower, upper))),
-        status=status,
-        iterations=len(residuals) - 1,
-        products=descent.products,
-        residuals=tuple(residuals),
-        seconds=time.perf_counter() - start,
-        method="bounded",
-        errors=errors * unit * unit_w,
-        least=np.maximum(least - hidden, 0.0) * unit * unit_w,
-        held=held,
-        gap=float(np.max(excess / scale)),
-    )
+    x = np.clip(x, *(bound[:, None] for bound in inwards(lower, upper)))
+    history = len(residuals) - 1, descent.products, tuple(residuals), time.perf_counter() - start
+    least = np.maximum(least - hidden, 0.0) * unit * unit_w
+    certificate = {"errors": errors * unit * unit_w, "least": least, "gap": float(np.max(excess / scale))}
+    return Bounded(x, status, *history, "bounded", held=held, **certificate)
 
 
 def inwards(lower: ArrayLike, upper: ArrayLike) -> Box:
@@ -168,35 +144,35 @@ def inwards(lower: ArrayLike, upper: ArrayLike) -> Box:
 
 
 class _Descent:
-    """The iterate and, on the device, r = w (b - A x), g = -A^T w r, d, and h = A^T w^2 A d."""
+    """The iterate and, on the device, r = b - A x, u = w^2 r, g = -A^T u, d, and h = A^T w^2 A d."""
 
     def __init__(self, A: Operator, b: np.ndarray, w: np.ndarray | None, box: Box, x: np.ndarray) -> None:
         device, self.A, self.products, self._box = A.device, A, 0, box
         self.scale = np.linalg.norm(b if w is None else w * b, axis=0)
         self._largest_weight = 1.0 if w is None else float(np.max(w))
         self.b, self.x, *bounds = (device.upload(values) for values in (b, x, *box))
-        columns = Columns(self.x, "bounded", *_KERNELS)
+        columns = Columns(self.x, *_KERNELS)
         k, slices, weighted = columns.k, columns.slices, int(w is not None)
         self._slices, self._resting = slices, np.zeros(k, bool)
         self._rest = device.upload(self._resting, np.int32)
         numbers = np.zeros((4 + 3 * slices, k))
         numbers[0] = 1.0  # the first alpha
         self._numbers = numbers = device.upload(numbers)
-        sums, shares, curvatures, self._norms = (columns.sums(count) for count in (2, 1, 1, 1))
+        sums, shares, curvatures = (columns.sums(count) for count in (2, 1, 1))
         self.r, Ad = self.b.like(), self.b.like()
-        self._u = self.r.like() if weighted else self.r  # w r
-        W = self.r if w is None else device.upload(w)
+        self._u = self.r.like() if weighted else self.r
+        W = self.r if w is None else device.upload(np.square(w))
         self.g, self._q, d, h = (vectors.fill(self.x.like(), 0.0) for _ in range(4))
-        around, rows, (direction, weigh, move, look) = (*bounds, self.x), b.shape[0], _KERNELS
-        self._weigh_r = columns.bind(weigh, 2 * weighted, W, self.r, self._u, self._norms, rows=rows)
+        around, rows, (direction, dots, move, look) = (*bounds, self.x), b.shape[0], _KERNELS
         self._look_anew = columns.bind(look, 1, *around, self._q, self.g, h, numbers)
         to_d = (slices, self._rest, numbers, *around, self.g, d, sums, shares)
-        to_x = (rows, slices, weighted, numbers, sums, shares, curvatures, *bounds, d, self.x, W, Ad, self.r)
+        to_x = (weighted, numbers, sums, shares, curvatures, *bounds, d, self.x, W, Ad, self.r, self._u)
+        self._weigh_r = columns.bind(move, rows, 0, *to_x, extra=4)
         self._queued = (
             columns.bind(direction, *to_d, extra=2),
             A.bind(d, Ad),
-            columns.bind(weigh, weighted, W, Ad, self._u, curvatures, rows=rows),
-            columns.bind(move, *to_x, self._u, extra=4),
+            columns.bind(dots, 0, 0, weighted, W, Ad, Ad, Ad, curvatures, rows=rows),
+            columns.bind(move, rows, slices, *to_x, extra=4),
             A.bind(self._u, self._q, transpose=True),
             columns.bind(look, 0, *around, self._q, self.g, h, numbers),
         )
@@ -206,7 +182,6 @@ class _Descent:
         """r and g from x itself, instead of by recursion."""
         self.A.apply(self.x, self.r, scale=-1.0, add=self.b)
         self._weigh_r()
-        self._numbers.set_rows(4 + 2 * self._slices, self._norms)
         self.A.apply_transpose(self._u, self._q)
         self._look_anew()
         self.products += 2

@@ -22,7 +22,7 @@ from ltcl.operators import IdentityPlus, Operator, stored
 from ltcl.operators.interreflection import nbytes
 from ltcl.solvers.bounded import inwards
 from ltcl.solvers.result import Solution, Status
-from ltcl.solvers.solve import scale_rhs, unscale
+from ltcl.solvers.stopping import scale_rhs, unscale
 
 _ARRAYS = ("grid", "first_bounce", "errors", "confidence")
 
@@ -34,24 +34,20 @@ class Inverse:
     ----------
     bounces : sequence of 1 or 3 Operator, (N, N)
         A of each channel.
-    errors : sequence of float
-        Bound on ``||x~ - x|| / ||x||`` of every solution in each channel.
+    errors, confidence : sequence of float, float
+        Bound on ``||x~ - x|| / ||x||`` of every solution in each channel; confidence of each of these, over
+        the random starts of `theory.two_norm`.
     grid, first_bounce, mixing
         As of `ltcl.Transport`; F (N,) or (channels, N) is 0 at masked pixels.
-    confidence : float
-        Of each of these bounds, over the random starts of `theory.two_norm`.
 
     Examples
     --------
-    >>> import ltcl, numpy
-    >>> scene = ltcl.scenes.dihedral(4, albedo=0.5)
-    >>> T = scene.transport(first_bounce=scene.first_bounce)
-    >>> inv = ltcl.invert(T, rtol=1e-3)
-    >>> direct = numpy.zeros(T.grid)
-    >>> direct[:, :4] = 0.5  # the left wall is lit
-    >>> once = (inv.A @ direct.ravel()).reshape(T.grid)  # one bounce later the right one is
-    >>> bool(once[:, :4].max() < 1e-3 < once[:, 4:].min())
-    True
+    >>> import ltcl
+    >>> inverse = ltcl.invert(ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2)))
+    >>> inverse.solve([0.6, 0.6]).x.round(2).tolist()  # of S = [[1, 0.2], [0.2, 1]]
+    [0.5, 0.5]
+    >>> inverse.pattern([[0.3, 0.3]]).round(2).tolist()  # T makes [0.3, 0.3] of it
+    [[0.5, 0.5]]
     """
 
     def __init__(
@@ -134,10 +130,7 @@ class Inverse:
         if checks.count("channel", channel, least=0) >= self.channels:
             raise InputError(f"channel is {channel}; it must be below {self.channels}")
         X = self.systems[channel]
-        b = checks.finite("b", checks.real("b", b))
-        if b.ndim not in (1, 2) or b.shape[0] != X.shape[0] or b.size == 0:
-            raise InputError(f"b has shape {b.shape}; it must be ({X.shape[0]},) or ({X.shape[0]}, k)")
-        light, unit = scale_rhs(b)
+        light, unit = scale_rhs(b, X.shape[0])
         x = unscale(X.apply(X.device.upload(light)).get(), unit)
         spent, error = time.perf_counter() - start, self.errors[channel]
         return Solution(x, Status.PRECOMPUTED, 1, 1, (math.nan,), spent, "precomputed", error=error)
@@ -152,19 +145,8 @@ class Inverse:
     ) -> np.ndarray:
         """The projector pattern for a picture or frames of a video, by one product a channel.
 
-        l_in = F^-1 (b - A b) of b = gain * desired - background, float32, clamped to the bounds. What that
-        takes from one pixel is not made up for by others: for single pictures use `ltcl.compensate` with
-        ``inverse=``.
-
-        `desired` is (h, w), (h, w, 3), or frames of these; `bounds`, `background`, one number, and `gain` are
-        those of `ltcl.compensate`.
-
-        Examples
-        --------
-        >>> import ltcl, numpy
-        >>> T = ltcl.Transport([[0.5, 0.1], [0.1, 0.5]], grid=(1, 2))
-        >>> ltcl.invert(T).pattern(numpy.array([[0.3, 0.3]])).round(2).tolist()
-        [[0.5, 0.5]]
+        l_in = F^-1 (b - A b) of b = gain * desired - background, float32, clamped to the bounds, which other
+        pixels do not make up for; `ltcl.compensate`, whose options these are, does. `background` is a number.
         """
         low, high = checks.interval("bounds", bounds)
         gain, dark = checks.number("gain", gain, above=0.0), checks.number("background", background)

@@ -43,21 +43,19 @@ class Solution:
     iterations : int
     products : int
         Products with S, those for checks included; of "auto" those of all methods tried, and of the survey
-        in the solve that made it, without the one that finds the row sums of an operator.
+        in the solve that made it, but not the one for the row sums of an operator.
     residuals : tuple of float
         ``||b - S x|| / ||b||`` before each iteration and at the end; the largest over right-hand sides.
     seconds : float
         Wall time, transfers included.
-    method : str
-        The one that ran; for "auto" the one chosen.
-    reason : str
-        Why "auto" chose it, or what a method that samples has sampled, else empty.
+    method, reason : str
+        The one that ran; why "auto" chose it, or what a method that samples has sampled, else empty.
     lowest : float, optional
         Residual of the best iterate; the least of `residuals` when not given.
     standard_error : like x, optional
         Of "monte_carlo": of the noise of n samples, without the bias of alias tables, which leave out entries
-        drawn less than once in about 2^19 times the entries of their row. It falls as 1 / sqrt(n), its part
-        of light which no sample may have met as 1 / n (by the rule of three about 1.7 |R_i| max |b| / n).
+        drawn less than once in about 2^19 times the entries of their row. It falls as 1 / sqrt(n), and as
+        1 / n for light that no sample may have met.
     least_rtol : float, optional
         Of "direct" that did not converge: the smallest rtol that this x can be claimed to meet.
     error : float, optional
@@ -132,16 +130,16 @@ class Solution:
 
 def joined(channels: Sequence[Solution]) -> Solution:
     """One solution of what was sampled together, x (3, N) or (3, N, k)."""
-    first, reasons = channels[0], [part for one in channels for part in one.reason.split("; ")]
-    errors = [one.standard_error for one in channels if one.standard_error is not None]
+    reasons = [reason for channel in channels for reason in channel.reason.split("; ") if reason]
+    errors = [channel.standard_error for channel in channels if channel.standard_error is not None]
     return dataclasses.replace(
-        first,
-        x=np.stack([one.x for one in channels]),
-        status=Status.CONVERGED if all(one.converged for one in channels) else Status.SAMPLED,
-        iterations=max(one.iterations for one in channels),
-        products=sum(one.products for one in channels),
-        residuals=tuple(map(max, zip(*(one.residuals for one in channels), strict=True))),
-        reason="; ".join(dict.fromkeys(filter(None, reasons))),  # what all have in common once
-        lowest=max(one.residual for one in channels),
+        channels[0],
+        x=np.stack([channel.x for channel in channels]),
+        status=Status.CONVERGED if all(channel.converged for channel in channels) else Status.SAMPLED,
+        iterations=max(channel.iterations for channel in channels),
+        products=sum(channel.products for channel in channels),
+        residuals=tuple(map(max, zip(*(channel.residuals for channel in channels), strict=True))),
+        reason="; ".join(dict.fromkeys(reasons)),  # what all have in common once
+        lowest=max(channel.residual for channel in channels),
         standard_error=np.stack(errors) if errors else None,
     )

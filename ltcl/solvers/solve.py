@@ -2,42 +2,50 @@
 """`solve`: validate, scale right-hand sides, choose a method, run it, unscale.
 
 A method is a frozen dataclass whose fields are its options, with `name`, and `iterate(system, x, r, monitor)`
-or, where it draws random numbers, `sample(channels, callback)`; `Direct` solves at once.
+or, where it draws random numbers, `sample(channels, callback)`.
+
+Of S = I + W^T C W in an orthonormal basis W, S x = b is (I + C) a = W b with x = W^T a: two transforms in
+all, where pixels take two for every product. Where W has but some coefficients of such a basis, S is the
+identity on the rest of b, and x = b + W^T (a - W b). `cg` with weights, diagonal in pixels alone, runs there.
+
+Where an exact S judges, a compressed S~ = S + E makes the steps of an iterative refinement,
+
+    x^(k+1) = x^(k) + S~^-1 (b - S x^(k))
+
+With each solve to a tolerance t, the error shrinks by about ||S~^-1 E|| + t a step (Higham, Accuracy and
+Stability of Numerical Algorithms, 2nd ed., chapter 12).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
+from ltcl.device import Array, Device, vectors
 from ltcl.errors import ConvergenceError, InputError, InputTypeError, MemoryLimitError, ToleranceError
-from ltcl.operators import Operator
-from ltcl.solvers import auto, precision, refinement
-from ltcl.solvers.bicgstab import BiCGStab
-from ltcl.solvers.cg import CG
-from ltcl.solvers.gmres import GMRES
+from ltcl.operators import Compressed, Dense, IdentityPlus, Operator, as_operator
+from ltcl.solvers import auto, krylov, stationary
 from ltcl.solvers.monte_carlo import Channel, Hybrid, MonteCarlo, of_channel
-from ltcl.solvers.precision import Direct
-from ltcl.solvers.relaxation import SOR, BlockGaussSeidel, GaussSeidel, Southwell
+from ltcl.solvers.precision import Direct, is_small, product
 from ltcl.solvers.result import Solution, Status, joined
-from ltcl.solvers.stationary import Chebyshev, Jacobi, Neumann, Richardson
-from ltcl.solvers.stopping import CLAIM, Rule
+from ltcl.solvers.stopping import CLAIM, Monitor, Rule, System, relative, scale_rhs, unscale
 
-_SWEEPS = (GaussSeidel, SOR, BlockGaussSeidel, Southwell)
-ITERATIVE = {
-    kind.name: kind for kind in (Jacobi, Neumann, Richardson, Chebyshev, *_SWEEPS, CG, GMRES, BiCGStab)
-}
+ITERATIVE = {kind.name: kind for kind in (*stationary.METHODS, *krylov.METHODS)}
 SAMPLED = {kind.name: kind for kind in (MonteCarlo, Hybrid)}
 KINDS: dict[str, Any] = {**ITERATIVE, **SAMPLED, Direct.name: Direct}
 METHODS: tuple[str, ...] = (*KINDS, "auto")
+OPTIONS = {name: [own.name for own in dataclasses.fields(kind) if own.init] for name, kind in KINDS.items()}
 
-_MAXITER = 1000
-_LARGEST, _NORMAL = float(np.finfo(np.float32).max), 2.0**-126
+_FLOAT32 = 2.0**-20  # relative residual, below which float32 products are left
+_LEAST, _MOST = 1e-3, 0.1  # of the tolerance of a step: many short steps waste products by S, long ones by S~
+_HALF = 0.5  # of a residual: a solve that ended early but left no more is a step, too
+_on_coefficients: weakref.WeakKeyDictionary[IdentityPlus, IdentityPlus] = weakref.WeakKeyDictionary()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +94,6 @@ def solve(
     b : (N,) or (N, k), or (3, N) or (3, N, k) of three S
         k right-hand sides are solved together, each to its own tolerance.
     method : str
-        One of the table below.
     rtol, atol : float
         Done when ``||b - S x|| <= max(rtol ||b||, atol)`` in every column, judged by the numbers that were
         given, those of a float64 array in float64.
@@ -95,17 +102,16 @@ def solve(
     x0 : like b, optional
         Start; zero when not given.
     callback : callable(iteration, relative residual), optional
-        Called with every entry of `residuals`, as it is computed; of methods that sample also at each step
-        of theirs, whose residual is unknown, NaN.
+        Called with every entry of `residuals`, and at each step of a method that samples, with NaN.
     throw : bool
         Raise where the tolerance is not met; otherwise look at ``.converged``. Not of methods that sample,
         whose noise is no failure: they end CONVERGED or SAMPLED, with ``.standard_error``.
     exact : like S, optional
         What a compressed S stands for, ``T.interreflection`` of the uncompressed T: S makes the steps of an
-        iterative refinement, and the residual is that of `exact`. Any tolerance down to 1e-6 is reached by
-        products in float32, and down to about 1e-15 in float64 where the numbers of `exact` are at hand.
+        iterative refinement, and the residual is that of `exact`. Down to 1e-6 by products in float32, and
+        to about 1e-15 in float64 where the numbers of `exact` are at hand.
     **options
-        Of the method; an unknown one is an error.
+        Of the method, as in the table below.
 
     Returns
     -------
@@ -115,22 +121,17 @@ def solve(
     Raises
     ------
     InputError, InputTypeError
-        Shapes that do not fit, NaN, a tolerance or option out of range, or below what a compressed S is
-        worth.
+        Shapes that do not fit, NaN, a tolerance or option out of range, or below the error of a compressed S.
     ToleranceError
         A tolerance below what float32 keeps of an S that is too large to factorize.
     ConvergenceError
         Divergence or ``maxiter``, with the best iterate in ``.solution``.
 
-    See Also
-    --------
-    ltcl.solvers.matrix_series : the whole inverse at once, eq. 8 and 10
-
     Notes
     -----
     "auto" factorizes small systems; else it compares the times that methods need, by the row sums of S and
     a survey of three products, and tries others where its choice fails: see ``.reason``. Below rtol = 1e-6
-    its choice takes the steps of a refinement in float64.
+    its choice takes the steps of a refinement in float64. `ltcl.solvers.matrix_series` inverts S.
 
     ====================  =======================================================================
     method                options: what they are; their defaults
@@ -145,18 +146,14 @@ def solve(
     southwell             rows: relaxed in one step; a 64th of the picture
     cg                    weights: (N,) of the inner product; those of S
     gmres                 restart: directions of a cycle; 20
-    bicgstab              none
     monte_carlo           samples: walks of each pixel; 256. seed: below 2^64; 0
     |                     pixels: (P,) of them to estimate; all. error: standard error wanted,
     |                     in units of x; the last samples of a pixel are then at most 2^20
     |                     albedo: m of eq. 24. adjoint: walks from b, without pixels and
-    |                     error; False
-    |                     gather: one exact product at the end; False
+    |                     error; False. gather: one exact product at the end; False
     hybrid                samples: columns of each row; 32. seed, gather: as above
-    direct, auto          none
+    bicgstab, direct      none; nor has auto
     ====================  =======================================================================
-
-    Right-hand sides share the random walks of monte_carlo; hybrid has no standard error.
 
     Examples
     --------
@@ -165,16 +162,16 @@ def solve(
     >>> s.converged, s.x.round(1).tolist()
     (True, [1.0, 0.0])
     """
-    settings = dict(rtol=rtol, atol=atol, maxiter=maxiter, x0=x0, callback=callback, exact=exact)  # noqa: C408
+    options |= dict(rtol=rtol, atol=atol, maxiter=maxiter, x0=x0, callback=callback, exact=exact)  # noqa: C408
     checks.one_of("method", method, METHODS)
     if isinstance(S, (tuple, list)) and any(isinstance(channel, Operator) for channel in S):
-        return joined(_in_colour(S, b, method, **settings, **options))
-    return _solve(S, b, method, throw, **settings, **options)
+        return joined(_in_colour(S, b, method, **options))
+    return _solve(S, b, method, throw, **options)
 
 
 def solve_each(
     systems: Sequence[Operator],
-    parts: Sequence[np.ndarray],
+    sides: Sequence[np.ndarray],
     method: str = "auto",
     *,
     exact: Sequence[Operator | None] = (),
@@ -183,17 +180,17 @@ def solve_each(
 ) -> tuple[Solution, ...]:
     """One solution a colour channel, as `solve` gives; methods that sample take walks that all three share.
 
-    `parts` are b of each and `exact` theirs, where there is one; `settings` are those of `solve`, but for x0.
+    `sides` are b of each and `exact` theirs, where there is one; `settings` are those of `solve`, but for x0.
     `with_residual` asks for b - S x where it costs little.
     """
     exacts = exact or [None] * len(systems)
-    if len(systems) == 1 or method not in SAMPLED or any(one is not None for one in exacts):
+    if len(systems) == 1 or method not in SAMPLED or any(E is not None for E in exacts):
         checks.one_of("method", method, METHODS)
         settings["with_residual"] = with_residual
-        each = zip(systems, parts, exacts, strict=True)
+        each = zip(systems, sides, exacts, strict=True)
         return tuple(_solve(S, b, method, exact=E, **settings) for S, b, E in each)
     settings.pop("throw", None)  # noise is no failure
-    return _in_colour(systems, np.stack(parts), method, **settings)
+    return _in_colour(systems, np.stack(sides), method, **settings)
 
 
 def _solve(S: Any, b: Any, method: str, throw: bool = True, **settings: Any) -> Solution:
@@ -215,7 +212,7 @@ def _in_colour(
     start, n = time.perf_counter(), len(systems)
     if method not in SAMPLED or n != 3:
         raise InputTypeError(f"S is {n} operators, one per colour channel; it must be one: solve each")
-    shapes = [precision.shape("S", S) for S in systems]
+    shapes = [_shape("S", S) for S in systems]
     if len(set(shapes)) > 1:
         raise InputError(f"S is operators of shapes {shapes}; all must be the same")
     rows = shapes[0][0]
@@ -251,38 +248,35 @@ def _validate(
     **options: Any,
 ) -> _Problem:
     """Refuse bad input before anything is uploaded; b, x0 and atol in units of each column."""
-    b, n = checks.finite("b", checks.real("b", b)), precision.shape("S", S)[0]
-    if b.ndim not in (1, 2) or b.shape[0] != n or b.size == 0:
-        raise InputError(f"b has shape {b.shape}; it must be ({n},) or ({n}, k)")
+    n = _shape("S", S)[0]
+    b, unit = scale_rhs(b, n)
     rtol = checks.number("rtol", rtol, least=0.0, below=1.0)
     atol = checks.number("atol", atol, least=0.0)
     if rtol == 0.0 and atol == 0.0:
         raise InputError("rtol is 0; it must be above 0 and below 1, or atol above 0")
     if callback is not None and not callable(callback):
         raise InputTypeError(f"callback is {callback!r}; it must be callable(iteration, relative residual)")
-    maxiter = _MAXITER if maxiter is None else checks.count("maxiter", maxiter)
+    maxiter = 1000 if maxiter is None else checks.count("maxiter", maxiter)
     if x0 is not None:
         x0 = checks.shape("x0", checks.finite("x0", checks.real("x0", x0)), b.shape)
-    kind = KINDS.get(method)  # None of "auto"
     for option in options:
-        owners = [name for name, other in KINDS.items() if option in other.__dataclass_fields__]
+        owners = [name for name, own in OPTIONS.items() if option in own]
         if not owners:
-            has = ", ".join(kind.__dataclass_fields__ if kind else ()) or "none"
+            has = ", ".join(OPTIONS.get(method, ())) or "none"
             raise InputTypeError(f"unknown option {option!r}; method {method!r} has {has}")
         if method not in owners:
             several = " or ".join(map(repr, owners))
             raise InputTypeError(f"option {option!r} is one of method={several}, but method is {method!r}")
-    chosen = kind(**options) if kind else None
+    chosen = KINDS[method](**options) if method in KINDS else None  # of "auto"
     if exact is not None and method in SAMPLED:
         raise InputTypeError(f"exact= corrects iterates, but method {method!r} samples; leave it out")
     if isinstance(chosen, MonteCarlo):
         chosen.check(n)
-    b, unit = scale_rhs(b)
     rule = Rule(rtol, atol / unit if atol else 0.0, maxiter, callback)
     required = _required(b, rule)
-    A = S if isinstance(S, Operator) else precision.operator(S)
+    A = S if isinstance(S, Operator) else _operator(S)
     if exact is not None:
-        exact = refinement.exact_operator(exact, A)
+        exact = _exact_operator(exact, A)
     elif required < A.solution_error:  # says less about the solution than S itself
         also = f" and atol {atol:g}" if atol else ""
         raise InputError(
@@ -299,7 +293,35 @@ def _required(b: np.ndarray, rule: Rule) -> float:
         return rule.rtol if np.any(b) else np.inf
     norms = np.atleast_1d(np.linalg.norm(b.astype(np.float64), axis=0))
     lit = norms > 0.0
-    return float(np.min((rule.target(norms) / np.where(lit, norms, 1.0))[lit], initial=np.inf))
+    return float(np.min(rule.target(norms)[lit] / norms[lit], initial=np.inf))
+
+
+def _operator(S: Any, device: Device | None = None) -> Operator:
+    """`as_operator`, which remembers the numbers of an array as they were before they became float32."""
+    A = as_operator(S, device)
+    if isinstance(A, Dense) and A is not S:
+        A.given = np.asarray(S), np.ones(A.shape[1]), np.zeros(A.shape[0])
+    return A
+
+
+def _exact_operator(exact: Any, S: Operator) -> Operator:
+    """`exact` on the device of S, checked."""
+    if (shape := _shape("exact", exact)) != S.shape:
+        raise InputError(f"exact has shape {shape}; it must be that of S, {S.shape}")
+    E = _operator(exact, S.device)
+    if E.device is not S.device:
+        raise InputError(f"exact is on another device, {E.device}; it must be on {S.device}")
+    return E
+
+
+def _shape(name: str, S: Any) -> tuple[int, ...]:
+    """The shape of a square S before it becomes an operator on a device."""
+    if hasattr(type(S), "interreflection"):  # asked of the object, it would upload
+        raise InputTypeError(f"{name} is a {type(S).__name__}; give its operator, T.interreflection")
+    own = getattr(S, "shape", None) or checks.real(name, S).shape
+    if len(own) != 2 or own[0] != own[1]:
+        raise InputError(f"{name} has shape {own}; it must be square, (N, N)")
+    return own
 
 
 def _automatic(problem: _Problem) -> Solution:
@@ -310,7 +332,7 @@ def _automatic(problem: _Problem) -> Solution:
     products, S = 0, problem.S
     target = min(problem.required, 0.5)
     if problem.exact is None and target < auto.PRECISE and S.shape[0] > auto.SMALL:
-        if precision.product(S) is not None:
+        if product(S) is not None:
             problem = dataclasses.replace(problem, exact=S)
             reasons.append(f"refined in float64, since rtol={target:g} is below what float32 products reach")
         elif S.shape[0] > auto.LARGEST_DIRECT:
@@ -320,10 +342,10 @@ def _automatic(problem: _Problem) -> Solution:
                 auto.PRECISE,
             )
     if problem.exact is not None:
-        target = refinement.step_tolerance(S)
-    for method, why, made in auto.plan(S, target, problem.b[0].size):
+        target = _step_tolerance(S)
+    for method, why, surveyed in auto.plan(S, target, problem.b[0].size):
         reasons.append(why)
-        products += made
+        products += surveyed
         try:
             attempts.append(_attempt(method, problem))
         except (MemoryLimitError, InputError) as error:  # no room, or no transpose
@@ -338,7 +360,7 @@ def _automatic(problem: _Problem) -> Solution:
         reasons.append(f"{attempts[-1].method} ended {attempts[-1].status.name.lower()}")
     if failure is not None and not attempts:
         raise failure
-    best = attempts[-1] if attempts[-1].converged else min(attempts, key=lambda one: one.residual)
+    best = attempts[-1] if attempts[-1].converged else min(attempts, key=lambda attempt: attempt.residual)
     return dataclasses.replace(best, products=products, reason="; ".join(reasons))
 
 
@@ -348,71 +370,127 @@ def _attempt(method: Any, problem: _Problem) -> Solution:
         return _sample(method, [problem])[0]
     if isinstance(method, Direct) and problem.exact is None:
         return _factorize(method, problem)
-    S, b, x0, rule = problem.S, problem.b, problem.x0, problem.rule
-    rest = None
+    S, x0, rest = problem.S, problem.x0, None
     if problem.exact is None:
-        guess, right = None if x0 is None else S.device.upload(x0), S.device.upload(b)
-        x, monitor, left = refinement.iterate(method, S, right, guess, rule, b, problem.with_residual)
-        x, rest = x.get(), left and unscale(left.get(), problem.unit)
+        guess, b = None if x0 is None else S.device.upload(x0), S.device.upload(problem.b)
+        x, monitor, r = _iterate(method, S, b, guess, problem.rule, problem.b, problem.with_residual)
+        x, rest = x.get(), r and unscale(r.get(), problem.unit)
     else:
-        x, monitor = refinement.refine(method, S, problem.exact, b, x0, rule, problem.required)
+        x, monitor = _refine(method, problem, problem.exact)
     facts = monitor.status, monitor.iterations, monitor.system.products, tuple(monitor.residuals)
     return problem.solution(method, x, *facts, lowest=monitor.lowest, rest=rest)
+
+
+def _iterate(
+    method: Any,
+    S: Operator,
+    b: Array,
+    guess: Array | None,
+    rule: Rule,
+    host: np.ndarray | None = None,
+    with_residual: bool = False,
+) -> tuple[Array, Monitor, Array | None]:
+    """x in pixels of S x = b by an iterative method, what watched it, and b - S x where that is asked for.
+
+    `host` is b before it became float32; `guess` is None for zero.
+    """
+    W, right = None, b
+    weighted = isinstance(method, krylov.CG) and method.inner(S) is not None
+    if isinstance(S, IdentityPlus) and isinstance(S.R, Compressed) and S.R.two_sided and not weighted:
+        W, core = S.R.into, S.R.core
+        if S not in _on_coefficients:  # what is learnt of it serves all solves
+            inside = _on_coefficients[S] = IdentityPlus(core, S.sign)
+            inside.weights, inside._row_sums = S.weights, S.row_sums()  # in pixels these bound the spectrum
+        S = _on_coefficients[S]
+    if W is None:
+        norms = vectors.norms(b)
+    else:
+        right, guess, host = W.apply(b), guess and W.apply(guess), None
+        norms = vectors.norms(b, right)
+    system = System(S, right, norms[0], host, on_coefficients=W is not None)
+    if guess is None:  # whose residual is b and costs no product
+        x, r, first = vectors.fill(right.like(), 0.0), right.copy(), norms[-1]
+    else:
+        x, r = guess, right.like()
+        first = system.residual(x, r)
+    monitor = Monitor(system, rule)
+    if not monitor.check(x, r, first[None]):
+        method.iterate(system, x, r, monitor)
+    x = monitor.result(x)
+    rest = r if with_residual and monitor.status is Status.CONVERGED else None
+    if W is None:
+        return x, monitor, rest
+    rest = rest and W.apply_transpose(rest)
+    if W.orthonormal:
+        return W.apply_transpose(x), monitor, rest
+    return W.apply_transpose(vectors.axpby(1.0, x, -1.0, right, x.like()), add=b), monitor, rest
+
+
+def _refine(method: Any, problem: _Problem, exact: Operator) -> tuple[np.ndarray, Monitor]:
+    """Refine solutions of S~ x = b until `exact` finds the residual required; products are by S and S~.
+
+    x is float64 on the host; so are residuals where the numbers of `exact` are at hand and a product with
+    them is cheap, or float32 could not tell.
+    """
+    S, b, rule = problem.S, problem.b, problem.rule
+    right = S.device.upload(b)
+    system = System(exact, right, vectors.norm(right), b)
+    system.fine = (is_small(exact) or problem.required < _FLOAT32) and system.times is not None
+    x, r, norms = np.zeros(b.shape), right.copy(), system.norms
+    if problem.x0 is not None:
+        x = problem.x0.astype(np.float64)
+        norms = system.residual(x, r)
+    monitor = Monitor(system, rule)
+    while not monitor.check(x, r, norms[None]):
+        if isinstance(method, Direct):
+            solved = method.solve(S, r.get())
+            step, failure = (x, Status.BREAKDOWN) if solved is None else (solved[0], None)
+        else:
+            missing = np.divide(problem.required, monitor.residuals[-1])  # infinite of 0
+            tolerance = min(max(_step_tolerance(S), _HALF * float(missing)), _MOST)
+            light, inner, _ = _iterate(method, S, r, None, Rule(tolerance, 0.0, rule.maxiter))
+            system.products += inner.system.products
+            step, failure = light.get(), None if inner.lowest <= _HALF else inner.status
+        if failure is not None:
+            monitor.status = failure
+            break
+        x = x + step
+        norms = system.residual(x, r)
+    x = monitor.result(x)
+    return (x if system.fine else x.astype(np.float32)), monitor
+
+
+def _step_tolerance(S: Operator) -> float:
+    """Relative residual of the solves with S~: no smaller than what S~ is worth."""
+    return min(max(S.solution_error, _LEAST), _MOST)
 
 
 def _factorize(method: Direct, problem: _Problem) -> Solution:
     """Claimed where the residual is within the tolerance with all that rounding of float64 may hide."""
     b, rule = problem.b.astype(np.float64), problem.rule
-    try:
-        x, left, hidden = method.solve(problem.S, b)
-    except np.linalg.LinAlgError:
+    solved = method.solve(problem.S, b)
+    if solved is None:
         status, residual = (Status.BREAKDOWN, 1.0) if np.any(b) else (Status.CONVERGED, 0.0)
         return problem.solution(method, np.zeros(b.shape), status, 0, 0, (residual,))
+    x, left, hidden = solved
     norms = np.linalg.norm(b, axis=0)
     limit = rule.target(norms)
-    relative = float(np.max(left / np.where(norms > 0.0, norms, 1.0)))
     claimed = np.all(left <= limit) and np.all(left + hidden <= CLAIM * limit)
+    residuals = 1.0, relative(left, norms)
     if rule.callback is not None:
-        rule.callback(0, 1.0)
-        rule.callback(1, relative)
+        for iteration, residual in enumerate(residuals):
+            rule.callback(iteration, residual)
     status = Status.CONVERGED if claimed else Status.STAGNATED
-    least = None if claimed else float(np.max((left + hidden) / np.where(norms > 0.0, norms, 1.0)))
-    return problem.solution(method, x, status, 1, 0, (1.0, relative), least_rtol=least)
+    least = None if claimed else relative(left + hidden, norms)
+    return problem.solution(method, x, status, 1, 0, residuals, least_rtol=least)
 
 
 def _sample(method: Any, problems: Sequence[_Problem]) -> list[Solution]:
     """A method that samples, on colour channels of one size at once; one solution a channel."""
-    channels = [
-        Channel(method.name, one.S, one.b, one.x0, min(one.required, 1.0), one.unit, one.rule.maxiter)
-        for one in problems
-    ]
+    channels = [Channel(method.name, problem) for problem in problems]
     solutions = []
-    for one, estimate in zip(problems, method.sample(channels, problems[0].rule.callback), strict=True):
+    for p, estimate in zip(problems, method.sample(channels, problems[0].rule.callback), strict=True):
         error = estimate.standard_error
-        error = None if error is None else unscale(error, one.unit)
-        x = unscale(estimate.x, one.unit)
-        solutions.append(dataclasses.replace(estimate, x=x, standard_error=error))
+        error = None if error is None else unscale(error, p.unit)
+        solutions.append(dataclasses.replace(estimate, x=unscale(estimate.x, p.unit), standard_error=error))
     return solutions
-
-
-def scale_rhs(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """b in units near the largest value of each column, float32 where it is so already; and the units.
-
-    They are powers of two, so that squares of any light stay in float32 and no digit is lost.
-    """
-    columns = b.reshape(len(b), -1).T  # one by one: NumPy reduces an axis of few columns ten times as slowly
-    sizes = np.array([max(float(np.max(one)), -float(np.min(one))) for one in columns]).reshape(b.shape[1:])
-    unit = np.exp2(np.floor(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
-    is_float32 = b.dtype == np.float32 and np.all(unit >= _NORMAL)
-    return b / (unit.astype(np.float32) if is_float32 else unit), unit
-
-
-def unscale(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """x times its unit: float32 where x is and where that holds all of it, else float64."""
-    if x.dtype == np.float32 and np.all(unit >= _NORMAL):
-        with np.errstate(all="ignore"):
-            result = x * unit.astype(np.float32)
-        sizes = np.abs(result)
-        if np.max(sizes) <= _LARGEST and not np.any((sizes < _NORMAL) & (x != 0.0)):  # flushed, or may be
-            return result
-    return x * unit

@@ -1,44 +1,57 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Stationary iterations, Jacobi, the Neumann series, Richardson; and Chebyshev's, which shares their loop.
+"""Jacobi, the Neumann series, Richardson, Chebyshev; relaxation, row by row; the whole inverse.
 
-One launch a step (`Operator.stepper`), with x the iterate and r its residual:
+Jacobi to Chebyshev take one launch a step (`Operator.stepper`), with x the iterate and r its residual:
 
     x += d,   r -= S d,   d = keep d + gain r
 
-Jacobi (eq. 20), keep = 0 and gain = 1: what the projector must still add is what the last guess lacks,
-l^(k+1) = l^(k) + (l_out - S l^(k)). Started from zero, k steps are the k-term inverse Neumann series
-(eq. 10), whose next term is the residual; the forward dual (eq. 18) is the same on I - A. Both converge
-where the spectral radius of R is below 1.
+Jacobi (eq. 20), keep = 0 and gain = 1: l^(k+1) = l^(k) + (l_out - S l^(k)). Started from zero, k steps are
+the k-term inverse Neumann series (eq. 10), whose next term is the residual; the forward dual (eq. 18) is the
+same on I - A. Both converge where the spectral radius of R is below 1.
 
-Richardson, gain = omega: damping makes it converge for every albedo below one. On a spectrum in [a, b] the
-best omega is 2 / (a + b), with the factor (b - a) / (b + a) a step (Saad, Iterative Methods for Sparse Linear
-Systems, 2nd ed., example 4.1).
+Richardson, gain = omega, converges for every albedo below one. On a spectrum in [a, b] the best omega is
+2 / (a + b) (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., example 4.1).
 
 Chebyshev (Saad, algorithm 12.1, whose numbers are in comments): the best polynomial in S for a spectrum in an
-interval, of a Lambertian scene the free bounds (`theory.free_bounds`). Not for spectra with large imaginary
-parts, nor with eigenvalues on both sides of 0: the monitor sees residuals grow. A few steps of GMRES at the
-start draw the bounds in. Where they leave out eigenvalues, the residual grows by their eigenvectors: more
-steps of GMRES take those out and show their eigenvalues, the bounds are widened, and the iteration goes on.
+interval, of a Lambertian scene the free bounds. A few steps of GMRES at the start draw these in. Where they
+leave out eigenvalues, the residual grows by their eigenvectors: more steps of GMRES take those out and show
+their eigenvalues, the bounds are widened, and the iteration goes on. Not for spectra with large imaginary
+parts, nor with eigenvalues on both sides of 0.
+
+Gauss-Seidel, SOR, block Gauss-Seidel and Southwell relax one row or block of rows after the other:
+
+    l_i += omega (l_out_i - sum_(j<i) S_ij l_j^(k+1) - sum_(j>=i) S_ij l_j^(k)) / S_ii,  row i after row i
+    l_B += (S_BB)^-1 (l_out - S l)_B,  block B after block
+    i = argmax |r_i|,  l_i += r_i / S_ii,  r -= S[:, i] r_i / S_ii
+
+Gauss-Seidel, omega = 1, is Jacobi that uses each new value at once (eq. 17-20, in place). Where S is
+self-adjoint, sweeps converge for every albedo (Saad, theorem 4.10). The residual of an iterate comes with the
+sweep that follows it: k iterations take k + 1 sweeps, each about one product. Southwell takes the largest
+residual first, as progressive radiosity does (R. V. Southwell, Relaxation Methods in Engineering Science,
+1940; M. Cohen et al., SIGGRAPH 1988).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ltcl import checks, theory
-from ltcl.device import Array
-from ltcl.errors import InputError
-from ltcl.operators import Operator
-from ltcl.solvers import gmres
-from ltcl.solvers.stopping import SLOTS, Monitor, System
+from ltcl.device import Array, vectors
+from ltcl.errors import ConvergenceError, InputError
+from ltcl.operators import Operator, as_operator
+from ltcl.operators.relaxation import INVERTED, Steps, Sweeps, relaxation
+from ltcl.solvers import krylov
+from ltcl.solvers.result import Solution, Status
+from ltcl.solvers.stopping import GROWTH, SLOTS, Monitor, System
 
-_GROWTH = 10.0  # times what a residual should be in theory: above what weights of surfaces may do to norms
+_BEYOND = 10.0  # times what a residual should be in theory: above what weights of surfaces may do to norms
 _SEEN = 1e-4  # relative residual down to which bounds are judged: below, rounding has its part in it
 _REPAIRS = 3  # times that bounds are widened before the monitor alone decides
 _REPAIR_STEPS = 5
@@ -46,6 +59,8 @@ _FIRST_STEPS = 2
 _DEEPER = 4.0  # what a lower bound that failed is divided by: small eigenvalues are found last
 _MARGIN = 0.25  # of the width of the Ritz values, added on both sides: the outermost are not found at once
 _SAFETY = 1.05
+_STEPS = 64  # of an iteration of Southwell's, where `rows` is not given and there are that many pixels
+_CHUNK = 64  # columns of the matrix series in one product
 
 
 def steps(
@@ -78,14 +93,17 @@ class Jacobi:
     """No options."""
 
     name: ClassVar[str] = "jacobi"
+    omega: ClassVar[float | None] = 1.0
 
     def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
         """Improve `x`, whose residual is `r`, until the monitor ends it."""
-        for _ in steps(system, x, r, monitor, itertools.repeat((0.0, self._damping(system.S)))):
+        omega = self.omega
+        if omega is None:
+            lower, upper = theory.free_bounds(system.S)
+            # Row sums that leave float32 tell nothing; a first step without damping shows that S does, too.
+            omega = 2.0 / (lower + upper) if math.isfinite(upper) else 1.0
+        for _ in steps(system, x, r, monitor, itertools.repeat((0.0, float(omega)))):
             pass
-
-    def _damping(self, S: Operator) -> float:
-        return 1.0
 
 
 @dataclass(frozen=True)
@@ -100,18 +118,11 @@ class Richardson(Jacobi):
     """Options: ``omega``, the damping; the best one for the free bounds of S when not given."""
 
     name: ClassVar[str] = "richardson"
-    omega: float | None = None
+    omega: float | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __post_init__(self) -> None:
         if self.omega is not None:
             checks.number("omega", self.omega, above=0.0)
-
-    def _damping(self, S: Operator) -> float:
-        if self.omega is not None:
-            return float(self.omega)
-        lower, upper = theory.free_bounds(S)
-        # Row sums that leave float32 tell nothing; a first step without damping shows that S does, too.
-        return 2.0 / (lower + upper) if math.isfinite(upper) else 1.0
 
 
 def chebyshev_steps(lower: float, upper: float) -> Iterator[tuple[float, float]]:
@@ -162,29 +173,38 @@ class Chebyshev:
         S, bounds = system.S, self.spectrum or theory.free_bounds(system.S)
         first = self.arnoldi if self.arnoldi is not None else 0 if self.spectrum else _FIRST_STEPS
         if first:
-            space = gmres.cycle(system, x, r, monitor, first)
+            space = krylov.cycle(system, x, r, monitor, first)
             bounds = drawn_in(bounds, S, space.ritz_values())
-        for growth in (*[_GROWTH] * _REPAIRS, math.inf):
-            if monitor.status is not None or not _run(system, x, r, monitor, bounds, growth):
+        for limit in (*[_BEYOND] * _REPAIRS, math.inf):
+            if monitor.status is not None:
+                return
+            start, initial = monitor.iterations, max(monitor.residuals[-1], monitor.lowest)
+            monitor.factor, has_grown = chebyshev_rate(*bounds), False
+            for _ in steps(system, x, r, monitor, chebyshev_steps(*bounds)):
+                left = monitor.factor ** (monitor.iterations - start)
+                expected = initial * 2.0 * left / (1.0 + left**2)  # 1 / T_k(sigma) of it
+                if has_grown := monitor.residuals[-1] > max(limit * expected, _SEEN):
+                    break
+            if not has_grown and not (math.isfinite(limit) and monitor.resume(x, r)):
                 return
             # What has grown are the eigenvectors that the bounds leave out; few steps find their eigenvalues.
-            space = gmres.cycle(system, x, r, monitor, _REPAIR_STEPS)
-            lower, upper = _hull(_hull(bounds, theory.free_bounds(S)), _positive(space.ritz_values()))
+            space = krylov.cycle(system, x, r, monitor, _REPAIR_STEPS)
+            lower, upper = _hull(bounds, [*theory.free_bounds(S), *_positive(space.ritz_values())])
             bounds = lower / _DEEPER, upper
 
 
 def drawn_in(bounds: tuple[float, float], S: Operator, ritz: np.ndarray) -> tuple[float, float]:
     """Bounds drawn in to a quarter of the width of the Ritz values around these, and out to hold them.
 
-    With them <1, S 1> / <1, 1> in the inner product of `S.weights`: near the eigenvalue that dominates R, of
-    which a picture may have hardly any part.
+    With them the mean row sum: near the eigenvalue that dominates R, which a picture may have no part of.
     """
-    seen = _positive(np.append(ritz, theory.row_sum_range(S)[1]))
-    if len(ritz) < 2 or not len(seen):
-        return _hull(bounds, seen)
-    margin = _MARGIN * float(np.max(seen) - np.min(seen))
-    lower, upper = max(bounds[0], float(np.min(seen)) - margin), min(bounds[1], float(np.max(seen)) + margin)
-    return _hull((lower, upper) if lower < upper else bounds, seen)
+    values = _positive(np.append(ritz, theory.row_sum_range(S)[1]))
+    if len(ritz) < 2 or not len(values):
+        return _hull(bounds, values)
+    low, high = float(np.min(values)), float(np.max(values))
+    margin = _MARGIN * (high - low)
+    lower, upper = max(bounds[0], low - margin), min(bounds[1], high + margin)
+    return _hull((lower, upper) if lower < upper else bounds, values)
 
 
 def _positive(ritz: np.ndarray) -> np.ndarray:
@@ -199,15 +219,159 @@ def _hull(bounds: tuple[float, float], values: Any) -> tuple[float, float]:
     return lower if least >= lower else least / _SAFETY, upper if most <= upper else most * _SAFETY
 
 
-def _run(
-    system: System, x: Array, r: Array, monitor: Monitor, bounds: tuple[float, float], growth: float
-) -> bool:
-    """Iterate to the end, or until the residual is so many times what theory has it: then True."""
-    start, first = monitor.iterations, max(monitor.residuals[-1], monitor.lowest)
-    monitor.factor = chebyshev_rate(*bounds)
-    for _ in steps(system, x, r, monitor, chebyshev_steps(*bounds)):
-        left = monitor.factor ** (monitor.iterations - start)
-        theirs = first * 2.0 * left / (1.0 + left**2)  # 1 / T_k(sigma) of the first, in theory
-        if monitor.residuals[-1] > max(growth * theirs, _SEEN):
-            return True
-    return math.isfinite(growth) and monitor.resume(x, r)
+@dataclass(frozen=True)
+class BlockGaussSeidel:
+    """Options: ``block``, rows of a block, which changes the iterates; inverses take 4 N block bytes.
+
+    With blocks of one row it is Gauss-Seidel, with one block the direct solution.
+    """
+
+    name: ClassVar[str] = "block_gauss_seidel"
+    block: int | None = INVERTED
+    omega: ClassVar[float | None] = None
+
+    def __post_init__(self) -> None:
+        if self.block is not None or self.omega is None:
+            checks.count("block", self.block)
+        if self.omega is not None:
+            checks.number("omega", self.omega, above=0.0, below=2.0)
+
+    def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
+        """Improve `x`, whose residual is `r`, until the monitor ends it with one of the iterates."""
+        sweeps = Sweeps(relaxation(system.S, self.name, self.block, self.omega), x, system.b, r)
+        sweeps.sweep()
+        system.products += 1
+        _repeat(sweeps.sweep, system, sweeps.before, r, monitor)
+        x.copy_from(sweeps.before)
+
+
+@dataclass(frozen=True)
+class GaussSeidel(BlockGaussSeidel):
+    """Options: ``block``, rows of a block; it changes the speed, not the iterates."""
+
+    name: ClassVar[str] = "gauss_seidel"
+    block: int | None = None
+    omega: ClassVar[float | None] = 1.0
+
+
+@dataclass(frozen=True)
+class SOR(GaussSeidel):
+    """Options: ``omega`` in (0, 2), and ``block`` as of Gauss-Seidel, which SOR is with omega = 1."""
+
+    name: ClassVar[str] = "sor"
+    omega: float = 1.0  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+@dataclass(frozen=True)
+class Southwell:
+    """Options: ``rows`` relaxed in one step; a 64th of the picture when not given.
+
+    With ``rows=1`` it converges for every self-adjoint S. With more, each of as many equal parts of the
+    picture relaxes its own largest residual at the same time; too many at once behave like Jacobi and may
+    diverge. An iteration is as many steps as relax N rows, and so costs what one product costs.
+    """
+
+    name: ClassVar[str] = "southwell"
+    rows: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.rows is not None:
+            checks.count("rows", self.rows)
+
+    def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
+        """Improve `x`, whose residual is `r`, until the monitor ends it."""
+        n = x.shape[0]
+        rows = min(max(1, n // _STEPS) if self.rows is None else self.rows, n)
+        steps = Steps(system.S, self.name, x, r, rows)
+
+        def relax_all() -> None:
+            for _ in range(-(-n // rows)):
+                steps.step()
+            steps.step(picks=False)
+
+        _repeat(relax_all, system, x, r, monitor)
+
+
+def _repeat(iteration: Callable[[], None], system: System, x: Array, r: Array, monitor: Monitor) -> None:
+    """Queue iterations, each of which leaves `r` of `x`, until the monitor ends it; few readings of norms."""
+    squares = x.device.empty((SLOTS, x.columns))
+    while True:
+        ahead = monitor.steps_ahead()
+        for slot in range(ahead):
+            iteration()
+            vectors.queue_dot(r, r, squares, slot)
+        system.products += ahead
+        norms = np.sqrt(squares.get()[:ahead].astype(np.float64))
+        if monitor.check(x, r, norms, travelled=np.inf):
+            return
+
+
+def matrix_series(
+    S: Any, *, rtol: float = 1e-2, steps: int | None = None, maxiter: int = 1000, throw: bool = True
+) -> Solution:
+    """S^-1 = I - R + R^2 - ... (eq. 10), or (I - A)^-1 = I + A + A^2 + ... (eq. 8), term by term: N^3 each.
+
+    The paper's baseline; its matrix iteration Sinv_k = I - R Sinv_(k-1) (eq. 21) gives the same.
+
+    Parameters
+    ----------
+    S : (N, N) Operator, or anything `solve` takes
+        ``T.interreflection`` inverts light transport, ``IdentityPlus(A, sign=-1)`` makes it from one bounce.
+    rtol : float
+        Done when ``||e_j - S x_j|| <= rtol`` for every column x_j.
+    steps : int, optional
+        Make exactly so many and judge nothing; `maxiter` and `throw` are those of `solve`.
+
+    Returns
+    -------
+    Solution
+        `x` is the inverse, (N, N) float32; `products` counts those of N x N matrices, one for the residual.
+
+    Raises
+    ------
+    MemoryLimitError, ConvergenceError
+        Two N x N iterates do not fit the device; divergence, or `maxiter` reached.
+
+    Examples
+    --------
+    >>> matrix_series([[1.0, 0.5], [0.5, 1.0]], steps=1).x.tolist()
+    [[1.0, -0.5], [-0.5, 1.0]]
+    """
+    start = time.perf_counter()
+    rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
+    most = checks.count("maxiter", maxiter) if steps is None else checks.count("steps", steps, least=0)
+    S = as_operator(S)
+    n, device = S.shape[1], S.device
+    if S.shape[0] != n:
+        raise InputError(f"S has shape {S.shape}; it must be square, (N, N)")
+    # Columns never mix: the device works on some of them at a time.
+    what = f"a matrix series for N = {n}, two N x N iterates,"
+    device.require(2 * 4 * n * n + 4 * n * _CHUNK, what)
+    checks.fits_host(what, 2 * 4 * n * n)
+    starts = range(0, n, _CHUNK)
+    x = [device.upload(np.eye(n, min(_CHUNK, n - first), -first, np.float32)) for first in starts]
+    r = [S.apply(e, scale=-1.0, add=e) for e in x]
+    residuals: list[float] = []
+    status = None
+    while status is None:
+        if residuals:
+            for chunk, rs in enumerate(r):
+                vectors.axpy(1.0, rs, x[chunk])
+                r[chunk] = S.apply(rs, scale=-1.0, add=rs)  # the next term, -R r = r - S r
+        residual = float(max(vectors.norm(columns).max() for columns in r))  # columns of I have norm 1
+        residuals.append(residual)
+        if steps is None and residual <= rtol:
+            status = Status.CONVERGED
+        elif steps is None and not (np.isfinite(residual) and residual <= GROWTH * residuals[0]):
+            status = Status.DIVERGED
+        elif len(residuals) > most:
+            status = Status.MAXITER
+    inverse, count = np.concatenate([columns.get() for columns in x], axis=1), len(residuals)
+    facts = status, count - 1, count, tuple(residuals), time.perf_counter() - start
+    solution = Solution(inverse, *facts, "matrix_series")
+    if throw and steps is None and not solution.converged:
+        raise ConvergenceError(str(solution), solution)
+    return solution
+
+
+METHODS = (Jacobi, Neumann, Richardson, Chebyshev, GaussSeidel, SOR, BlockGaussSeidel, Southwell)

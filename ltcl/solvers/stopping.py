@@ -8,24 +8,28 @@ the one the method has where that is little, else one that is computed anew, in 
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from ltcl import checks
 from ltcl.device import Array, vectors
-from ltcl.operators import Operator
+from ltcl.errors import InputError
+from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Operator, Tiles
 from ltcl.solvers import precision
 from ltcl.solvers.result import Status
+from ltcl.theory import row_sum_range
 
 SLOTS = 8  # steps between two readings, at most
 
-# Residuals of Chebyshev swing under an envelope that falls, and come close to 0 by chance on the way; so what
-# counts is the start and the largest of a long window, not the best residual so far.
-_GROWTH = 100.0  # times the first residual: past all transient growth of a nearly self-adjoint system
+# Residuals of Chebyshev swing: what counts is the start and the largest of a long window, not the best.
+GROWTH = 100.0  # times the first residual: past all transient growth of a nearly self-adjoint system
 _RISES = 20  # residuals in a row, each above the one before, up to more than the first
 _WINDOW = 100  # steps whose largest residual must be 1 % below that of as many steps before
 _PATIENCE = 25  # steps without a new best residual once they are near rounding
@@ -33,16 +37,19 @@ _DRIFT = 2.0**-20  # relative residual, below which one kept by recursion in flo
 CLAIM = 1.01  # times the tolerance: what a residual may reach with what rounding hides added
 _REFUSALS = 3  # claims in a row that could not be confirmed, none better than those before
 _BETTER = 0.99  # times a residual: less of it is progress
+_MOST, _NORMAL = float(np.finfo(np.float32).max), 2.0**-126  # of float32
+_LARGEST = 1e18  # Frobenius norm whose square stays in float32
+_LEAST = 2.0**-63  # entries of S below have squares that are 0 on the device
+_norms: weakref.WeakKeyDictionary[Operator, float] = weakref.WeakKeyDictionary()
 
 
 @dataclass(eq=False)
 class System:
     """S x = b on the device, counting products.
 
-    `norms` (k,) are what tolerances are relative to: those of b, or, where a part of the system is solved
-    already, of the whole right-hand side. `host` is b before it became float32. Of a `fine` system x is
-    float64 on the host, residuals are computed in float64, and r is rounded once. With `on_coefficients` x
-    will come back to pixels by float32 products, so that float64 proves nothing.
+    `norms` (k,) are what tolerances are relative to: those of the whole right-hand side. `host` is b before
+    it became float32. Of a `fine` system x is float64 on the host, residuals are computed in float64, and r
+    is rounded once. With `on_coefficients` x comes back to pixels in float32: float64 proves nothing.
     """
 
     S: Operator
@@ -124,28 +131,21 @@ class Monitor:
         """Iterations done: the first residual is that of the start."""
         return max(0, len(self.residuals) - 1)
 
-    @property
-    def left(self) -> float:
-        """What the residuals of the columns above the tolerance have to shrink by, at most 1."""
-        where = self.unsolved
-        return float(np.min(self._target[where] / self.norms[where], initial=1.0))
-
     def steps_ahead(self) -> int:
-        """Steps to queue before residuals are read: half of those to the tolerance, or to divergence.
+        """Steps to queue before residuals are read: half of those that the tolerance seems to take.
 
         No more than were made so far: products made in vain cost more than readings.
         """
-        done, residual = self.iterations, self.residuals[-1]
-        if done == 0 or not residual > 0.0:
+        done = self.iterations
+        if done == 0:
             return 1
         with np.errstate(all="ignore"):
             recent = np.array(self.residuals[-SLOTS - 1 :])
-            ratios = recent[1:] / recent[:-1]
-            factor = min(float(np.min(ratios)), self.factor)
+            factor = min(float(np.min(recent[1:] / recent[:-1])), self.factor)
             goal = np.maximum(self._target, precision.EPS * self._scale)
-            left = _steps(float(np.max(self.norms / goal)), 1.0 / factor if factor > 0.0 else math.inf)
-            growth = _steps(_GROWTH * self.residuals[0] / residual, float(ratios[-1]))
-        most = min(left, growth, 2.0 * SLOTS - 1.0, 2.0 * (self.rule.maxiter - done) - 1.0)
+            digits = np.log(np.max(self.norms / goal, initial=1.0))
+            required = digits / -np.log(factor) if factor < 1.0 else math.inf
+        most = min(required, 2.0 * SLOTS - 1.0, 2.0 * (self.rule.maxiter - done) - 1.0)
         return max(1, min(int((most + 1.0) / 2.0), done))
 
     def check(self, x: Any, r: Array, norms: np.ndarray, travelled: Any = None) -> bool:
@@ -154,8 +154,7 @@ class Monitor:
         `norms` (m, k) are those of the residuals of the m steps since the last check, the newest last.
         `travelled` is None where r was computed from x itself; of a residual kept by recursion it bounds the
         way (k,) of x in these steps, `inf` where that is unknown. Such a residual is computed anew, into `r`,
-        before convergence is claimed, unless all that rounding may have parted the two by is within the
-        tolerance, too.
+        before convergence is claimed, unless rounding cannot hide more than the tolerance.
         """
         *before, last = norms
         if travelled is None:
@@ -163,7 +162,7 @@ class Monitor:
         else:
             self._steps, self._travelled = self._steps + len(norms), self._travelled + travelled
         self.norms, claimed = self._confirm(x, r, last)
-        troubles = [self._judge(one) for one in (*before, self.norms)]
+        troubles = [self._judge(norms) for norms in (*before, self.norms)]
         self.unsolved = self.above(self.norms)
         if not claimed and not self.unsolved.any():  # within the tolerance, but for what rounding may hide
             self.unsolved = self.norms > 0.0
@@ -235,7 +234,7 @@ class Monitor:
         """Whether norms are within the tolerance with all that rounding may hide of the residual of x."""
         if not np.all(norms <= self._target):
             return False
-        norm, is_bound = precision.norm_bound(self.system.S)
+        norm, is_bound = norm_bound(self.system.S)
         if self._steps and not is_bound:
             return False
         size = vectors.norm(x) if isinstance(x, Array) else np.linalg.norm(x, axis=0)
@@ -248,7 +247,7 @@ class Monitor:
         self._record(norms)
         first, residual = self.residuals[0], self.residuals[-1]
         self._finite &= bool(np.isfinite(residual))  # what comes after an overflow is no iterate
-        grown = residual > _GROWTH * first or (self._rises >= _RISES and residual > first)
+        grown = residual > GROWTH * first or (self._rises >= _RISES and residual > first)
         if grown or not np.isfinite(residual):
             return Status.DIVERGED
         before, recent = self.residuals[-2 * _WINDOW : -_WINDOW], self.residuals[-_WINDOW:]
@@ -267,8 +266,58 @@ class Monitor:
         self._rises = self._rises + 1 if residual > previous else 0
 
 
-def _steps(times: float, rate: float) -> float:
-    """Steps in which what grows by `rate` a step grows so many times; infinite where it never does."""
-    if times <= 1.0 or rate == math.inf:
-        return 0.0
-    return math.log(times) / math.log(rate) if rate > 1.0 else math.inf
+def scale_rhs(b: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """b, (n,) or (n, k), in units near the largest value of each column, float32 where it is so already.
+
+    The units come with it: powers of two, so that squares of any light stay in float32 and no digit is lost.
+    """
+    b = checks.finite("b", checks.real("b", b))
+    if b.ndim not in (1, 2) or b.shape[0] != n or b.size == 0:
+        raise InputError(f"b has shape {b.shape}; it must be ({n},) or ({n}, k)")
+    whole = len(b) // 256 * 256  # 256 rows side by side: NumPy reduces an axis of few columns slowly
+    sizes = np.abs(b[:whole]).reshape(256, -1).max(axis=0).reshape(-1, *b.shape[1:]).max(axis=0, initial=0)
+    sizes = np.maximum(sizes, np.abs(b[whole:]).max(axis=0, initial=0)).astype(np.float64)
+    unit = np.exp2(np.floor(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
+    is_float32 = b.dtype == np.float32 and np.all(unit >= _NORMAL)
+    return b / (unit.astype(np.float32) if is_float32 else unit), unit
+
+
+def unscale(x: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """x times its unit: float32 where x is and where that holds all of it, else float64."""
+    if x.dtype == np.float32 and np.all(unit >= _NORMAL):
+        with np.errstate(all="ignore"):
+            result = x * unit.astype(np.float32)
+        sizes = np.abs(result)
+        if np.max(sizes) <= _MOST and not np.any(x[sizes < _NORMAL]):  # flushed, or may be
+            return result
+    return x * unit
+
+
+def relative(residuals: np.ndarray, norms: np.ndarray) -> float:
+    """The largest residual relative to its right-hand side; absolute of a dark one."""
+    return float(np.max(residuals / np.where(norms > 0.0, norms, 1.0), initial=0.0))
+
+
+def norm_bound(S: Operator) -> tuple[float, bool]:
+    """A bound on the 2-norm of |S|, entry by entry, and whether it is one, computed once in the life of S.
+
+    The Frobenius norm of the numbers, between isometric bases that of the core; of other operators the
+    largest row sum, a bound of symmetric S >= 0, an estimate else.
+    """
+    if isinstance(S, IdentityPlus):
+        norm, is_bound = norm_bound(S.R)
+        return 1.0 + norm, is_bound
+    if isinstance(S, Compressed) and all(W is None or W.isometric for W in (S.out, S.into)):
+        return norm_bound(S.core)
+    if not isinstance(S, Tiles | CSR | Dense):
+        least, _, most = row_sum_range(S)
+        return max(1.0, most, -least), False
+    if S not in _norms:
+        if isinstance(S, Tiles):
+            norm = S.frobenius
+        else:
+            values = [slab.arguments[-1] for slab in S.slabs if slab.arguments[-1].size]
+            flat = [dataclasses.replace(array, shape=(array.size,)) for array in values]
+            norm = math.sqrt(math.fsum(float(vectors.dot(array, array)[0]) for array in flat))
+        _norms[S] = 1.01 * norm + _LEAST * max(S.shape) if norm < _LARGEST else math.inf
+    return _norms[S], True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""An opened device: limits, the memory pool, threads, processes."""
+"""Which device is best and which one a user means; an opened one: memory, threads, processes."""
 
 from __future__ import annotations
 
@@ -10,23 +10,22 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 import ltcl
-from ltcl.device import Device, vectors
+from ltcl.device import Device, discovery, vectors
 from ltcl.device.device import SPARE_BYTES
-from ltcl.errors import MemoryLimitError
+from ltcl.device.discovery import Description
+from ltcl.errors import DeviceError, InputTypeError, MemoryLimitError
 
 
-def test_a_buffer_beyond_the_largest_is_refused_with_both_sizes(small_device):
+def test_arrays_and_matrices_beyond_the_memory_are_refused_with_both_sizes(device, small_device, monkeypatch):
+    """On a CPU also where the host has filled up since."""
     most = (small_device.max_allocation - SPARE_BYTES) // 4
     small_device.empty(most)
     with pytest.raises(MemoryLimitError, match=r"3\.988 KiB .*\(1021,\).* 4 KiB"):
         small_device.empty(most + 1)
-
-
-def test_matrices_beyond_the_memory_are_refused_with_both_sizes(device, monkeypatch):
-    """On a CPU also where the host has filled up since."""
     monkeypatch.setattr(device, "memory", 1 << 20)
     device.require(1 << 20, "this")
     with pytest.raises(MemoryLimitError, match=r"that .*1\.5 MiB.* 1 MiB"):
@@ -37,7 +36,7 @@ def test_matrices_beyond_the_memory_are_refused_with_both_sizes(device, monkeypa
             device.require(101, "that")
 
 
-def test_memory_is_used_again(device):
+def test_memory_is_used_again_and_unused_blocks_make_room(device, monkeypatch):
     device = Device(device.description)
     for size in (0, 1, 1000, 100_000):
         device.empty(size)
@@ -45,6 +44,11 @@ def test_memory_is_used_again(device):
         for _ in range(5):
             device.empty(size)
         assert device.allocations == before
+    monkeypatch.setattr(device, "_largest_pooled", 1000)
+    device.empty(1000)
+    before = device.allocations
+    device.empty(100)
+    assert device.allocations == before + 1  # nothing unused was left
 
 
 def test_memory_may_be_used_again_while_kernels_are_queued(device):
@@ -55,16 +59,6 @@ def test_memory_may_be_used_again_while_kernels_are_queued(device):
         vectors.fill(device.empty(50_000), -1)
         device.upload(np.full(50_000, -1))
     assert (total.get() == 4950).all()
-
-
-def test_unused_blocks_make_room_for_a_large_array(device, monkeypatch):
-    device = Device(device.description)
-    device.empty(100)
-    monkeypatch.setattr(device, "_largest_pooled", 1000)
-    device.empty(1000)
-    before = device.allocations
-    device.empty(100)
-    assert device.allocations == before + 1  # nothing unused was left
 
 
 def test_threads_open_one_device(device, monkeypatch):
@@ -94,7 +88,7 @@ device.finish()
 uses = [
     lambda: ltcl.open_device(sys.argv[1]), lambda: device.empty(3), lambda: device.finish(), lambda: x.get(),
     lambda: x.set(np.ones(1000)), lambda: vectors.norm(x), launch, lambda: kernel(1, 1, 1, 1.0, x),
-    lambda: device.kernel("vector", "vector_dot"), lambda: S @ np.ones(3), lambda: x.copy(),
+    lambda: device.kernel("vector", "vector_dots"), lambda: S @ np.ones(3), lambda: x.copy(),
     lambda: ltcl.solve(S, np.ones(3), "cg"),
 ]
 child = os.fork()
@@ -130,3 +124,76 @@ def test_opening_a_device_leaves_the_environment_alone_and_reads_no_pickles(devi
         "import pyopencl; assert pyopencl._PYOPENCL_NO_CACHE"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+
+
+def describe(index: str, name: str, kind: str, driver: str, units: int = 2) -> Description:
+    return Description(index, name, kind, driver, units, 1 << 30, 1 << 28, None)
+
+
+SIMULATOR = describe("0:0", "Oclgrind Simulator", "simulator", "Oclgrind 21.10")
+OLD = describe("1:0", "pthread-Ryzen", "cpu", "PoCL 3.0-rc2")
+NEW = describe("2:0", "pthread-Ryzen", "cpu", "PoCL 3.1+debian", 1)
+NEWER = describe("3:0", "Ryzen", "cpu", "Intel(R) 2026.22.10.0.01_160000")
+BIG = describe("4:1", "Radeon", "gpu", "AMD 3.0", 60)
+LITTLE = describe("4:0", "Radeon Graphics", "gpu", "AMD 3.0", 2)
+STRANGE = describe("5:0", "Phi", "accelerator", "unnumbered")
+ALL = [BIG, LITTLE, STRANGE, NEWER, NEW, OLD, SIMULATOR]  # the best first
+
+
+def test_ranking():
+    shuffled = [ALL[i] for i in (3, 0, 6, 2, 5, 1, 4)]
+    assert sorted(shuffled, key=lambda device: device.rank) == ALL
+    drivers = ["none", "0.1", "3.0-rc2", "3.0.1", "3.1+debian", "9.2", "10.0"]  # the newest last
+    devices = [describe("0:0", "cpu", "cpu", f"PoCL {driver}") for driver in drivers]
+    assert sorted(devices, key=lambda device: device.rank) == devices[::-1]
+
+
+@pytest.mark.parametrize(("select", "device"), [
+    (None, BIG), (" CPU ", NEWER), ("accelerator", STRANGE), ("4:0", LITTLE), ("radeon g", LITTLE),
+    ("3.1", NEW), ("pocl", NEW), ("simulator", SIMULATOR),
+])  # fmt: skip
+def test_selection(select, device):
+    assert discovery.choose(ALL, select) is device
+
+
+@pytest.mark.parametrize(
+    ("select", "kind"),
+    [("9:0", " index "), ("tpu", " name "), ("cpu", " CPU "), ("accelerator", " accelerator "), (None, "")],
+)
+def test_selection_of_nothing_lists_what_there_is(select, kind):
+    """A simulator is never taken unasked."""
+    devices, best = ([BIG, SIMULATOR], ".*4:1 Radeon") if select else ([SIMULATOR], "")
+    with pytest.raises(DeviceError, match=f"{select or ''}.*{kind}{best}.*0:0 Oclgrind Simulator"):
+        discovery.choose(devices, select)
+
+
+@pytest.mark.parametrize(
+    ("system", "fix"),
+    [("linux", "pocl"), ("darwin", "conda-forge"), ("win32", "Intel"), ("sunos5", "pocl")],
+)
+def test_no_device_at_all_names_a_driver_and_what_may_hide_it(monkeypatch, system, fix):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
+    with pytest.raises(DeviceError, match=f"OCL_ICD_VENDORS=/nowhere.*{fix}"):
+        discovery.choose([], "gpu")
+
+
+def test_the_environment_names_the_default(device, monkeypatch):
+    index = device.description.index
+    monkeypatch.setenv("LTCL_DEVICE", index)
+    assert ltcl.open_device() is ltcl.open_device("") is ltcl.open_device(device) is device
+    assert device.description in ltcl.list_devices()
+    monkeypatch.setenv("LTCL_DEVICE", "no such device")
+    with pytest.raises(DeviceError, match="no such device"):
+        ltcl.open_device()
+    assert ltcl.open_device(index) is device  # an argument overrides it
+    with pytest.raises(InputTypeError, match="device is 0"):
+        ltcl.open_device(0)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_machine_without_platforms_has_no_devices(monkeypatch):
+    def none() -> None:
+        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(cl, "get_platforms", none)
+    assert ltcl.list_devices() == []

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import stat
 
 import pytest
+import scipy
 
 from ltcl.device import tuning
 from ltcl.errors import DeviceError, MemoryLimitError
@@ -69,6 +71,13 @@ def test_speeds_of_the_machine_are_remembered(device, speed):
     assert speed(device) == measured
 
 
+def test_seconds_of_an_older_ltcl_are_not_taken_for_operations_a_second():
+    """They may lie in its file as "factorization": `auto` then foresaw one of 1.8e14 ms."""
+    machine = f"{platform.node()}|{os.cpu_count()} cores|scipy {scipy.__version__}"
+    tuning.remember(f"{machine}|factorization", 0.2475)
+    assert tuning.factorization_flops() > 1e6
+
+
 def test_without_tuning_the_first_variant_and_constants_are_taken(device, monkeypatch, folder):
     monkeypatch.setenv("LTCL_TUNE", "0")
     assert tuning.choose(device, "csr", "k=1", {"a": pytest.fail, "b": pytest.fail}) == "a"
@@ -94,8 +103,8 @@ def test_a_spoilt_file_is_as_good_as_none(folder, content):
     tuning.remember("key", 1)
     (folder / "tuning.json").write_bytes(content)
     assert tuning.recall("key") is None
-    tuning.remember("key", 2)
-    tuning.remember("other", None)
+    for key, value in (("key", 2), ("other", None)):
+        tuning.remember(key, value)
     assert json.loads((folder / "tuning.json").read_text()) == {"key": 2, "other": None}
     assert [file.name for file in folder.iterdir()] == ["tuning.json"]
 

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+import scipy.sparse.linalg
 
 from ltcl.device import Array, Device
-from ltcl.operators import Operator
+from ltcl.operators import CSR, Dense, Operator, Tiles
 from ltcl.operators.rows import RowOperator, Variant
 from tests import gallery, reference
 
@@ -21,11 +24,19 @@ EPILOGUES = {
     "all": (0.5, "other", -2.0, 0.75),
     "all onto itself": (-1.0, "out", 0.5, 1.0),
 }
+# Formats of rows, of an array or a sparse matrix.
+FORMATS: dict[str, Any] = {
+    "csr": lambda device, matrix: CSR(device, scipy.sparse.csr_array(matrix)),
+    "dense": lambda device, matrix: Dense(device, scipy.sparse.coo_array(matrix).toarray()),
+    "tiles of 1": lambda device, matrix: Tiles(device, matrix, 1, "float16"),
+    "tiles of 8": lambda device, matrix: Tiles(device, matrix, 8, "float32"),
+    "bytes": lambda device, matrix: Tiles(device, matrix, 8, "int8"),
+}
+ROWS = ("csr", "dense")  # those that relaxation and walks can read
 # How a product may be launched on CPUs and GPUs.
 LAUNCHES = {
     "item": Variant("", 16, shared=False),
     "item64": Variant("", 64, shared=False),
-    "stream": Variant("_stream", 16, shared=False),
 } | {
     f"group{items}": Variant("_group", items, shared=True)
     for items in (7, 32, 64, 128, 256)  # sums in trees work for any size
@@ -71,6 +82,13 @@ def close(found: np.ndarray, expected: np.ndarray, error: np.ndarray) -> None:
     np.testing.assert_array_less(np.abs(found - expected), error + np.finfo(np.float32).tiny)
 
 
+def refused(error: Any, *cases: tuple[Any, ...]) -> None:
+    """Assert that each call of (part, call, *arguments) raises the error, with that part in its message."""
+    for part, call, *arguments in cases:
+        with pytest.raises(error, match=part):
+            call(*arguments)
+
+
 def same_bits(a: np.ndarray, b: np.ndarray) -> None:
     assert a.dtype == b.dtype
     np.testing.assert_array_equal(a.view(np.uint32), b.view(np.uint32))
@@ -86,6 +104,17 @@ def same_rows(device: Device, a: np.ndarray, b: np.ndarray, error: np.ndarray) -
         close(a, b, 2 * error)
     else:
         same_bits(a, b)
+
+
+class Plain(scipy.sparse.linalg.LinearOperator):
+    """A user's own operator that knows no transpose."""
+
+    def __init__(self, matrix: Any) -> None:
+        super().__init__(matrix.dtype, matrix.shape)
+        self.matrix = matrix
+
+    def _matvec(self, x):
+        return self.matrix @ x
 
 
 def force(monkeypatch: pytest.MonkeyPatch, A: RowOperator, name: str) -> None:

@@ -17,7 +17,6 @@ from ltcl.operators import (
     Pyramid,
     ScaledColumns,
     SubsetBasis,
-    Tiles,
     Wavelet,
     stored,
 )
@@ -28,41 +27,35 @@ GRID = (5, 7)
 N = 35
 NNZ = gallery.sparse(N, N).nnz
 
-
-CORES = {
-    "csr": CSR,
-    "dense": lambda device, matrix: Dense(device, matrix.toarray()),
-    "int8": lambda device, matrix: Tiles(device, matrix, 8, "int8"),
-    "float16": lambda device, matrix: Tiles(device, matrix, 1, "float16"),
-    "float32": lambda device, matrix: Tiles(device, matrix, 8, "float32"),
-}
+SYSTEMS = ("core", "rows", "two-sided", "chained", "subset", "nested", "pixels", "pyramid", "two")
 
 
-def _core(device, kind, n=N, seed=0):
-    return CORES[kind](device, gallery.sparse(n, n, seed=seed))
-
-
-def _systems(device, core: Any = "csr"):
-    """Every kind of operator that can be kept."""
-    W = Wavelet(device, GRID, "db2")
-    order = np.random.default_rng(0).permutation(N)
+def _systems(device, core: Any = "csr") -> dict[str, IdentityPlus]:
+    """Every kind of operator and basis that can be kept."""
+    W, order = Wavelet(device, GRID, "db2"), np.random.default_rng(0).permutation(N)
     C = SubsetBasis(device, GRID, order, of=Wavelet(device, GRID, "haar", 1))
-    V = SubsetBasis(device, GRID, order[:11], of=W)
-    P = Pyramid(device, GRID)
-    M = P.shape[0]
+    V, D = (SubsetBasis(device, GRID, order[:11], of=of) for of in (W, C))
+    Q, P = SubsetBasis(device, GRID, order[:11]), Pyramid(device, GRID)
+
+    def kept(out: Any, into: Any, **options: Any) -> Compressed:
+        n = next((W.shape[0] for W in (into, out) if W is not None), N)
+        return Compressed(helpers.FORMATS[core](device, gallery.sparse(n, n)), out, into, **options)
+
     return {
-        "core": IdentityPlus(_core(device, core)),
-        "rows": IdentityPlus(Compressed(_core(device, core), None, W), -1),
-        "two-sided": IdentityPlus(Compressed(_core(device, core), W, W, 0.25), solution_error=0.5),
-        "chained": IdentityPlus(Compressed(_core(device, core), C, C), weights=np.arange(1.0, N + 1)),
-        "subset": IdentityPlus(Compressed(_core(device, core, 11), V, V, 0.1), solution_error=0.2),
-        "pyramid": IdentityPlus(Compressed(_core(device, core, M), P, P, 0.1, diagonal=np.arange(N))),
-        "two": IdentityPlus(Compressed(_core(device, core), W, C), solution_error=np.inf),
+        "core": IdentityPlus(kept(None, None).core),
+        "rows": IdentityPlus(kept(None, W), -1),
+        "two-sided": IdentityPlus(kept(W, W, error=0.25), solution_error=0.5),
+        "chained": IdentityPlus(kept(C, C), weights=np.arange(1.0, N + 1)),
+        "subset": IdentityPlus(kept(V, V, error=0.1), solution_error=0.2),
+        "nested": IdentityPlus(kept(D, D, error=0.1)),
+        "pixels": IdentityPlus(kept(Q, Q, error=0.1)),
+        "pyramid": IdentityPlus(kept(P, P, error=0.1, diagonal=np.arange(N))),
+        "two": IdentityPlus(kept(W, C), solution_error=np.inf),
     }
 
 
-@pytest.mark.parametrize("core", CORES)
-@pytest.mark.parametrize("name", ["core", "rows", "two-sided", "chained", "subset", "pyramid", "two"])
+@pytest.mark.parametrize("core", helpers.FORMATS)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_the_same_bits_come_back(device, name, core):
     a = _systems(device, core)[name]
     arrays = stored.to_arrays([a])
@@ -78,6 +71,10 @@ def test_the_same_bits_come_back(device, name, core):
     if isinstance(a.R, Compressed) and isinstance(b.R, Compressed):
         assert b.R.two_sided == a.R.two_sided
         assert (b.R.known_diagonal is None) == (a.R.known_diagonal is None)
+        for old, new in ((a.R.out, b.R.out), (a.R.into, b.R.into)):
+            if old is not None and new is not None:
+                assert type(old) is type(new)
+                assert (old.name, old.grid, old.orthonormal) == (new.name, new.grid, new.orthonormal)
 
 
 def test_what_channels_share_is_kept_and_made_once(device):
@@ -98,18 +95,10 @@ def test_other_operators_cannot_be_kept(device):
             stored.to_arrays([IdentityPlus(R)])
 
 
-def _two_sided(device):
-    return stored.to_arrays([_systems(device)["two-sided"]])
-
-
 BAD = {
     "no kind": ({"system_0.R.kind": None}, "lack 'kind'"),
     "no core": ({"system_0.R.core.kind": None}, "lack 'kind'"),
     "another kind": ({"system_0.R.core.kind": np.array("pickle")}, "kind .* is 'pickle'; .* compress again"),
-    "a sum, as older files have": (
-        {"system_0.R.kind": np.array("sum")},
-        "kind .* is 'sum'; .* compress again",
-    ),
     "no values": ({"system_0.R.core.data": None}, "lack 'data'"),
     "column beyond": ({"system_0.R.core.indices": np.full(NNZ, 35, np.int32)}, "holds 35; column indices"),
     "column before": ({"system_0.R.core.indices": np.full(NNZ, -1, np.int32)}, "holds -1; column indices"),
@@ -123,12 +112,10 @@ BAD = {
     "NaN": ({"system_0.R.core.data": np.full(NNZ, np.nan, np.float32)}, "NaN"),
     "words for values": ({"system_0.R.core.data": np.full(NNZ, "a")}, "must hold real numbers"),
     "basis that is not there": ({"system_0.R.out": np.array(7)}, "lack grid and name; compress again"),
-    "a basis as older files have it": (
-        {"basis_0.name": None, "basis_0.outer.name": np.array("db2")},
-        "lack name; compress again",
-    ),
     "half a basis": ({"system_0.R.out": np.array([0, 0])}, "do not fit"),
     "basis of another grid": ({"basis_0.grid": np.array([6, 6])}, "36 coefficients, but the core"),
+    "basis of no side": ({"basis_0.grid": np.array([2])}, "grid is"),
+    "no basis": ({"basis_0.name": np.array("pixels"), "basis_0.levels": None}, "pixels"),
     "biorthogonal": ({"basis_0.name": np.array("bior2.2")}, "bior2.2"),
     "too many levels": ({"basis_0.levels": np.array(99)}, "levels is 99"),
     "sign": ({"system_0.sign": np.array(3.0)}, "sign is 3.0"),
@@ -143,10 +130,8 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_arrays_are_refused_in_one_line(device, name):
     changes, part = BAD[name]
-    arrays = {**_two_sided(device), **{key: value for key, value in changes.items() if value is not None}}
-    for key, value in changes.items():
-        if value is None:
-            del arrays[key]
+    arrays = stored.to_arrays([_systems(device)["two-sided"]]) | changes
+    arrays = {key: value for key, value in arrays.items() if value is not None}
     with pytest.raises((InputError, InputTypeError), match=part) as caught:
         stored.from_arrays(device, arrays)
     assert "\n" not in str(caught.value)

@@ -1,24 +1,39 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The methods that the tables of this folder run over."""
+"""Methods and systems that the tables of this folder run over, and the two ways in which a solve can fail."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+import pytest
+import scipy.sparse
+from scipy.sparse.linalg import LinearOperator
+
+import ltcl
 from ltcl.device import Device
 from ltcl.device.kernels import Kernel
-from ltcl.solvers.solve import ITERATIVE as _ITERATIVE
-from ltcl.solvers.solve import METHODS as ALL
-from ltcl.solvers.solve import SAMPLED as _SAMPLED
+from ltcl.errors import ConvergenceError, InputError
+from ltcl.operators import CSR, Compressed, IdentityPlus
+from ltcl.solvers import METHODS as ALL
+from ltcl.solvers import Solution, Status
+from ltcl.solvers.krylov import STATE, Columns  # noqa: F401 - of the tests of kernels
+from tests.bases import Given, rotation, stands_for, two_sided
+from tests.problems import Scene, enclosure
 
-ITERATIVE = tuple(_ITERATIVE)
-METHODS = tuple(method for method in ALL if method not in _SAMPLED)  # those that keep a tolerance
-READS_ROWS = (
-    "gauss_seidel",
-    "sor",
-    "block_gauss_seidel",
-    "southwell",
-)  # methods that refuse operators whose entries cannot be read
+SAMPLED = ("monte_carlo", "hybrid")
+METHODS = tuple(method for method in ALL if method not in SAMPLED)  # those that keep a tolerance
+ITERATIVE = tuple(method for method in METHODS if method not in ("direct", "auto"))
+READS_ROWS = ("gauss_seidel", "sor", "block_gauss_seidel", "southwell")  # refuse entries that cannot be read
+N, SOME = 43, 19  # pixels of compressed systems, and coefficients where not all are there
+CLOSED = enclosure(N, 0.4)  # self-adjoint in the plain inner product, and so on coefficients
+
+
+def by_products(n: int, act: Callable[[np.ndarray], Any], **more: Any) -> LinearOperator:
+    """S, (n, n), of which only products are known, and by its transpose none, but for `more`."""
+    parts: dict[str, Any] = {"shape": (n, n), "matvec": act, "matmat": act, "dtype": np.float64}
+    return LinearOperator(**parts | more)
 
 
 def small_blocks(method: str, block: int = 4) -> dict[str, Any]:
@@ -38,4 +53,37 @@ def force_groups(monkeypatch: Any, device: Device, group: int) -> None:
     monkeypatch.setattr(Kernel, "group", forced)
 
 
-__all__ = ["ALL", "ITERATIVE", "METHODS", "READS_ROWS", "force_groups", "small_blocks"]
+def refused(says: str, S: Any, b: Any, method: str = "auto", kind: Any = InputError, **options: Any) -> str:
+    """The message, of one line, with which `solve` refuses this."""
+    with pytest.raises(kind, match=says) as caught:
+        ltcl.solve(S, b, method, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def failed(S: Any, b: Any, method: str = "auto", **options: Any) -> Solution:
+    """The best iterate of a solve that has to fail; the same comes back where nothing is to be thrown."""
+    with pytest.raises(ConvergenceError) as caught:
+        ltcl.solve(S, b, method, **options)
+    s = caught.value.solution
+    assert not s.converged
+    assert s.status is not Status.SAMPLED
+    assert np.isfinite(s.x).all()
+    assert "\n" not in str(caught.value)
+    return s
+
+
+def compressed(
+    device: Device, scene: Scene = CLOSED, keep: float = 0.6, **options: Any
+) -> tuple[IdentityPlus, np.ndarray]:
+    """S = I + R with R in a basis that turns all pixels, and its float64 matrix."""
+    R = two_sided(device, scene.R, keep)
+    return IdentityPlus(R, **options), np.eye(N) + stands_for(R)
+
+
+def subset(device: Device, sign: float = 1.0) -> tuple[IdentityPlus, np.ndarray]:
+    """S = I + sign V^T C V with 19 of 43 coefficients, and its float64 matrix."""
+    V = Given(device, rotation(N, 6)[:SOME])  # row sums are near the spectrum, as free bounds suppose
+    scene = enclosure(SOME, 0.4)
+    R = Compressed(CSR(device, scipy.sparse.csr_array(scene.R if sign > 0 else scene.A)), V, V)
+    return IdentityPlus(R, sign), np.eye(N) + sign * stands_for(R)

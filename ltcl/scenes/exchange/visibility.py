@@ -74,7 +74,7 @@ class Rays:
 
     def _seen(self, i: np.ndarray, start: np.ndarray, columns: int) -> np.ndarray:
         """V of patches i and the `columns` from `start` on, in whole lanes: (columns or more, len(i))."""
-        kernel = self.device.kernel("visibility", "visibility_rows", **self._defines)
+        kernel = self.device.kernel("form_factor", "form_factor_visible", K=1, **self._defines)
         lanes = geometry.lanes(self.device)
         stretches = -(-columns // lanes)
         out = self.device.empty((stretches * lanes, len(i)))

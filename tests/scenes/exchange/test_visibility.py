@@ -54,7 +54,7 @@ def test_rows_and_pairs_meet_their_twin(device, count, boxes, samples):
     patches, blocks = random_scene(count, boxes, seed=count)
     found = visibility(patches, blocks, device, samples=samples)
     read = read_by_kernel(device, patches, blocks, samples)
-    expected = reference.visibility_rows(*read)
+    expected = reference.form_factor_visible(*read)
     # A ray that grazes a box or a plane to rounding counts either way: one in a hundred entries at most.
     assert np.count_nonzero(np.abs(found - expected) > 1e-6) <= 0.01 * count**2
     np.testing.assert_array_equal(found, found.T)
