@@ -12,7 +12,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-SUFFIXES = {".py", ".cl", ".h", ".typed"}
+SUFFIXES = {".py", ".cl", ".h", ".jpg", ".typed"}
 
 
 def checkout(*folders: str) -> set[str]:

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from ltcl.scenes import CornerRows
-from ltcl.scenes.exchange.transport import transport
+from ltcl.scenes.scene import transport
 
 
 def interreflection(n: int, albedo: float, progress: Callable[[str], object]) -> np.ndarray:

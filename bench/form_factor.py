@@ -15,8 +15,7 @@ import numpy as np
 
 from _harness import Options, Row, options, report, seconds
 from ltcl.scenes import FormFactor, Patches, box, cut
-from ltcl.scenes.exchange.geometry import Frame
-from ltcl.scenes.exchange.near import squared_size
+from ltcl.scenes.patches import Frame, squared_size
 
 TARGETS = {"numpy": 20.0, "side": 2.0}
 ACCURACY = 1e-4

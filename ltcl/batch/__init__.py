@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from ltcl.batch.frames import compensate_frames
+from ltcl.batch.frames import CompensatedFrames, compensate_frames
 from ltcl.batch.manifest import Record
-from ltcl.batch.result import CompensatedFrames
 
 __all__ = ["CompensatedFrames", "Record", "compensate_frames"]

@@ -1,14 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`compensate_frames`: patterns for a folder or a video of frames, a batch of right-hand sides at a time.
 
-Every frame gets the same gain: one that followed the frames would make the scene flicker. gain="auto" is
-found once, on a sample of frames from all over the source, and kept. A frame that needs more light than the
-sample did is brought as near as the bounds allow, and its record tells how much of it is clipped. What a
-solve leaves, up to `rtol`, differs from frame to frame; where that is seen, a smaller one helps.
-
-Batches begin at the same frames in every run and share nothing but T, so that a run that was ended early and
-resumed gives what an uninterrupted one does: to the last bit where `method` takes the same way, as a named
-one does; "auto" may know more of S the second time.
+Every frame gets the same gain, as one that followed the frames would make the scene flicker; gain="auto" is
+found once, on a sample of frames from all over the source. Batches begin at the same frames in every run and
+share nothing but T, so that a resumed run gives what an uninterrupted one does: to the last bit with a named
+method; "auto" may know more of S the second time.
 """
 
 from __future__ import annotations
@@ -16,27 +12,64 @@ from __future__ import annotations
 import inspect
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import islice, repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ltcl import checks, layout
-from ltcl.batch import identity, manifest
-from ltcl.batch.manifest import Manifest
-from ltcl.batch.output import BITS, Output
-from ltcl.batch.reading import Reader
-from ltcl.batch.result import CompensatedFrames
-from ltcl.batch.run import Run, staying
+from ltcl import checks, images, layout
+from ltcl.batch.manifest import NAME, Manifest, OtherRun, Record, curve, fingerprint, locked, setting
 from ltcl.compensation import compensate, problem
-from ltcl.errors import InputError
+from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.files import as_path
-from ltcl.images.codes import Encoding
-from ltcl.images.frames import check_video, open_frames, write_video
-from ltcl.transport import Transport, require, resolve_reference
+from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
+from ltcl.images.srgb import Encoding
+from ltcl.transport import Transport, error_note, require, resolve_reference
 
 _USUAL_FPS = 25.0
+_WRITERS = 4  # threads: files are compressed and flushed side by side
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CompensatedFrames:
+    """Result of `compensate_frames`: a record a frame, in order, those of earlier runs, too.
+
+    The `folder` holds the patterns and frames.json. `solved` frames of this run took `seconds`, reading and
+    writing included. `transport_error` is as in `ltcl.Compensation`: not in the errors of the records.
+    """
+
+    folder: Path
+    video: Path | None
+    gain: float
+    records: tuple[Record, ...]
+    solved: int
+    seconds: float
+    transport_error: float = 0.0
+
+    @property
+    def frames_per_second(self) -> float:
+        """Of this run; 0 where nothing was left to do."""
+        return self.solved / self.seconds if self.solved else 0.0
+
+    @property
+    def worst(self) -> Record:
+        """The frame with the largest error."""
+        return max(self.records, key=lambda record: record.error)
+
+    @property
+    def most_clipped(self) -> Record:
+        """The frame with the largest share of clipped values."""
+        return max(self.records, key=lambda record: record.clipped)
+
+    def __repr__(self) -> str:
+        worst = self.worst
+        off = f"at worst off by {worst.error:.2%}{error_note(self.transport_error)}, frame {worst.number}"
+        return f"<ltcl CompensatedFrames {len(self.records)} in {self.folder}, {off}>"
 
 
 def compensate_frames(
@@ -55,7 +88,7 @@ def compensate_frames(
     resize: bool = False,
     gain: float | str = 1.0,
     loss: float | None = None,
-    progress: Callable[[int, int | None], object] | None = None,
+    progress: Callable[[str, int, int | None], object] | None = None,
     codes: Callable[[np.ndarray], np.ndarray] | None = None,
     **options: Any,
 ) -> CompensatedFrames:
@@ -66,14 +99,13 @@ def compensate_frames(
     T : Transport
         As in `ltcl.compensate`.
     source
-        A folder of pictures, or a video file, as `ltcl.images.frames.open_frames` takes it; all of one size.
+        A folder of pictures, or a video file, as `ltcl.images.frames.open_frames` takes it.
     out
-        A folder: pattern_000001.png and so on, and frames.json, which tells settings and frames done. What is
-        in it already stays.
+        A folder: pattern_000001.png and so on, and frames.json, which tells settings and frames done. Other
+        files in it stay; a second run in it at the same time is refused.
     batch : int
         Frames solved at once; more need more memory and, up to a point, less time for each. What a solve
-        leaves within `rtol` depends on the frames beside, and the sample for a gain is as large: when
-        resuming it has to be the same.
+        leaves within `rtol`, and the sample for a gain, depend on it: resuming needs the same.
     resume : bool
         Go on where an earlier run with the same T, settings and frames ended; from the beginning where there
         was none. Without it, a folder with frames of an earlier run is refused.
@@ -83,20 +115,17 @@ def compensate_frames(
         "png", 16 bits in sRGB with white at the upper bound of the light; or "exr", the light as it is.
     appearance : bool
         Write T pattern + background, too, into a folder appearance within `out`.
-    video : optional
-        Also a video of the patterns: .mkv or .avi (lossless), .mp4. It is made from the pictures when all
-        are done.
-    fps : float, optional
-        Of that video; that of the source, or 25.
+    video, fps : optional
+        Also a video of the patterns, made when all are done: .mkv or .avi (lossless), .mp4; its frames a
+        second are those of the source, or 25.
     encoding, resize
         What the frames hold; whether to scale them to the camera's grid.
     gain : float or "auto"
-        Of all frames; "auto" finds the largest for a sample of `batch` frames, evenly spread.
-    loss : float, optional
-        As in `ltcl.compensate`, of that sample.
-    progress : callable(done, total), optional
-        Called after every batch with the number of frames done, of earlier runs, too; total is None where the
-        source does not tell.
+        Of all frames; "auto" finds the largest for a sample of `batch` frames, evenly spread, with `loss` as
+        in `ltcl.compensate`. A frame that needs more light is clipped, and its record tells how much.
+    progress : callable("frames", done, total), optional
+        Called before every batch and at the end; done counts frames of earlier runs, too, and total is None
+        where the source does not tell.
     codes : callable(pattern), optional
         What the projector is fed for a pattern of light, (h, w) or (h, w, 3), such as
         `ltcl.acquisition.Setup.codes`: .png and video then hold these codes, and not sRGB.
@@ -109,12 +138,10 @@ def compensate_frames(
 
     Raises
     ------
-    FileError, InputError
+    FileError, InputError, ConvergenceError
         As `ltcl.compensate`, `open_frames` and `write_video`; a frame that cannot be read or has another
-        size; a folder with frames of an earlier run; one whose T, settings or frames differ when resuming.
-    ConvergenceError
-        As in `ltcl.compensate`.
-        After any of these, or Ctrl-C, the frames of all batches before stay done.
+        size; a folder with frames of another run. The frames of all batches before stay done, as after
+        Ctrl-C.
 
     Examples
     --------
@@ -130,39 +157,48 @@ def compensate_frames(
     array([[0.33, 0.33]], dtype=float32)
     """
     start = time.perf_counter()
-    checks.one_of("format", format, BITS)
+    checks.one_of("format", format, ("png", "exr"))
     fps = None if fps is None else checks.number("fps", fps, above=0.0)
     limit = None if frames is None else checks.count("frames", frames)
-    bounds = _checked(T, gain, loss, options)
+    bounds = _validate(T, gain, loss, codes, options)
     if video is not None:
         check_video(video, T.grid)
-    opened = open_frames(source, encoding=encoding)
-    _apart(opened.path, {"out": out, "video": video})
-    kept = _manifest(
-        T,
-        as_path(out),
-        resume,
-        {"gain": gain, "loss": loss, "batch": checks.count("batch", batch), "format": format}
-        | {"appearance": appearance, "encoding": encoding, "resize": resize, "codes": codes, **options},
-    )
-    white = bounds[1] if bounds[1] > 0 else 1.0
-    output = Output(kept.path.parent, format, white, appearance, codes)
-    output.sweep()
-    run = Run(T, Reader(opened, T.camera_grid, resize, limit), output, kept, batch, options)
-    with staying(kept):
-        for _ in run.solve(gain, loss):
-            if progress is not None:
-                progress(len(run.passed), run.reader.count)
-        if video is not None:
-            write_video(video, output.patterns(run.passed), fps or opened.fps or _USUAL_FPS)
-    return run.result(None if video is None else as_path(video), time.perf_counter() - start)
+    opened, folder = open_frames(source, encoding=encoding), as_path(out)
+    for name, target in {"out": out, "video": video}.items():
+        if target is not None and as_path(target).resolve() == opened.path.resolve():
+            raise InputError(f"{name} is {target}, where the frames are; it must be another place")
+    parameters = inspect.signature(compensate).parameters.values()
+    settings = {each.name: each.default for each in parameters if each.kind is each.KEYWORD_ONLY}
+    settings |= {"gain": gain, "loss": loss, "batch": checks.count("batch", batch), "format": format}
+    settings |= {"appearance": appearance, "encoding": encoding, "resize": resize, **options}
+    described = {name: setting(value) for name, value in settings.items() if name != "callback"}
+    described["codes"] = codes and curve(codes, T.grid)
+    manifest, white = Manifest(folder / NAME, described, fingerprint(T)), bounds[1] if bounds[1] > 0 else 1.0
+    run = _Run(T, opened, limit, resize, manifest, batch, format, white, appearance, codes, options)
+    with locked(folder):
+        manifest.begin(resume)
+        for name in (".pattern_*", ".frames-*.json", "appearance/.appearance_*"):  # of killed runs
+            for file in folder.glob(name):
+                file.unlink(missing_ok=True)
+        with _worded(after=run.advice):
+            for done in run.solve(gain, loss):
+                if progress is not None:
+                    progress("frames", done, run.count)
+            if video is not None:
+                write_video(video, run.patterns(), fps or opened.fps or _USUAL_FPS)
+    records = tuple(manifest.records[number] for number in run.done)
+    error = (options.get("exact") or T).error
+    seconds, film = time.perf_counter() - start, None if video is None else as_path(video)
+    return CompensatedFrames(folder, film, manifest.gain or 0.0, records, run.solved, seconds, error)
 
 
-def _checked(T: Transport, gain: Any, loss: Any, options: dict[str, Any]) -> tuple[float, float]:
+def _validate(T: Transport, gain: Any, loss: Any, codes: Any, options: dict[str, Any]) -> tuple[float, float]:
     """The bounds, (low, high); refuses what `compensate` would, and pictures that are not for all frames."""
     require(T, square=False)
     resolve_reference(T, options.get("exact"))
     problem.gain(gain, loss)
+    if codes is not None and not callable(codes):
+        raise InputTypeError(f"codes is {checks.shown(codes)}; it must be a function of a pattern")
     for name in ("background", "weights"):
         value = options.get(name)
         if value is None or checks.real(name, value).ndim == 0:
@@ -173,21 +209,145 @@ def _checked(T: Transport, gain: Any, loss: Any, options: dict[str, Any]) -> tup
     return checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
 
 
-def _apart(source: Path, targets: dict[str, Any]) -> None:
-    """Refuse to write where the frames come from."""
-    for name, target in targets.items():
-        if target is not None and as_path(target).resolve() == source.resolve():
-            raise InputError(f"{name} is {target}, where the frames are; it must be another place")
+@dataclass(eq=False)
+class _Run:
+    """The loop over batches: read ahead, solve, write, record, in this order."""
+
+    T: Transport
+    source: Source
+    limit: int | None
+    resize: bool
+    manifest: Manifest
+    size: int
+    format: str
+    white: float  # light that is white in .png
+    appearance: bool
+    codes: Callable[[np.ndarray], np.ndarray] | None
+    options: dict[str, Any]
+    done: list[int] = field(default_factory=list)  # numbers of frames, of earlier runs, too
+    solved: int = 0
+
+    @property
+    def count(self) -> int | None:
+        """Of the frames, as far as the source tells."""
+        count = self.source.count
+        return count if count is None or self.limit is None else min(count, self.limit)
+
+    def advice(self) -> str:
+        """How to go on after an error, if there is anything."""
+        count, folder = len(self.manifest.records), self.manifest.path.parent
+        done = f"; {count} frame(s) are done and stay in {folder}, resume=True goes on from there"
+        return done if count else ""
+
+    def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
+        """All batches; yields the number of frames done before each that is not done yet, and at the end."""
+        batches = self._batches()
+        with ThreadPoolExecutor(1) as reader:
+            coming = reader.submit(next, batches, None)
+            while (batch := coming.result()) is not None:
+                coming = reader.submit(next, batches, None)
+                frames, digests, pictures = batch
+                if pictures:
+                    yield len(self.done)
+                    self._solve(frames, digests, _stack(pictures), self._gain(gain, loss))
+                self.done += [frame.number for frame in frames]
+        yield len(self.done)
+
+    def patterns(self) -> Iterator[np.ndarray]:
+        """As they were written, white at 1; codes as the light of which sRGB makes them."""
+        for number in self.done:
+            pattern = images.read(self._files(number)[0])
+            if self.format == "exr" and self.codes is not None:
+                pattern = images.from_srgb(self.codes(pattern))
+            elif self.format == "exr":
+                pattern = pattern / np.float32(self.white)
+            yield pattern
+
+    def _files(self, number: int) -> list[Path]:
+        """Those of a frame: its pattern and, where asked for, its appearance."""
+        names = ["pattern_{:06}.{}", "appearance/appearance_{:06}.{}"][: 1 + self.appearance]
+        return [self.manifest.path.parent / name.format(number, self.format) for name in names]
+
+    def _batches(self) -> Iterator[tuple[list[Frame], list[str], list[np.ndarray]]]:
+        """Frames, digests, and pictures: none where an earlier run has done all of them."""
+        frames, folder = islice(self.source, self.limit), self.manifest.path.parent
+        while batch := list(islice(frames, self.size)):
+            digests = [frame.digest() for frame in batch]
+            records = [self.manifest.records.get(frame.number) for frame in batch]
+            for frame, digest, record in zip(batch, digests, records, strict=True):
+                if record is not None and record.digest != digest:
+                    advice = f"give the same frames to go on, or another folder than {folder}"
+                    raise OtherRun(f"{self._place(frame)} has changed since its pattern was made; {advice}")
+            files = [file for frame in batch for file in self._files(frame.number)]
+            is_done = None not in records and all(file.is_file() for file in files)
+            yield batch, digests, [] if is_done else [self._picture(frame) for frame in batch]
+
+    def _place(self, frame: Frame) -> str:
+        return f"{self.source.path}: frame {frame.number} ({frame.name})"
+
+    def _picture(self, frame: Frame) -> np.ndarray:
+        """The frame on the camera's grid."""
+        picture, grid = frame.picture(), self.T.camera_grid
+        if picture.shape[:2] != grid and self.resize:
+            return images.resize(picture, grid)
+        if picture.shape[:2] != grid:
+            has, wants = ("{} x {}".format(*size) for size in (picture.shape[:2], grid))
+            advice = "give resize=True to scale all frames"
+            raise InputError(f"{self._place(frame)} is {has} pixels, but the camera has {wants}; {advice}")
+        return picture
+
+    def _gain(self, gain: float | str, loss: float | None) -> float:
+        """The one of all frames, found once, of a sample: the first frames where their number is unknown."""
+        if self.manifest.gain is None and isinstance(gain, str):
+            count = self.count or self.size
+            numbers = {*np.rint(np.linspace(1, count, min(self.size, count))).astype(int).tolist()}
+            frames = islice(self.source, max(numbers))
+            sample = _stack([self._picture(frame) for frame in frames if frame.number in numbers])
+            self.manifest.gain = compensate(self.T, sample, gain=gain, loss=loss, **self.options).gain
+        elif self.manifest.gain is None:
+            self.manifest.gain = float(gain)
+        return self.manifest.gain
+
+    def _solve(self, frames: list[Frame], digests: list[str], pictures: np.ndarray, gain: float) -> None:
+        """Patterns of a batch, on the disk, and then their records."""
+        numbers = [frame.number for frame in frames]
+        with _worded(f"frames {numbers[0]} to {numbers[-1]}: "):
+            solved = compensate(self.T, pictures, gain=gain, **self.options)
+        with ThreadPoolExecutor(_WRITERS) as writers:
+            appearances = solved.appearance if self.appearance else solved.pattern  # not written then
+            list(writers.map(self._write, numbers, solved.pattern, appearances, repeat(gain)))
+        results = zip(frames, digests, solved.frame_errors, solved.frame_clipped, strict=True)
+        self.manifest.add(
+            Record(frame.number, frame.name, digest, float(error), float(clipped))
+            for frame, digest, error, clipped in results
+        )
+        self.solved += len(frames)
+
+    def _write(self, number: int, pattern: np.ndarray, appearance: np.ndarray, gain: float) -> None:
+        """A frame's files; an appearance in a .png is divided by the gain, as the picture asked for."""
+        pairs = ((pattern, self.white), (appearance, gain))
+        for file, (light, white) in zip(self._files(number), pairs, strict=False):
+            if self.format == "exr":
+                images.write(file, light)
+            elif self.codes is not None and light is pattern:
+                images.write(file, self.codes(pattern), bits=16, encoding="linear")
+            else:
+                images.write(file, light / np.float32(white), bits=16)
 
 
-def _manifest(T: Transport, folder: Path, resume: bool, settings: dict[str, Any]) -> Manifest:
-    known = inspect.signature(compensate).parameters.values()
-    usual = {each.name: each.default for each in known if each.kind is each.KEYWORD_ONLY}
-    used = {name: value for name, value in {**usual, **settings}.items() if name != "callback"}
-    described = {name: identity.of_setting(value) for name, value in used.items()}
-    kept = Manifest(folder / manifest.NAME, described, identity.of_transport(T))
-    if resume:
-        kept.take_up()
-    else:
-        manifest.refuse_earlier(kept.path)
-    return kept
+def _stack(pictures: list[np.ndarray]) -> np.ndarray:
+    """(frames, h, w), or (frames, h, w, 3) where one of them is in colour."""
+    if any(picture.ndim == 3 for picture in pictures):
+        pictures = [np.stack([p] * 3, axis=-1) if p.ndim == 2 else p for p in pictures]
+    return np.stack(pictures)
+
+
+@contextmanager
+def _worded(before: str = "", after: Callable[[], str] = str) -> Iterator[None]:
+    """Put words around the message of every refusal of the block but those of another run."""
+    try:
+        yield
+    except LtclError as error:
+        if not isinstance(error, OtherRun):
+            error.args = (f"{before}{error}{after()}",)
+        raise

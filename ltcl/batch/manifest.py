@@ -7,20 +7,33 @@ frame that is not there, and whatever ends a run early costs the batch it was at
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
 import json
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import scipy.sparse
+
 from ltcl import report
-from ltcl.batch import identity
 from ltcl.errors import FileError, InputError
 from ltcl.files import input_file, replace_file
+from ltcl.transport import Transport
+
+try:
+    import fcntl
+except ImportError:  # Windows: nothing keeps two runs apart there
+    fcntl = None
 
 NAME = "frames.json"
-_FORMAT = 1
+_FORMAT = 2
+_FEW = 8  # numbers are shown as they are, more by a digest
+_LEVELS = 9  # of light, at which the curves of projectors are compared
 
 
 class OtherRun(InputError):
@@ -29,18 +42,9 @@ class OtherRun(InputError):
 
 @dataclass(frozen=True)
 class Record:
-    """One frame that is done.
+    """One frame that is done: its number, from 1, its name and the SHA-256 of what was read.
 
-    Attributes
-    ----------
-    number : int
-        From 1; of the pattern, too.
-    name : str
-        Of the frame that was read.
-    digest : str
-        SHA-256 of what it holds.
-    error, clipped : float
-        Of this frame, as in `ltcl.Compensation`: with T, or with `exact` where that is among the settings.
+    `error` and `clipped` are as in `ltcl.Compensation`: with T, or with `exact` where that is a setting.
     """
 
     number: int
@@ -59,73 +63,127 @@ class Manifest:
     transport: dict[str, Any]
     gain: float | None = None
     records: dict[int, Record] = field(default_factory=dict)
-    _lines: dict[int, str] = field(default_factory=dict)  # all of them are written after every batch
 
     def add(self, records: Iterable[Record]) -> None:
         """Take these frames as done, on the disk, too."""
-        self._take(records)
+        self.records |= {record.number: record for record in records}
         known = {"settings": self.settings, "transport": self.transport, "gain": self.gain}
         head = report.dumps({"format": _FORMAT, "versions": report.versions(), **known})
-        lines = ",\n".join(self._lines[number] for number in sorted(self._lines))
+        ordered = (dataclasses.asdict(self.records[number]) for number in sorted(self.records))
+        lines = ",\n".join(f"    {json.dumps(record)}" for record in ordered)
         with replace_file(self.path) as temporary:
             temporary.write_text(f'{head[:-2]},\n  "frames": [\n{lines}\n  ]\n}}\n', encoding="utf-8")
 
-    def take_up(self) -> None:
-        """Go on with the run whose file is there, if one is.
+    def begin(self, resume: bool) -> None:
+        """Go on with the run whose file is there, if one is; without `resume`, refuse that.
 
-        Raises
-        ------
-        FileError
-            The file is damaged.
-        OtherRun
-            That run had other settings, or another T.
+        OtherRun where that run had other settings, or another T; FileError where the file is damaged.
         """
         if not self.path.exists():
             return
-        earlier, records = _read(self.path)
-        for name in sorted({*self.settings, *earlier["settings"]}):
-            had, has = (of.get(name) for of in (earlier["settings"], self.settings))
-            if had != has:
-                raise OtherRun(
-                    f"{self.path}: that run had {name}={had!r}, this one has {has!r}; "
-                    "give the same to go on with it, or another folder"
-                )
-        if not identity.same_transport(earlier["transport"], self.transport):
-            raise OtherRun(
-                f"{self.path}: that run was with another T; give the same to go on with it, or another folder"
-            )
-        self.gain = earlier["gain"]
-        self._take(records)
-
-    def _take(self, records: Iterable[Record]) -> None:
-        for record in records:
-            self.records[record.number] = record
-            self._lines[record.number] = f"    {json.dumps(dataclasses.asdict(record))}"
-
-
-def refuse_earlier(path: Path) -> None:
-    """Refuse to begin anew where a run has left frames: they may be worth hours."""
-    if path.exists():
-        _, records = _read(path)
-        raise InputError(
-            f"{path.parent}: holds {len(records)} frame(s) of an earlier run; "
-            "give resume=True to go on with it, or another folder"
-        )
+        try:
+            content = json.loads(input_file(self.path).read_text(encoding="utf-8"))
+            if content["format"] != _FORMAT:
+                raise ValueError(f"format {content['format']!r}")
+            records = {int(entry["number"]): Record(**entry) for entry in content["frames"]}
+            settings, transport = dict(content["settings"]), {**content["transport"], "error": None}
+            gain = float(content["gain"])
+        except FileError:
+            raise
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            reason = " ".join(str(error).split())
+            raise FileError(f"{self.path}: is no list of frames of ltcl, or damaged ({reason})") from None
+        if not resume:
+            count, folder = len(records), self.path.parent
+            advice = "give resume=True to go on with it, or another folder"
+            raise InputError(f"{folder}: holds {count} frame(s) of an earlier run; {advice}")
+        advice = "give the same to go on with it, or another folder"
+        for name in sorted({*self.settings, *settings}):
+            before, now = settings.get(name), self.settings.get(name)
+            if before != now:
+                raise OtherRun(f"{self.path}: that run had {name}={before!r}, this one has {now!r}; {advice}")
+        if transport != {
+            **self.transport,
+            "error": None,
+        }:  # which depends on the first bounce: patterns do not
+            raise OtherRun(f"{self.path}: that run was with another T; {advice}")
+        self.gain, self.records = gain, records
 
 
-def _read(path: Path) -> tuple[dict[str, Any], list[Record]]:
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Make the folder, and refuse other runs in it until the block ends; an empty one is removed again."""
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        found = json.loads(input_file(path).read_text(encoding="utf-8"))
-        if found["format"] != _FORMAT:
-            raise ValueError(f"format {found['format']!r}")
-        records = [Record(**entry) for entry in found["frames"]]
-        head = {key: found[key] for key in ("settings", "transport", "gain")}
-        kinds = [*zip(head.values(), (dict, dict, float), strict=True), *((r.number, int) for r in records)]
-        if not all(isinstance(value, kind) for value, kind in kinds):
-            raise ValueError("values of other types")
-    except FileError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise FileError(f"{path}: is no list of frames of ltcl, or a damaged one ({reason})") from None
-    return head, records
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY) if fcntl else -1
+    except OSError as error:
+        reason = "is a file; a folder cannot be written there" if folder.is_file() else error.strerror
+        raise FileError(f"{folder}: {reason}") from error
+    try:
+        if fcntl:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise FileError(f"{folder}: another run writes there; wait for it, or give another folder") from None
+    try:
+        yield
+    finally:
+        for place in made:
+            with contextlib.suppress(OSError):  # something is in it
+                place.rmdir()
+        if fcntl:
+            os.close(handle)
+
+
+def fingerprint(T: Transport) -> dict[str, Any]:
+    """Sizes, error and a SHA-256 of all entries; of operators without entries, of some numbers u.(T v).
+
+    Not of the first bounce: compensation does not depend on it.
+    """
+    arrays = [T.masked] if T.mixing is None else [T.masked, T.mixing]
+    for matrix in T.matrices if T.blocks is None else (block for row in T.blocks for block in row):
+        if isinstance(matrix, scipy.sparse.csr_array):
+            arrays += [matrix.data, matrix.indices.astype(np.int64), matrix.indptr.astype(np.int64)]
+        elif isinstance(matrix, np.ndarray):
+            arrays.append(matrix)
+        else:
+            random = np.random.default_rng(0)
+            sums = random.random((4, matrix.shape[0])) @ (matrix @ random.random(matrix.shape[1]))
+            arrays.append(np.array([f"{number:.4g}" for number in sums], "S16"))  # float32 products
+    sizes = {"grid": list(T.grid), "camera_grid": list(T.camera_grid), "channels": T.channels}
+    return {**sizes, "error": T.error, "digest": _digest(*arrays)}
+
+
+def setting(value: Any) -> Any:
+    """A setting in the types of JSON: pictures and transports by a digest, other objects by their repr.
+
+    >>> setting((0.0, 1.0)), setting("auto"), setting(np.zeros((4, 5)))[:13]
+    ([0.0, 1.0], 'auto', '4 x 5, sha256')
+    """
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return value
+    if isinstance(value, Transport):
+        return f"Transport, sha256 {fingerprint(value)['digest']}"
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        text = repr(value)
+        return type(value).__name__ if " at 0x" in text else text  # an address is of one run
+    if array.size <= _FEW:
+        return array.tolist()
+    return f"{' x '.join(map(str, array.shape))}, sha256 {_digest(array.astype(np.float64))}"
+
+
+def curve(codes: Callable[[np.ndarray], np.ndarray], grid: tuple[int, int]) -> str:
+    """By what a projector's curve is known again: its codes for some levels of light, and for a ramp."""
+    ramp = np.linspace(0.0, 1.0, grid[0] * grid[1], dtype=np.float32).reshape(grid)
+    levels = [np.full(grid, level, np.float32) for level in np.linspace(0.0, 1.0, _LEVELS)]
+    return f"sha256 {_digest(*(np.rint(65535 * np.asarray(codes(light))) for light in (*levels, ramp)))}"
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    digest: Any = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype} {array.shape};".encode())
+        digest.update(np.ascontiguousarray(array))
+    return digest.hexdigest()

@@ -197,7 +197,8 @@ def run(
     rtol = default_rtol(RTOL, T, judge, known) if rtol is None else rtol
     reader = pictures.Reader(T.camera_grid, "the camera", encoding, resize)
     desired = {} if source else reader.read_all(picture)
-    dark, counts = (None if file is None else reader.read(file) for file in (background, weights))
+    photographs = pictures.Reader(T.camera_grid, "the camera", encoding, resize, upright=False)
+    dark, counts = (None if file is None else photographs.read(file) for file in (background, weights))
     if dark is None and setup is not None:
         dark = setup.ambient
     text = transports.heading(

@@ -59,7 +59,7 @@ def run(T: Transport, path: Path, out: Path, settings: dict[str, Any]) -> Compen
     given = {name: value for name, value in settings.items() if value is not None}
     with console.Frames() as progress:
         try:
-            return compensate_frames(T, path, out, progress=progress, **given)
+            return compensate_frames(T, path, out, progress=lambda _, *done: progress(*done), **given)
         except KeyboardInterrupt:
             console.note(f"{progress.done} frame(s) are done and stay in {out}; --resume goes on from there")
             raise

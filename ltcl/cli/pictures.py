@@ -21,6 +21,7 @@ class Reader:
     """How picture files become linear pictures on a `grid`: what they hold, whether to scale them.
 
     Those of integers are codes for the projector of a `setup`, where there is one and nothing else is said.
+    Photographs, not `upright`, keep the camera's pixels.
     """
 
     grid: Grid
@@ -28,6 +29,7 @@ class Reader:
     encoding: Literal["auto", "srgb", "linear"]
     resize: bool
     setup: Any = None
+    upright: bool = True
 
     def read(self, path: Path) -> np.ndarray:
         """The picture in `path`, linear float32, (h, w) or (h, w, 3) on the grid.
@@ -40,7 +42,8 @@ class Reader:
         from ltcl import images
 
         setup = self.setup if self.encoding == "auto" and self.setup and _holds_integers(path) else None
-        picture = images.read(path, encoding="linear" if setup else self.encoding)
+        encoding = "linear" if setup else self.encoding
+        picture = images.read(path, encoding=encoding, upright=self.upright)
         if self.resize and picture.shape[:2] != self.grid:
             picture = images.resize(picture, self.grid)
         if picture.shape[:2] == self.grid:

@@ -24,17 +24,24 @@ from ltcl.files import fill_folder
 def fill(out: Path, text: dict[str, Any]) -> Iterator[Path]:
     """Fill `out` as `fill_folder` does, and add the report `text` with the list of its files.
 
+    Another run that writes there is refused at once.
+
     Only when all is in place, the files go that the earlier report of this command listed and this one
     does not.
     """
+    from ltcl.batch.manifest import locked
+
     name = f"{text['command']}.json"
-    earlier = _listed(out / name)
-    with fill_folder(out) as folder:
-        yield folder
-        found = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-        text["files"] = [*found, name]
-        report.write(folder / name, text)
-    _remove(out, earlier, text["files"])
+    with locked(out):
+        earlier = _listed(out / name)
+        with fill_folder(out) as folder:
+            yield folder
+            found = sorted(
+                file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()
+            )
+            text["files"] = [*found, name]
+            report.write(folder / name, text)
+        _remove(out, earlier, text["files"])
 
 
 def _listed(path: Path) -> list[str]:

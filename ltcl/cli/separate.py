@@ -49,7 +49,7 @@ def run(
     known = transports.load_inverse(inverse, T)
     judge = transports.load_exact(exact, T, grid=grid, on_dark=on_dark)
     rtol = default_rtol(RTOL, T, judge, known) if rtol is None else rtol
-    seen = pictures.Reader(T.grid, "the camera", encoding, resize).read_all(picture)
+    seen = pictures.Reader(T.grid, "the camera", encoding, resize, upright=False).read_all(picture)
     text = transports.heading(
         "separate",
         transport,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The main result without hardware: a picture thrown into a coloured corner, before and after compensation.
 
-`experiment` computes, `target` makes the picture that is wanted, `output` fills the folder.
+`experiment` computes, `output` fills the folder.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +24,7 @@ STEPS = (*experiment.STEPS, "pictures")
 
 @dataclass(frozen=True)
 class Demo:
-    """Result of `run`.
-
-    Attributes
-    ----------
-    folder : Path
-    report : dict
-        The contents of report.json.
-    files : tuple of str
-        All files written, relative to `folder`.
-    """
+    """Result of `run`: the `folder`, the contents of report.json, and all `files` written, relative to it."""
 
     folder: Path
     report: dict[str, Any]
@@ -60,21 +51,6 @@ def run(
     progress : callable, optional
         Called with each of `STEPS` as it begins.
 
-    Returns
-    -------
-    Demo
-
-    Raises
-    ------
-    InputError
-        A size below 4.
-    MemoryLimitError
-        A size whose matrices do not fit.
-    DeviceError
-        No OpenCL device.
-    FileError
-        The folder cannot be written.
-
     Examples
     --------
     >>> import tempfile
@@ -83,34 +59,20 @@ def run(
     True
     """
     checks.count("size", size, least=4)
-    clock = _Clock(progress)
+    starts: dict[str, float] = {}
+
+    def begin(step: str) -> None:
+        starts[step] = time.perf_counter()
+        if progress is not None:
+            progress(step)
+
     with fill_folder(out) as folder:
-        found = experiment.compute(size, device, clock.start)
-        clock.start("pictures")
-        output.write_pictures(found, folder)
-        clock.stop()
-        text = output.report_of(found, clock.seconds)
+        results = experiment.compute(size, device, begin)
+        begin("pictures")
+        output.write_pictures(results, folder)
+        ends = [*starts.values(), time.perf_counter()][1:]
+        seconds = {step: round(end - starts[step], 3) for step, end in zip(starts, ends, strict=True)}
+        text = output.report_of(results, seconds)
         report.write(folder / "report.json", text)
         files = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
     return Demo(Path(out), text, tuple(files))
-
-
-@dataclass
-class _Clock:
-    """Tells which step begins, and how long each took."""
-
-    progress: Callable[[str], object] | None
-    seconds: dict[str, float] = field(default_factory=dict)
-    _running: tuple[str, float] | None = None
-
-    def start(self, step: str) -> None:
-        self.stop()
-        self._running = (step, time.perf_counter())
-        if self.progress is not None:
-            self.progress(step)
-
-    def stop(self) -> None:
-        if self._running is not None:
-            step, since = self._running
-            self.seconds[step] = round(time.perf_counter() - since, 3)
-        self._running = None

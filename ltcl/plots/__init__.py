@@ -8,8 +8,7 @@ by the first plot, not with this module.
 
 from __future__ import annotations
 
-from ltcl.plots.forecast import analysis
+from ltcl.plots.figures import Panel, analysis, contact_sheet, convergence
 from ltcl.plots.page import save
-from ltcl.plots.sheet import Panel, Sheet, contact_sheet, convergence
 
-__all__ = ["Panel", "Sheet", "analysis", "contact_sheet", "convergence", "save"]
+__all__ = ["Panel", "analysis", "contact_sheet", "convergence", "save"]

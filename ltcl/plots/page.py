@@ -20,15 +20,7 @@ OTHERS = ("#c792ea", "#f78fb3", "#7fdbca", "#d6deeb", "#ffd866", "#9fb4ff", "#e0
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure; an earlier file at `path` is replaced whole or not at all.
-
-    Raises
-    ------
-    InputError
-        An extension that matplotlib cannot write.
-    FileError
-        The file cannot be written.
-    """
+    """Write a figure in a format of matplotlib; an earlier file at `path` is replaced whole or not at all."""
     known = figure.canvas.get_supported_filetypes()
     extension = os.path.splitext(path)[1].lstrip(".").lower()
     if extension not in known:

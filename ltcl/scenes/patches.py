@@ -2,19 +2,25 @@
 """Walls cut into flat patches: the geometry that form factors, rays and visibility are computed from.
 
 A picture on the walls has grid (n, walls * n), row-major: patch (r, c) of wall w is number
-r * walls * n + w * n + c.
+r * walls * n + w * n + c. Kernels compute in float32, so for them lengths are counted from the middle of the
+scene in parts of its size, and boxes are shrunk by a hair: light that leaves a face of a box, or runs along
+it, is not blocked by that very box.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ltcl import checks
-from ltcl.errors import InputError
+from ltcl.device import Array, Device
+from ltcl.errors import InputError, InputTypeError
 from ltcl.scenes.walls import Wall
+
+_HAIR = 1e-5  # of the scene's size: above the rounding of coordinates, far below a patch
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +62,7 @@ class Patches:
 def cut(walls: Sequence[Wall], n: int) -> Patches:
     """The n x n patches of each wall, in the order of the picture.
 
-    Raises
-    ------
-    InputError
-        If there is no wall, or n is not a whole number of at least 1.
+    InputError: there is no wall, or n is not a whole number of at least 1.
 
     Examples
     --------
@@ -72,12 +75,88 @@ def cut(walls: Sequence[Wall], n: int) -> Patches:
     if not walls:
         raise InputError("walls is empty; there must be at least one wall to cut")
     place = (np.arange(n) + 0.5) / n
-    corner, right, down = (
-        np.array([getattr(wall, name) for wall in walls], np.float64) for name in ("corner", "right", "down")
-    )  # (walls, 3) each
-    shape = (n, len(walls), n, 3)
-    along = place[None, None, :, None] * right[None, :, None, :]
-    across = place[:, None, None, None] * down[None, :, None, :]
-    centre = corner[None, :, None, :] + along + across
-    edges = (np.broadcast_to(edge[None, :, None, :] / n, shape).reshape(-1, 3) for edge in (right, down))
-    return Patches(centre.reshape(-1, 3), *edges)
+    centre = np.stack([wall.points(place, place[:, None]) for wall in walls], axis=1)  # (n, walls, n, 3)
+    edges = (
+        np.broadcast_to(
+            np.array([getattr(wall, name) for wall in walls], np.float64)[:, None] / n, centre.shape
+        )
+        for name in ("right", "down")
+    )
+    return Patches(centre.reshape(-1, 3), *(edge.reshape(-1, 3) for edge in edges))
+
+
+def squared_size(patches: Patches) -> np.ndarray:
+    """(|right|^2 + |down|^2) / 4 of every patch, (N,); the size of a pair is the root of the sum of both."""
+    return (np.square(patches.right).sum(axis=1) + np.square(patches.down).sum(axis=1)) / 4
+
+
+def check_patches(patches: Any) -> Patches:
+    """Return `patches` if they are some, finite and each with an area."""
+    if not isinstance(patches, Patches):
+        raise InputTypeError(
+            f"patches is a {type(patches).__name__}; it must be ltcl.scenes.Patches, see ltcl.scenes.cut"
+        )
+    count = len(patches)
+    if count < 1:
+        raise InputError("patches are 0; there must be at least 1")
+    for name in ("centre", "right", "down"):
+        value = checks.real(f"patches.{name}", getattr(patches, name))
+        checks.finite(f"patches.{name}", checks.shape(f"patches.{name}", value, (count, 3)))
+    flat = np.flatnonzero(patches.area == 0)
+    if len(flat):
+        raise InputError(f"patches has {len(flat)} without area, the first at {flat[0]}; edges must span one")
+    return patches
+
+
+def check_blocks(blocks: Any) -> np.ndarray:
+    """Return `blocks` as (B, 2, 3) float64, low and high corners of boxes; None is no box."""
+    value = checks.finite("blocks", checks.real("blocks", () if blocks is None else blocks)).astype(
+        np.float64
+    )
+    if value.size == 0:
+        return np.zeros((0, 2, 3))
+    if value.ndim != 3 or value.shape[1:] != (2, 3):
+        raise InputError(f"blocks has shape {value.shape}; it must be (B, 2, 3), two corners of each box")
+    bad = np.flatnonzero((value[:, 0] >= value[:, 1]).any(axis=1))
+    if len(bad):
+        low, high = value[bad[0]]
+        raise InputError(f"blocks has a box from {low} to {high}; the first must be below")
+    return value
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where the scene is, and the largest of its three extents."""
+
+    middle: np.ndarray
+    size: float
+
+    @classmethod
+    def of(cls, patches: Patches) -> Frame:
+        """The frame of the box, along the axes, that holds all patches."""
+        half = (np.abs(patches.right) + np.abs(patches.down)) / 2
+        low, high = (patches.centre - half).min(axis=0), (patches.centre + half).max(axis=0)
+        return cls((low + high) / 2, float((high - low).max()))
+
+    def patches(self, patches: Patches) -> Patches:
+        """The same patches, counted in this frame."""
+        centre = (patches.centre - self.middle) / self.size
+        return Patches(centre, patches.right / self.size, patches.down / self.size)
+
+    def upload_blocks(self, device: Device, blocks: np.ndarray) -> Array:
+        """Centre and half sides of boxes (B, 2, 3), shrunk by a hair; one unused row where there are none."""
+        low, high = ((blocks[:, end] - self.middle) / self.size for end in (0, 1))
+        half = (high - low) / 2
+        rows = np.concatenate([(low + high) / 2, half - np.minimum(_HAIR, half / 2)], axis=1)
+        return device.upload(rows if len(rows) else np.zeros((1, 6)))
+
+
+def lanes(device: Device) -> int:
+    """Neighbouring patches that one work-item handles together."""
+    return 8 if device.is_cpu else 1
+
+
+def padded(device: Device, rows: np.ndarray) -> Array:
+    """Rows (m, N) on the device, with zeros behind each up to whole stretches of lanes."""
+    more = -rows.shape[1] % lanes(device)
+    return device.upload(np.pad(rows, ((0, 0), (0, more))))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The first thing a ray meets: walls, which are parallelograms with a front, and opaque black blocks.
+"""What rays meet first, and what a point sees of patches: walls with a front, and opaque black blocks.
 
 Walls stop light from both sides; from behind they are black, as blocks are from everywhere. With o + t d
 on the plane of a wall at o + t d = corner + u right + v down, the wall is met where u and v are in [0, 1].
@@ -10,30 +10,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ltcl.scenes.walls import Wall
+from ltcl.errors import InputError
+from ltcl.scenes.patches import Patches, check_blocks
+from ltcl.scenes.walls import Block, Vector, Wall, point
 
-_EDGE = 1e-9  # of a wall's side: rays that aim at a seam must not slip through it
-_START = 1e-9  # of a ray's length: a ray does not meet the surface it starts from
-_HAIR = 1e-9  # of a block's side: what runs along a face is not stopped by it
-_END = 1e-9  # of a ray's length: the place that it aims at may lie on a surface
-_FACE = 1e-9  # of a ray's length: walls are in front of the face of a block that they lie on
+_HAIR = 1e-9
+"""Of a wall's or block's side: rays that aim at a seam must not slip through it, and what runs along a face
+of a block is not stopped by it. Of a ray's length: where it starts and what it aims at may lie on a surface,
+and walls are in front of the face of a block that they lie on."""
+
+_LIGHT_POINTS, _SIGHT_POINTS = 8, 4  # along a patch
+_NEAR = 1e-6  # of a wall's side: a projector or camera this near lies on the wall
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
     """What rays met first, one entry per ray.
 
-    Attributes
-    ----------
-    wall : ndarray of int
-        Number of the wall whose front was met; -1 where that was nothing, a block, or a wall's back.
-    u, v : ndarray
-        Where on the wall, in [0, 1] along its right and down edges; 0 where wall is -1.
-    distance : ndarray
-        How far, in lengths of the ray's direction; infinite where nothing was met.
+    `wall` is the number of the wall whose front was met; -1 where that was nothing, a block, or a wall's
+    back. `u`, `v` say where on it, in [0, 1] along its right and down edges, or 0. `distance` counts lengths
+    of the ray's direction; it is infinite where nothing was met.
     """
 
     wall: np.ndarray
@@ -42,49 +42,31 @@ class Hits:
     distance: np.ndarray
 
 
-def cast(
-    walls: Sequence[Wall],
-    origins: np.ndarray,
-    directions: np.ndarray,
-    blocks: Sequence[np.ndarray] | np.ndarray = (),
-) -> Hits:
-    """Follow rays to the nearest wall or block.
+def cast(walls: Sequence[Wall], origins: np.ndarray, directions: np.ndarray, blocks: Any = ()) -> Hits:
+    """Follow rays, origins and directions (R, 3), to the nearest wall or block.
 
-    Parameters
-    ----------
-    walls : sequence of Wall
-    origins, directions : ndarray, (R, 3)
-        Directions need not be unit vectors.
-    blocks : ndarray, (B, 2, 3)
-        Opaque boxes along the axes, lowest and highest corner, as
-        `ltcl.scenes.exchange.geometry.check_blocks` returns them. Walls on their faces reflect.
+    Blocks (B, 2, 3) are opaque boxes along the axes, lowest and highest corner; walls on their faces reflect.
 
     Examples
     --------
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
-    >>> down = np.array([[0.0, 0.0, -1.0]])
-    >>> hits = cast([floor], np.array([[0.25, 0.5, 2.0]]), down)
+    >>> start, down = np.array([[0.25, 0.5, 2.0]]), np.array([[0.0, 0.0, -1.0]])
+    >>> hits = cast([floor], start, down)
     >>> int(hits.wall[0]), float(hits.u[0]), float(hits.v[0]), float(hits.distance[0])
     (0, 0.5, 0.25, 2.0)
-    >>> block = np.array([[(0, 0, 1), (1, 1, 1.5)]])
-    >>> int(cast([floor], np.array([[0.25, 0.5, 2.0]]), down, block).wall[0])
+    >>> int(cast([floor], start, down, [[(0, 0, 1), (1, 1, 1.5)]]).wall[0])
     -1
     """
     rays = len(origins)
-    found = Hits(np.full(rays, -1), np.zeros(rays), np.zeros(rays), np.full(rays, np.inf))
+    hits = Hits(np.full(rays, -1), np.zeros(rays), np.zeros(rays), np.full(rays, np.inf))
     for number, wall in enumerate(walls):
-        _meet_wall(found, number, wall, origins, directions)
-    for low, high in blocks:
-        _meet_block(found, low, high, origins, directions)
-    return found
+        _meet_wall(hits, number, wall, origins, directions)
+    for low, high in check_blocks(blocks):
+        _meet_block(hits, low, high, origins, directions)
+    return hits
 
 
-def clear(
-    walls: Sequence[Wall],
-    origins: np.ndarray,
-    place: np.ndarray,
-    blocks: Sequence[np.ndarray] | np.ndarray = (),
-) -> np.ndarray:
+def clear(walls: Sequence[Wall], origins: np.ndarray, place: np.ndarray, blocks: Any = ()) -> np.ndarray:
     """Whether nothing stands between points (R, 3) and a place (3,), or a place (R, 3) each; (R,) bool.
 
     Walls, from either side, and blocks are as in `cast`. The points and the place may lie on them.
@@ -95,29 +77,104 @@ def clear(
     >>> clear([floor], np.array([[0.5, 0.5, 0], [0.5, 0.5, -1]]), np.array([0.5, 0.5, 1])).tolist()
     [True, False]
     """
-    return cast(walls, origins, place - origins, blocks).distance >= 1 - _END
+    return cast(walls, origins, place - origins, blocks).distance >= 1 - _HAIR
 
 
-def _meet_wall(found: Hits, number: int, wall: Wall, origins: np.ndarray, directions: np.ndarray) -> None:
+def irradiance(
+    walls: Sequence[Wall], grid: tuple[int, int], light: Vector, blocks: Sequence[Block] = ()
+) -> np.ndarray:
+    """Light that falls on each patch from a point that shines alike in all directions, largest value 1.
+
+        E = mean over 8 x 8 points of the patch of  cos(t) / r^2,  0 where something stands in between
+
+    so the edge of a shadow is good to 1/64 of a patch's light or so. (h, w) float32, the walls side by side.
+    """
+    where = np.array(point("light", light))
+    if any(((where > block.low) & (where < block.high)).all() for block in blocks):
+        raise InputError(f"light is {light}, inside a block; move it out")
+    h, w = grid[0], grid[1] // len(walls)
+    u, v = ((np.arange(n * _LIGHT_POINTS) + 0.5) / (n * _LIGHT_POINTS) for n in (w, h))
+    boxes, parts = [(block.low, block.high) for block in blocks], []
+    for wall in walls:
+        points = wall.points(u, v[:, None])
+        ways = where - points
+        arrives = np.maximum(ways @ wall.normal, 0) / np.linalg.norm(ways, axis=-1) ** 3
+        arrives *= clear(walls, points.reshape(-1, 3), where, boxes).reshape(arrives.shape)
+        parts.append(arrives.reshape(h, _LIGHT_POINTS, w, _LIGHT_POINTS).mean(axis=(1, 3)))
+    picture = np.concatenate(parts, axis=1)
+    if picture.max() <= 0:
+        raise InputError(f"light is {light}, from where it reaches no patch; move it in front of a wall")
+    return (picture / picture.max()).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What a point sees of patches.
+
+    `towards` (N, 3) are unit vectors from the middle of each patch to the point, in the patch's frame;
+    `share` (N,) is the part of each patch that the point sees, of a lattice of 16 places, 0 from behind.
+    """
+
+    towards: np.ndarray
+    share: np.ndarray
+
+
+def sight(name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks: Any = ()) -> Sight:
+    """What a projector or camera that stands at `stand` (3,) sees of the patches of walls.
+
+    InputError: it is no place, lies on a wall or in a block, or sees no patch from its front.
+
+    Examples
+    --------
+    >>> from ltcl.scenes import cut
+    >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
+    >>> seen = sight("camera", (0.5, 0.5, 1), [floor], cut([floor], 1))
+    >>> seen.towards.tolist(), seen.share.tolist()
+    ([[0.0, 0.0, 1.0]], [1.0])
+    """
+    place, boxes = np.array(point(name, stand)), check_blocks(blocks)
+    here = f"{name} is at ({', '.join(f'{value:g}' for value in place)})"
+    for wall in walls:
+        u, v, height = wall.coordinates(place - wall.corner)
+        if abs(height) <= _NEAR * np.linalg.norm(wall.right) and 0 <= u <= 1 and 0 <= v <= 1:
+            raise InputError(f"{here}, on the wall {wall.name!r}; it must stand off it")
+    if any(((place >= low) & (place <= high)).all() for low, high in boxes):
+        raise InputError(f"{here}, in a block; it must stand outside")
+    towards = place - patches.centre
+    towards = np.einsum("nij,nj->ni", patches.frames, towards / np.linalg.norm(towards, axis=1)[:, None])
+    step = (np.arange(_SIGHT_POINTS) + 0.5) / _SIGHT_POINTS - 0.5
+    v, u = (part.ravel()[:, None] for part in np.meshgrid(step, step, indexing="ij"))
+    origins = patches.centre[:, None] + u * patches.right[:, None] + v * patches.down[:, None]
+    free = clear(walls, origins.reshape(-1, 3), place, boxes).reshape(len(patches), -1)
+    share = np.where(towards[:, 2] > 0, free.mean(axis=1), 0.0)
+    if not share.any():
+        raise InputError(
+            f"{here}, where it faces none of {len(walls)} wall(s) in plain view; "
+            "it must stand in front of one"
+        )
+    return Sight(towards, share)
+
+
+def _meet_wall(hits: Hits, number: int, wall: Wall, origins: np.ndarray, directions: np.ndarray) -> None:
     """Enter the rays that meet this wall before all that was met so far."""
-    # Rows that give u, v and the height over the wall of a point from its corner.
-    edges = np.stack([wall.right, wall.down, wall.normal], axis=1).astype(np.float64)
-    inverse = np.linalg.inv(edges)
-    start, step = (origins - wall.corner) @ inverse.T, directions @ inverse.T  # (R, 3) each
+    start, step = (
+        wall.coordinates(origins - wall.corner),
+        wall.coordinates(directions),
+    )  # (R, 3): u, v, height
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -start[:, 2] / step[:, 2]
         place = start[:, :2] + distance[:, None] * step[:, :2]
-        inside = ((place >= -_EDGE) & (place <= 1 + _EDGE)).all(axis=1)
-        met = inside & (distance > _START) & (distance < found.distance)
+        inside = ((place >= -_HAIR) & (place <= 1 + _HAIR)).all(axis=1)
+        met = inside & (distance > _HAIR) & (distance < hits.distance)
     front = met & (step[:, 2] < 0)
-    found.distance[met] = distance[met]
-    found.wall[met] = -1
-    found.wall[front] = number
-    found.u[met], found.v[met] = np.where(front[met], np.clip(place[met].T, 0, 1), 0.0)
+    hits.distance[met] = distance[met]
+    hits.wall[met] = -1
+    hits.wall[front] = number
+    hits.u[met], hits.v[met] = np.where(front[met], np.clip(place[met].T, 0, 1), 0.0)
 
 
 def _meet_block(
-    found: Hits, low: np.ndarray, high: np.ndarray, origins: np.ndarray, directions: np.ndarray
+    hits: Hits, low: np.ndarray, high: np.ndarray, origins: np.ndarray, directions: np.ndarray
 ) -> None:
     """Enter the rays that meet this block first: the method of slabs."""
     hair = _HAIR * (high - low)
@@ -127,7 +184,7 @@ def _meet_block(
     enter, leave = np.min(ends, axis=0).max(axis=1), np.max(ends, axis=0).min(axis=1)
     with np.errstate(invalid="ignore"):
         # Rays that run within a face give 0 / 0: they graze the block and pass.
-        met = (enter < leave) & (leave > _START) & (enter < found.distance * (1 - _FACE))
-    found.distance[met] = np.maximum(enter[met], 0.0)
-    found.wall[met] = -1
-    found.u[met], found.v[met] = 0.0, 0.0
+        met = (enter < leave) & (leave > _HAIR) & (enter < hits.distance * (1 - _HAIR))
+    hits.distance[met] = np.maximum(enter[met], 0.0)
+    hits.wall[met] = -1
+    hits.u[met], hits.v[met] = 0.0, 0.0

@@ -4,7 +4,7 @@
     l_out = (I - A)^-1 l_d,    A = diag(albedo) F    (eq. 4),    l_d = diag(albedo) l_in
 
 Projector pixel i lights patch i with unit irradiance, and a white patch (albedo 1) under unit light
-shows 1. So the transport is T = (I - A)^-1 diag(albedo), (N, N), one per colour; `exchange` computes it.
+shows 1. So the transport is T = (I - A)^-1 diag(albedo), (N, N), one per colour.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.linalg
 
 from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes import light as lighting
+from ltcl.scenes import rays
 from ltcl.scenes import viewer as viewing
-from ltcl.scenes.blocks import Block
-from ltcl.scenes.exchange import crossing
-from ltcl.scenes.exchange import transport as exchange
 from ltcl.scenes.viewer import Viewer
-from ltcl.scenes.walls import Wall
+from ltcl.scenes.walls import Block, Wall, check_albedo, refuse_crossing
 from ltcl.transport import Transport
 
 if TYPE_CHECKING:
     from ltcl.device import Device
+
+_BLOCK = 512  # rows and columns touched at a time where a matrix meets its transpose
+_TOLERANCE = 1e-6  # form factors found by quadrature or sampling are a little off
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +57,7 @@ class Scene:
     ------
     InputError
         If shapes disagree, a value is NaN, infinite or negative, an albedo is not below 1, rows of the
-        form factors sum to more than 1, they break reciprocity, two walls cut through each other, or the
-        viewer sees no wall.
+        form factors sum to more than 1, they break reciprocity, walls cross, or the viewer sees no wall.
 
     Examples
     --------
@@ -83,9 +83,16 @@ class Scene:
             raise InputError("walls are 0; a scene needs at least one")
         if w % len(self.walls):
             raise InputError(f"walls are {len(self.walls)}; they must divide the {w} columns of the grid")
-        for name, value in exchange.checked(self.form_factors, self.albedo, self.area, h * w).items():
+        n = h * w
+        for name, shapes in {"form_factors": [(n, n)], "albedo": [(1, n), (3, n)], "area": [(n,)]}.items():
+            value = checks.real(name, getattr(self, name)).astype(np.float64, copy=False)
+            # A view, so that the caller's own array stays writeable.
+            value = checks.finite(name, checks.shape(name, value, *shapes)).view()
+            value.flags.writeable = False
             object.__setattr__(self, name, value)
-        crossing.refuse((*self.walls, *self._screens))
+        check_albedo(self.albedo)
+        _check_exchange(self.form_factors, self.area)
+        refuse_crossing((*self.walls, *self._screens))
         viewing.frame(self.viewer, self.walls)
 
     @property
@@ -109,12 +116,9 @@ class Scene:
         return bounces[0] if self.channels == 1 else bounces
 
     def matrices(self) -> tuple[np.ndarray, ...]:
-        """Light transport T = (I - A)^-1 diag(albedo), exact in float64, one (N, N) array per channel.
+        """Light transport T = (I - A)^-1 diag(albedo) (eq. 4), exact, one (N, N) float64 array per channel.
 
-        Returns
-        -------
-        tuple of ndarray, (N, N), float64
-            One for each channel; T_ij is what patch i shows when unit light falls on patch j.
+        T_ij is what patch i shows when unit light falls on patch j.
 
         Raises
         ------
@@ -122,10 +126,6 @@ class Scene:
             If the matrices do not fit in the memory of the host; nothing is allocated then.
         InputError
             If the scene makes light: form factors a little above 1 and albedos hardly below.
-
-        Notes
-        -----
-        Eq. 4 of the paper, solved by Cholesky, see `ltcl.scenes.exchange.transport`.
 
         Examples
         --------
@@ -135,7 +135,7 @@ class Scene:
         ((8, 8), True)
         """
         self._fits(self.channels)
-        return tuple(exchange.transport(self.form_factors, albedo, self.area) for albedo in self.albedo)
+        return tuple(transport(self.form_factors, albedo, self.area) for albedo in self.albedo)
 
     def transport(
         self,
@@ -155,13 +155,6 @@ class Scene:
         on_dark : "raise" or "mask"
             What `Transport` does about patches of albedo 0: refuse, or never light them.
 
-        Raises
-        ------
-        InputError
-            If `Transport` refuses an option, or a patch is black and not to be masked.
-        MemoryLimitError
-            If the matrices do not fit in the memory of the host.
-
         Examples
         --------
         >>> from ltcl.scenes import dihedral
@@ -175,11 +168,6 @@ class Scene:
     def picture(self, patches: Any) -> np.ndarray:
         """Values per patch, (N,) or (3, N), as a picture on the grid, (h, w) or (h, w, 3).
 
-        Raises
-        ------
-        InputError
-            If the shape is neither.
-
         Examples
         --------
         >>> from ltcl.scenes import dihedral
@@ -192,7 +180,7 @@ class Scene:
         return np.moveaxis(values.reshape(*values.shape[:-1], *self.grid), 0, -1 if values.ndim == 2 else 0)
 
     def view(self, picture: Any, size: int = 480, supersample: int = 3) -> np.ndarray:
-        """What a viewer who looks into the room sees of a picture on its walls.
+        """What a viewer who looks into the room sees of a picture on its walls; backs of walls are left out.
 
         Parameters
         ----------
@@ -206,8 +194,7 @@ class Scene:
         Returns
         -------
         ndarray, (H, W) or (H, W, 3), float32
-            The image; 0 beside the walls and on black blocks. Walls that show the viewer their back are
-        left out.
+            The image; 0 beside the walls and on black blocks.
 
         Raises
         ------
@@ -223,7 +210,9 @@ class Scene:
         >>> max(image.shape), float(image.max())
         (64, 1.0)
         """
-        picture, size = viewing.check_picture(picture, self.grid), viewing.check_size(size)
+        picture = checks.finite("picture", checks.real("picture", picture))
+        checks.shape("picture", picture, self.grid, (*self.grid, 3))
+        size = checks.count("size", size, most=viewing.LONGEST)
         supersample = checks.count("supersample", supersample)
         return viewing.draw(self.viewer, self.walls, picture, size, supersample, self._screens)
 
@@ -254,7 +243,11 @@ class Scene:
         >>> dihedral(8).sample(landscape(60, 80)).shape
         (8, 16, 3)
         """
-        return viewing.read(self.viewer, self.walls, viewing.check_image(image), self.grid, self._screens)
+        image = checks.finite("image", checks.real("image", image))
+        if image.ndim not in (2, 3) or image.size == 0 or image.shape[2:] not in ((), (3,)):
+            raise InputError(f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty")
+        checks.count("image", max(image.shape), most=viewing.LONGEST)
+        return viewing.read(self.viewer, self.walls, image, self.grid, self._screens)
 
     def irradiance(self, light: Any) -> np.ndarray:
         """Light that falls on each patch straight from a point, shadows included, largest value 1.
@@ -269,15 +262,7 @@ class Scene:
         Returns
         -------
         ndarray, (h, w), float32
-
-        Raises
-        ------
-        InputError
-            If the light is not three finite numbers, stands inside a block, or reaches no patch.
-
-        Notes
-        -----
-        See `ltcl.scenes.light`.
+            An InputError says that the light stands inside a block, or reaches no patch.
 
         Examples
         --------
@@ -286,7 +271,7 @@ class Scene:
         >>> picture.shape, float(picture.max())
         ((8, 24), 1.0)
         """
-        return lighting.irradiance(self.walls, self.grid, light, self.blocks)
+        return rays.irradiance(self.walls, self.grid, light, self.blocks)
 
     @property
     def _screens(self) -> tuple[Wall, ...]:
@@ -297,3 +282,72 @@ class Scene:
         pixels = len(self.area)
         what = f"{matrices} matrix(es) of {pixels} x {pixels} for the scene {self.name}"
         checks.fits_host(what, matrices * 8 * pixels**2)
+
+
+def transport(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """T = (I - A)^-1 diag(r), A = diag(r) F, (N, N) float64, of form factors F, albedos r and areas a (N,).
+
+    Reciprocity says that diag(a) F is symmetric. With s = sqrt(r / a) this gives
+
+        B = diag(s) diag(a) F diag(s) = B^T,    T = diag(s) (I - B)^-1 diag(s) diag(a)
+
+    where I - B is positive definite for albedos below one. Cholesky inverts it with half the work of a
+    general inverse and in the memory of the result alone; black patches (r = 0) need no special case.
+
+    InputError: the gain of one bounce is 1 or more.
+
+    Examples
+    --------
+    >>> mirrors = np.array([[0.0, 1.0], [1.0, 0.0]])
+    >>> transport(mirrors, albedo=np.array([0.5, 0.5]), area=np.ones(2)).round(4)
+    array([[0.6667, 0.3333],
+           [0.3333, 0.6667]])
+    """
+    s = np.sqrt(albedo / area)
+    matrix = form_factors * -s  # I - B, step by step in place
+    matrix *= (s * area)[:, None]
+    matrix[np.diag_indices_from(matrix)] += 1
+    potrf, potri = scipy.linalg.get_lapack_funcs(("potrf", "potri"), (matrix,))
+    # LAPACK wants columns; of a symmetric matrix the transposed view will do, and saves a copy.
+    columns, failed = potrf(matrix.T, lower=1, overwrite_a=1)
+    if not failed:
+        columns, failed = potri(columns, lower=1, overwrite_c=1)
+    if failed:
+        raise InputError("albedo and form_factors give a bounce a gain of 1 or more; lower the albedo")
+    # The result stands in the upper triangle of the rows only.
+    for rows, right in _blocks(len(matrix)):
+        block = matrix[rows, right]
+        if rows == right:
+            block = np.triu(block) + np.triu(block, 1).T
+            matrix[rows, right] = block
+        matrix[right, rows] = block.T
+    matrix *= s[:, None]
+    matrix *= s * area
+    return matrix
+
+
+def _check_exchange(form_factors: np.ndarray, area: np.ndarray) -> None:
+    """Refuse form factors that are negative, make light or break reciprocity, and areas of zero."""
+    if area.min() <= 0:
+        raise InputError(f"area has the value {area.min():g}; all must be above 0")
+    if form_factors.min() < 0:
+        raise InputError(f"form_factors has the value {form_factors.min():g}; all must be at least 0")
+    most = form_factors.sum(axis=1).max()
+    if most > 1 + _TOLERANCE:
+        raise InputError(f"form_factors has a row that sums to {most:g}; no patch can send out more than 1")
+    worst, largest = 0.0, (area * form_factors.max(axis=1)).max()
+    for rows, columns in _blocks(len(area)):
+        there = area[rows, None] * form_factors[rows, columns]
+        back = area[columns, None] * form_factors[columns, rows]
+        worst = max(worst, np.abs(there - back.T).max())
+    if worst > _TOLERANCE * largest:
+        raise InputError(
+            f"form_factors breaks reciprocity by {worst / largest:.2g} of the largest exchange; "
+            "area_i F_ij must equal area_j F_ji"
+        )
+
+
+def _blocks(size: int) -> list[tuple[slice, slice]]:
+    """Blocks (rows, columns) that cover the upper triangle of a size x size matrix."""
+    parts = [slice(start, min(start + _BLOCK, size)) for start in range(0, size, _BLOCK)]
+    return [(rows, columns) for i, rows in enumerate(parts) for columns in parts[i:]]

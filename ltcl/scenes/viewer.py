@@ -20,49 +20,21 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ltcl import checks
 from ltcl.errors import InputError
-from ltcl.scenes.exchange import crossing
-from ltcl.scenes.walls import Vector, Wall
+from ltcl.scenes.walls import Vector, Wall, overlap
 
-_LONGEST = 32766  # pixels along an image that OpenCV can still address
+LONGEST = 32766  # pixels along an image that OpenCV can still address
 _MARGIN = 0.03  # of the larger side, left free around the walls
 _BAND = 32  # output rows drawn at a time, so that supersampling stays small in memory
 _EDGE = 1e-9  # of a wall: points so far beside it count as on it, lest seams show as cracks
 _MOST_POINTS = 16  # along a patch: 256 points give a mean good to a fraction of a percent
 
 
-def check_picture(picture: Any, grid: tuple[int, int]) -> np.ndarray:
-    """Return `picture` if it is on the grid, (h, w) or (h, w, 3), and finite."""
-    picture = checks.finite("picture", checks.real("picture", picture))
-    return checks.shape("picture", picture, grid, (*grid, 3))
-
-
-def check_image(image: Any) -> np.ndarray:
-    """Return `image` if it is one, (H, W) or (H, W, 3), finite and not too large."""
-    image = checks.finite("image", checks.real("image", image))
-    if image.ndim not in (2, 3) or image.size == 0 or image.shape[2:] not in ((), (3,)):
-        raise InputError(f"image has shape {image.shape}; it must be (H, W) or (H, W, 3), not empty")
-    check_size(max(image.shape), "image")
-    return image
-
-
-def check_size(longest: Any, name: str = "size") -> int:
-    """Return the pixels along the longer side of an image if they can be addressed."""
-    longest = checks.count(name, longest)
-    if longest > _LONGEST:
-        raise InputError(f"{name} has {longest} pixels along a side; it must have at most {_LONGEST}")
-    return longest
-
-
 @dataclass(frozen=True)
 class Viewer:
     """A pinhole eye at `eye` that looks at `target`, upright (z is up).
 
-    Raises
-    ------
-    InputError
-        If it looks straight up or down, where upright means nothing.
+    InputError: it looks straight up or down, where upright means nothing.
 
     Examples
     --------
@@ -112,13 +84,7 @@ class Frame:
 
 
 def frame(viewer: Viewer, walls: Sequence[Wall]) -> Frame:
-    """Smallest upright frame with a small margin around the walls the viewer sees.
-
-    Raises
-    ------
-    InputError
-        If the viewer sees no wall, or one that reaches behind the viewer.
-    """
+    """Smallest upright frame with a small margin around the walls the viewer sees, in front, one at least."""
     corners = np.array([(0, 0, 1), (0, 1, 1), (1, 0, 1), (1, 1, 1)], dtype=np.float64)
     seen = [corners @ viewer.homography(wall).T for wall in walls if viewer.sees(wall)]
     points = np.concatenate(seen) if seen else np.zeros((1, 3))
@@ -135,7 +101,7 @@ def frame(viewer: Viewer, walls: Sequence[Wall]) -> Frame:
 def draw(
     viewer: Viewer,
     walls: Sequence[Wall],
-    picture: np.ndarray,
+    picture: Any,
     size: int,
     supersample: int,
     screens: Sequence[Wall] = (),
@@ -158,11 +124,7 @@ def draw(
 
 
 def read(
-    viewer: Viewer,
-    walls: Sequence[Wall],
-    image: np.ndarray,
-    grid: tuple[int, int],
-    screens: Sequence[Wall] = (),
+    viewer: Viewer, walls: Sequence[Wall], image: Any, grid: tuple[int, int], screens: Sequence[Wall] = ()
 ) -> np.ndarray:
     """Picture (h, w[, 3]) float32 on the walls' grid: means of an image (H, W[, 3]) over the patches.
 
@@ -228,7 +190,7 @@ def _overlap(first: np.ndarray, second: np.ndarray) -> bool:
     """Whether two walls overlap in the image by more than a rounding error."""
     corners = np.array([(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 1)], dtype=np.float64)
     one, other = (np.pad(_apply(homography, corners), ((0, 0), (0, 1))) for homography in (first, second))
-    return crossing.cover(one, other, touch=1e-9)
+    return overlap(one, other, touch=1e-9)
 
 
 def _read_wall(

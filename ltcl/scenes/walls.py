@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Walls of a room: where they stand, how their patches see each other, how bright they are.
-
-A picture on the walls has grid (n, walls * n): one n x n square per wall, side by side, row-major.
-The matrix of form factors follows that order, so patch (r, c) of wall w is row r * walls * n + w * n + c.
-"""
+"""Walls and blocks of a room: where they stand, how bright they are, and that none cuts through another."""
 
 from __future__ import annotations
 
@@ -15,16 +11,12 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.errors import InputError
-from ltcl.scenes.exchange.cube_tables import parallel, perpendicular
+from ltcl.errors import InputError, InputTypeError
 
 Vector = tuple[float, float, float]
 
-
-def vector(array: np.ndarray) -> Vector:
-    """Three floats of an array (3,)."""
-    x, y, z = (float(v) for v in array)
-    return x, y, z
+_TOUCH = 1e-9  # of the larger wall: overlaps that are rounding errors
+_FACES = {"+x": (0, 1), "-x": (0, -1), "+y": (1, 1), "-y": (1, -1), "top": (2, 1), "bottom": (2, -1)}
 
 
 @dataclass(frozen=True)
@@ -69,70 +61,111 @@ class Wall:
         """Area of the parallelogram."""
         return float(np.linalg.norm(np.cross(self.down, self.right)))
 
+    @property
+    def outline(self) -> np.ndarray:
+        """Its corners (4, 3), around the front."""
+        corner, right, down = np.array([self.corner, self.right, self.down], np.float64)
+        return np.stack([corner, corner + down, corner + down + right, corner + right])
 
-def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
-    """Form factors of all patches of some faces of the unit cube, (N, N) float64, N = n * n * len(walls).
+    def points(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Places (..., 3) at shares u of `right` and v of `down`, which broadcast."""
+        corner, right, down = np.array([self.corner, self.right, self.down], np.float64)
+        return corner + u[..., None] * right + v[..., None] * down
 
-    Parameters
-    ----------
-    walls : sequence of Wall
-        Different faces of the unit cube, seen from inside.
-    n : int
-        Patches along each side of a wall.
-
-    Returns
-    -------
-    ndarray, (N, N), float64
-        Entry [i, j] is the share of the light leaving patch i that meets patch j; symmetric.
-
-    Raises
-    ------
-    MemoryLimitError
-        If the matrix does not fit in the memory of the host.
-
-    Examples
-    --------
-    >>> from ltcl.scenes.box import WALLS
-    >>> float(form_factors(WALLS, 2).sum(axis=1).round(9).min())  # a closed room loses no light
-    1.0
-    """
-    size = n * n * len(walls)
-    checks.fits_host(f"a {size} x {size} matrix of form factors", 8 * size**2)
-    matrix = np.zeros((size, size))
-    if len(walls) == 1:
-        return matrix
-    meeting, facing = perpendicular(n), parallel(n, gap=n)
-    axis = [_axis(wall) for wall in walls]
-    places = [_doubled_places(wall, n) for wall in walls]
-    for i, j in itertools.combinations(range(len(walls)), 2):
-        table = facing if axis[i] == axis[j] else meeting
-        # The tables count along the shared directions first; their other two offsets may be swapped.
-        order = [k for k in range(3) if k not in (axis[i], axis[j])]
-        order += [axis[i], axis[j]] if len(order) == 1 else []
-        _gather(matrix, table, (i, places[i][:, :, order]), (j, places[j][:, :, order]))
-    return matrix
+    def coordinates(self, vectors: np.ndarray) -> np.ndarray:
+        """Vectors (..., 3) as parts of right, down and normal, (..., 3)."""
+        edges = np.stack([self.right, self.down, self.normal], axis=1).astype(np.float64)
+        return vectors @ np.linalg.inv(edges).T
 
 
-def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
-    """Albedo of every patch, (channels, N) float64, from one number, one per wall, per colour or both.
+@dataclass(frozen=True)
+class Block:
+    """An opaque box with sides along the axes: it shades, and hides what is behind it.
 
     Parameters
     ----------
-    albedo : array_like in [0, 1)
-        A scalar; (walls,), one per wall; (3,), one colour for all walls; (walls, 3) or (walls, 1) or
-        (1, 3) to say it in full. Three numbers for three walls could be either, and are refused.
-    walls, n : int
-        Number of walls, and patches along each side of one.
-
-    Returns
-    -------
-    ndarray, (channels, n * walls * n), float64
-        One channel, or three where colours were given.
+    corner, size : (3,) floats
+        Its corner nearest to the origin, and its lengths along x, y and z.
+    albedo : float or (3,) floats, optional
+        Of all its faces, one number or one colour: they become walls of the picture then, lit and seen.
+        Without it the block is black.
 
     Raises
     ------
     InputError
-        If the shape is none of the above, or could mean two things, or a value is outside [0, 1).
+        If a number is not finite, a length is not above 0, or the albedo is outside [0, 1).
+
+    Examples
+    --------
+    >>> block = Block(corner=(0.3, 0.4, 0), size=(0.2, 0.2, 0.5), albedo=0.6)
+    >>> [wall.name for wall in block.faces()]
+    ['block +x', 'block -x', 'block +y', 'block -y', 'block top', 'block bottom']
+    """
+
+    corner: Vector
+    size: Vector
+    albedo: Any = None
+
+    def __post_init__(self) -> None:
+        for name in ("corner", "size"):
+            object.__setattr__(self, name, point(f"block {name}", getattr(self, name)))
+        if min(self.size) <= 0:
+            raise InputError(f"block size is {self.size}; all three lengths must be above 0")
+        if self.albedo is not None:
+            value = checks.finite("block albedo", checks.real("block albedo", self.albedo))
+            check_albedo(checks.shape("block albedo", value.astype(np.float64), (), (3,)))
+
+    @property
+    def low(self) -> np.ndarray:
+        """The corner nearest to the origin, (3,)."""
+        return np.array(self.corner)
+
+    @property
+    def high(self) -> np.ndarray:
+        """The corner opposite to it, (3,)."""
+        return np.add(self.corner, self.size)
+
+    def faces(self) -> tuple[Wall, ...]:
+        """Its six faces as walls that look outwards; side faces stand upright."""
+        return tuple(self._face(name, *direction) for name, direction in _FACES.items())
+
+    def _face(self, name: str, axis: int, sign: int) -> Wall:
+        normal = sign * np.eye(3)[axis]
+        # Side faces hang from their upper edge; top and bottom lie as floor and ceiling do.
+        down = -np.eye(3)[2] if axis < 2 else np.eye(3)[0 if sign > 0 else 1]
+        right, down = np.cross(normal, down) * self.size, down * self.size
+        middle = (self.low + self.high + normal * self.size) / 2
+        return Wall(f"block {name}", *(vector(v) for v in (middle - right / 2 - down / 2, right, down)))
+
+
+def vector(array: np.ndarray) -> Vector:
+    """Three floats of an array (3,)."""
+    x, y, z = (float(v) for v in array)
+    return x, y, z
+
+
+def point(name: str, value: Any) -> Vector:
+    """Return `value` as three finite floats.
+
+    Examples
+    --------
+    >>> point("light", [1, 2, 3])
+    (1.0, 2.0, 3.0)
+    """
+    try:
+        array = checks.real(name, value)
+    except InputTypeError as error:
+        raise InputTypeError(f"{name} is {value!r}; it must be three numbers (x, y, z)") from error
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(f"{name} is {value!r}; it must be three finite numbers (x, y, z)")
+    return vector(array)
+
+
+def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
+    """Albedo of every patch, (channels, n * walls * n), from one number, one per wall, per colour or both.
+
+    A scalar; (walls,), one per wall; (3,), one colour for all walls; (walls, 3) or (walls, 1) or (1, 3) to
+    say it in full. Three numbers for three walls could be either, and are refused.
 
     Examples
     --------
@@ -164,33 +197,54 @@ def check_albedo(albedo: np.ndarray) -> None:
         )
 
 
-def _axis(wall: Wall) -> int:
-    """The coordinate axis a wall is perpendicular to."""
-    return int(np.argmax(np.abs(wall.normal)))
+def refuse_crossing(walls: Sequence[Wall]) -> None:
+    """Refuse walls that cut through each other, or cover each other facing the same way.
 
-
-def _doubled_places(wall: Wall, n: int) -> np.ndarray:
-    """Centres of the patches in half patch sides, (n, n, 3) integers: odd along the wall, even across."""
-    along = np.arange(1, 2 * n, 2)
-    corner, right, down = (np.asarray(v, dtype=np.int64) for v in (wall.corner, wall.right, wall.down))
-    return 2 * n * corner + along[:, None, None] * down + along[None, :, None] * right
-
-
-def _gather(
-    matrix: np.ndarray, table: np.ndarray, first: tuple[int, np.ndarray], second: tuple[int, np.ndarray]
-) -> None:
-    """Write the form factors between two walls, given as (index, places), in both triangles.
-
-    Row by row of the first wall, so that temporary arrays stay n times smaller than the block.
+    Light could not tell which side it is on. Walls may touch: along an edge, at a corner, or one with its
+    edge in the middle of the other.
     """
-    (i, from_places), (j, to_places) = first, second
-    n = len(from_places)
-    walls = round(len(matrix) / n**2)
-    blocks = matrix.reshape(n, walls, n, n, walls, n)
-    for r in range(n):
-        # Half of a doubled difference is the offset in patches; across the wall, where it is odd,
-        # rounding down gives the number of patches between patch and wall.
-        offset = np.abs(from_places[r][:, None, None, :] - to_places) // 2  # (n, n, n, axes)
-        block = table[tuple(np.moveaxis(offset, -1, 0))]
-        blocks[r, i, :, :, j, :] = block
-        blocks[:, j, :, r, i, :] = block.transpose(1, 2, 0)
+    for first, second in itertools.combinations(walls, 2):
+        same = bool(first.normal @ second.normal > 0)
+        problem = _crossing(first.outline, second.outline, same)
+        if problem:
+            raise InputError(f"walls {first.name!r} and {second.name!r} {problem}; move or shorten one")
+
+
+def overlap(first: np.ndarray, second: np.ndarray, touch: float) -> bool:
+    """Whether convex outlines (4, 3) in one plane overlap: no line along an edge of one parts them."""
+    normal = _normal(first)
+    for corners in (first, second):
+        for edge in np.roll(corners, -1, axis=0) - corners:
+            across = np.cross(normal, edge) / np.linalg.norm(edge)
+            one, other = first @ across, second @ across
+            if min(one.max(), other.max()) - max(one.min(), other.min()) <= touch:
+                return False
+    return True
+
+
+def _crossing(first: np.ndarray, second: np.ndarray, same: bool) -> str:
+    touch = _TOUCH * max(np.abs(np.diff(corners, axis=0)).max() for corners in (first, second))
+    over, under = (first - second[0]) @ _normal(second), (second - first[0]) @ _normal(first)
+    if same and max(np.abs(over).max(), np.abs(under).max()) <= touch:
+        return "lie on top of each other" if overlap(first, second, touch) else ""
+    if min(-over.min(), over.max(), -under.min(), under.max()) <= touch:
+        return ""
+    # Both planes are cut. On their common line each wall fills an interval.
+    line = np.cross(_normal(first), _normal(second))
+    line /= np.linalg.norm(line)
+    (low, high), (other_low, other_high) = _span(first, over, line), _span(second, under, line)
+    return "cut through each other" if min(high, other_high) - max(low, other_low) > touch else ""
+
+
+def _normal(corners: np.ndarray) -> np.ndarray:
+    normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
+    return normal / np.linalg.norm(normal)
+
+
+def _span(corners: np.ndarray, height: np.ndarray, line: np.ndarray) -> tuple[float, float]:
+    """Where a wall whose corners are `height` above a plane meets it: from and to along the line."""
+    after, height_after = np.roll(corners, -1, axis=0), np.roll(height, -1)
+    crossing = (height < 0) != (height_after < 0)
+    share = height[crossing] / (height[crossing] - height_after[crossing])
+    along = (corners[crossing] + share[:, None] * (after - corners)[crossing]) @ line
+    return float(along.min()), float(along.max())

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
 import shutil
+import struct
 import subprocess
 import sys
 import time
@@ -14,18 +15,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.sparse.linalg import aslinearoperator
 
 import ltcl
-from ltcl import files, images
-from ltcl.batch import CompensatedFrames, compensate_frames, identity
+from ltcl import images
+from ltcl.batch import CompensatedFrames, compensate_frames
 from ltcl.errors import ConvergenceError, FileError, InputError, InputTypeError
 from ltcl.images.frames import open_frames, write_video
 from tests.problems import lambertian
 
 GRID = (8, 8)
-LISTED = b'{"format": 1, "frames": [], "settings": [], "transport": {}, "gain": 1.0}'
 SCENE = lambertian(64, 0.8, seed=70)
 COUNT = 13
+NEARLY = SCENE.T.copy()
+NEARLY[5, 7] *= 1.0001
 random = np.random.default_rng(71)
 LIGHT = random.uniform(0.3, 0.7, (COUNT, *GRID))  # patterns whose pictures are wanted
 
@@ -43,15 +46,14 @@ def seen(pattern: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     """COUNT grey pictures of 8 x 8."""
-    folder = tmp_path_factory.mktemp("source")
-    fill(folder, seen(LIGHT))
-    return folder
+    return fill(tmp_path_factory.mktemp("source"), seen(LIGHT))
 
 
-def fill(folder: Path, pictures: np.ndarray | list[np.ndarray]) -> None:
+def fill(folder: Path, pictures: np.ndarray | list[np.ndarray]) -> Path:
     folder.mkdir(exist_ok=True)
     for number, picture in enumerate(pictures):
         images.write(folder / f"f{number}.exr", np.asarray(picture, np.float32))
+    return folder
 
 
 def everything(folder: Path) -> dict[str, bytes]:
@@ -61,26 +63,19 @@ def everything(folder: Path) -> dict[str, bytes]:
 
 
 def patterns(done: CompensatedFrames) -> list[np.ndarray]:
-    kinds = "exr" if any(done.folder.glob("*.exr")) else "png"
-    return [images.read(done.folder / f"pattern_{record.number:06}.{kinds}") for record in done.records]
+    suffix = "exr" if any(done.folder.glob("*.exr")) else "png"
+    return [images.read(done.folder / f"pattern_{record.number:06}.{suffix}") for record in done.records]
 
 
-@pytest.mark.parametrize("batch", [1, 4, 8, 20])
+@pytest.mark.parametrize("batch", [1, 4, 20])
 def test_pushed_through_T_the_patterns_give_the_frames(T, source, tmp_path, batch):
     calls = []
     done = compensate_frames(
-        T,
-        source,
-        tmp_path / "out",
-        batch=batch,
-        format="exr",
-        rtol=1e-4,
-        progress=lambda *now: calls.append(now),
+        T, source, tmp_path, batch=batch, format="exr", rtol=1e-4, progress=lambda *now: calls.append(now)
     )
     np.testing.assert_allclose(np.stack(patterns(done)), LIGHT, rtol=5e-4)
-    assert [record.number for record in done.records] == list(range(1, COUNT + 1))
-    assert [record.name for record in done.records] == [f"f{number}.exr" for number in range(COUNT)]
-    assert calls == [(n, COUNT) for n in [0, *range(batch, COUNT, batch), COUNT]]
+    assert [(r.number, r.name) for r in done.records] == [(n + 1, f"f{n}.exr") for n in range(COUNT)]
+    assert calls == [("frames", n, COUNT) for n in [*range(0, COUNT, batch), COUNT]]
     assert done.solved == COUNT
     assert done.worst.error < 1e-4
     assert done.most_clipped.clipped == 0
@@ -89,116 +84,78 @@ def test_pushed_through_T_the_patterns_give_the_frames(T, source, tmp_path, batc
 
 
 def test_png_patterns_are_those_of_exr_with_white_at_the_upper_bound(T, source, tmp_path):
-    common: dict[str, Any] = {"bounds": (0.0, 2.0), "appearance": True, "gain": 0.5}
+    common: dict[str, Any] = {"bounds": (0.0, 2.0), "appearance": True, "gain": 0.5, "frames": 5}
     png = compensate_frames(T, source, tmp_path / "png", **common)
     exr = compensate_frames(T, source, tmp_path / "exr", format="exr", **common)
     for coarse, exact in zip(patterns(png), patterns(exr), strict=True):
         np.testing.assert_allclose(coarse, exact / 2.0, atol=1e-4)
-    for number, frame in enumerate(open_frames(source), start=1):
-        shown = images.read(tmp_path / f"png/appearance/appearance_{number:06}.png")
+    for frame in list(open_frames(source))[:5]:
+        shown = images.read(tmp_path / f"png/appearance/appearance_{frame.number:06}.png")
         np.testing.assert_allclose(shown, frame.picture(), rtol=0.02, atol=1e-3)
-        light = images.read(tmp_path / f"exr/appearance/appearance_{number:06}.exr")
+        light = images.read(tmp_path / f"exr/appearance/appearance_{frame.number:06}.exr")
         np.testing.assert_allclose(light, 0.5 * frame.picture(), rtol=0.02)
 
 
-def test_records_are_those_of_each_frame_alone(T, tmp_path):
-    scale = np.array([0.5, 1.0, 2.0, 4.0])
-    pictures = scale[:, None, None] * seen(LIGHT[:4])
-    fill(tmp_path / "in", pictures)
-    done = compensate_frames(T, tmp_path / "in", tmp_path / "out", rtol=1e-4)
-    for record, picture in zip(done.records, pictures, strict=True):
+def test_grey_coloured_black_and_bright_frames_are_what_each_is_alone(T, tmp_path):
+    grey, colour = seen(LIGHT[:4]), np.stack(list(seen(LIGHT[4:7])), axis=-1)
+    pictures = [grey[0], colour, 4.0 * grey[2], np.zeros(GRID), 0.5 * grey[3]]
+    done = compensate_frames(T, fill(tmp_path / "in", pictures), tmp_path / "out", format="exr", rtol=1e-4)
+    for record, picture, pattern in zip(done.records, pictures, patterns(done), strict=True):
         alone = ltcl.compensate(T, picture, rtol=1e-4)
+        shown = pattern[..., 0] if picture.ndim == 2 else pattern  # a batch with one in colour is in colour
+        np.testing.assert_allclose(shown, alone.pattern, atol=2e-3)
         assert record.error == pytest.approx(alone.error, abs=1e-3)
         assert record.clipped == pytest.approx(alone.clipped, abs=0.05)
-    assert done.most_clipped.number == done.worst.number == 4
-    told = json.loads((tmp_path / "out/frames.json").read_text())
-    assert [entry["error"] for entry in told["frames"]] == [record.error for record in done.records]
+    assert done.most_clipped.number == done.worst.number == 3
+    listed = json.loads((tmp_path / "out/frames.json").read_text())["frames"]
+    assert [entry["error"] for entry in listed] == [record.error for record in done.records]
 
 
-def test_grey_and_coloured_frames_keep_their_kind(T, tmp_path):
-    kinds = [seen(LIGHT[:3])[n] if n != 1 else np.stack(list(seen(LIGHT[3:6])), axis=-1) for n in range(3)]
-    fill(tmp_path / "in", kinds)
-    done = compensate_frames(T, tmp_path / "in", tmp_path / "out", format="exr", rtol=1e-4)
-    found = patterns(done)
-    assert [pattern.shape for pattern in found] == [GRID, (*GRID, 3), GRID]
-    np.testing.assert_allclose(found[1], np.moveaxis(LIGHT[3:6], 0, -1), rtol=1e-3)
-    np.testing.assert_allclose(found[2], LIGHT[2], rtol=1e-3)
-    (tmp_path / "film").mkdir()
-    done = compensate_frames(
-        T, tmp_path / "in", tmp_path / "film", gain="auto", video=tmp_path / "a.mkv", encoding="auto"
-    )
-    assert open_frames(tmp_path / "a.mkv").count == 3
-
-
-def test_a_transport_in_colour_and_a_rectangular_one(device, tmp_path):
+def test_a_transport_in_colour_a_rectangular_one_and_one_pixel(device, tmp_path):
     grid = (2, 3)
-    parts = [lambertian(6, rho, seed=80 + c).T for c, rho in enumerate((0.5, 0.9, 1.5))]
+    blocks = [lambertian(6, rho, seed=80 + c).T for c, rho in enumerate((0.5, 0.9, 1.5))]
     light = random.uniform(0.3, 0.7, (5, *grid, 3))
     flat = light.reshape(5, 6, 3)
-    frames = np.stack([flat[..., c] @ part.T for c, part in enumerate(parts)], axis=-1).reshape(5, *grid, 3)
-    fill(tmp_path / "colour", frames)
-    T = ltcl.Transport(parts, grid, device=device)
-    done = compensate_frames(T, tmp_path / "colour", tmp_path / "a", batch=2, format="exr", rtol=1e-4)
+    frames = np.stack([flat[..., c] @ block.T for c, block in enumerate(blocks)], axis=-1)
+    source = fill(tmp_path / "colour", frames.reshape(5, *grid, 3))
+    T = ltcl.Transport(blocks, grid, device=device)
+    done = compensate_frames(T, source, tmp_path / "a", batch=2, format="exr", rtol=1e-4)
     np.testing.assert_allclose(np.stack(patterns(done)), light, rtol=1e-3)
     tall = random.uniform(0, 1, (20, 6))
-    fill(tmp_path / "tall", (light[..., 0].reshape(5, 6) @ tall.T).reshape(5, 4, 5))
+    source = fill(tmp_path / "tall", (flat[..., 0] @ tall.T).reshape(5, 4, 5))
     T = ltcl.Transport(tall, grid, camera_grid=(4, 5), device=device)
-    done = compensate_frames(T, tmp_path / "tall", tmp_path / "b", batch=2, format="exr", rtol=1e-5)
+    done = compensate_frames(T, source, tmp_path / "b", batch=2, format="exr", rtol=1e-5)
     np.testing.assert_allclose(np.stack(patterns(done)), light[..., 0], atol=2e-3)
-
-
-def test_one_frame_of_one_pixel(device, tmp_path):
-    fill(tmp_path / "in", [np.full((1, 1), 0.1)])
-    done = compensate_frames(
-        ltcl.Transport([[0.5]], (1, 1), device=device), tmp_path / "in", tmp_path / "out"
-    )
+    T = ltcl.Transport([[0.5]], (1, 1), device=device)
+    done = compensate_frames(T, fill(tmp_path / "one", [np.full((1, 1), 0.1)]), tmp_path / "c")
     np.testing.assert_allclose(patterns(done)[0], [[0.2]], atol=1e-4)
-
-
-def test_black_frames_are_black(T, tmp_path):
-    fill(tmp_path / "in", [np.zeros(GRID), seen(LIGHT[:1])[0], np.zeros(GRID)])
-    done = compensate_frames(T, tmp_path / "in", tmp_path / "out", gain="auto")
-    assert not patterns(done)[0].any()
-    assert [record.error for record in done.records][::2] == [0.0, 0.0]
-    assert done.gain > 1
 
 
 def test_one_gain_for_all_frames_from_a_sample_of_all(T, tmp_path):
     scale = np.linspace(1.0, 0.2, 9)
+    scale[2] = 5.0  # not in the sample
     pictures = scale[:, None, None] * seen(LIGHT[:9])
-    fill(tmp_path / "in", pictures)
-    done = compensate_frames(
-        T, tmp_path / "in", tmp_path / "out", batch=3, gain="auto", format="exr", rtol=1e-4
-    )
+    source = fill(tmp_path / "in", pictures)
+    done = compensate_frames(T, source, tmp_path / "out", batch=3, gain="auto", format="exr", rtol=1e-4)
     sample = ltcl.compensate(T, pictures[[0, 4, 8]], gain="auto", rtol=1e-4)
     assert done.gain == pytest.approx(sample.gain, rel=1e-3)
     for pattern, light, factor in zip(patterns(done)[3:], LIGHT[3:9], scale[3:], strict=True):
         np.testing.assert_allclose(pattern, done.gain * factor * light, rtol=1e-3)
-    told = json.loads((tmp_path / "out/frames.json").read_text())
-    assert told["gain"] == done.gain
-    assert told["settings"]["gain"] == "auto"
+    assert [record.number for record in done.records if record.clipped > 0.05] == [3]
+    listed = json.loads((tmp_path / "out/frames.json").read_text())
+    assert (listed["gain"], listed["settings"]["gain"]) == (done.gain, "auto")
 
 
-def test_a_frame_brighter_than_the_sample_is_clipped_and_told(T, tmp_path):
-    pictures = seen(LIGHT[:9])
-    pictures[2] *= 5.0
-    fill(tmp_path / "in", pictures)
-    done = compensate_frames(T, tmp_path / "in", tmp_path / "out", batch=3, gain="auto")
-    assert done.most_clipped.number == 3
-    assert done.most_clipped.clipped > 0.5
-    assert sum(record.clipped > 0.05 for record in done.records) == 1
-
-
-def test_background_and_weights_serve_all_frames(T, source, tmp_path):
-    dark = 0.1 * seen(LIGHT[:1])[0]
-    done = compensate_frames(
-        T, source, tmp_path / "out", background=dark, weights=np.ones(GRID), format="exr", rtol=1e-4
-    )
+def test_background_and_weights_serve_all_frames_and_sizes_are_scaled_when_asked(T, source, tmp_path):
+    options: dict[str, Any] = {"background": 0.1 * seen(LIGHT[:1])[0], "weights": np.ones(GRID)}
+    done = compensate_frames(T, source, tmp_path / "out", format="exr", rtol=1e-4, **options)
     np.testing.assert_allclose(np.stack(patterns(done)), LIGHT - 0.1 * LIGHT[0], rtol=2e-3)
-    for name in ("background", "weights"):
-        options: dict[str, Any] = {name: np.ones((8, *GRID))}
-        with pytest.raises(InputError, match=rf"{name} holds 8 frame\(s\); it must be one picture"):
-            compensate_frames(T, source, tmp_path / "more", **options)
+    wide = fill(tmp_path / "in", [np.full((4, 16), 0.2)])
+    with pytest.raises(InputError, match=r"frame 1 \(f0\.exr\) is 4 x 16 pixels, but the camera has 8 x 8"):
+        compensate_frames(T, wide, tmp_path / "wide")
+    assert not (tmp_path / "wide").exists()
+    done = compensate_frames(T, wide, tmp_path / "wide", resize=True, format="exr")
+    np.testing.assert_allclose(seen(patterns(done)[0][None])[0], 0.2, rtol=0.02)
 
 
 @pytest.mark.parametrize("suffix", [".mkv", ".avi"])
@@ -209,211 +166,135 @@ def test_videos_in_and_out(T, tmp_path, suffix):
     shown = open_frames(out)
     assert (shown.count, shown.fps) == (COUNT, pytest.approx(30.0))
     assert [record.name for record in done.records][:2] == [f"film{suffix}:1", f"film{suffix}:2"]
-    for frame, pattern in zip(shown, patterns(done), strict=True):
+    for frame, given, pattern in zip(shown, open_frames(film), patterns(done), strict=True):
         np.testing.assert_allclose(images.to_srgb(frame.picture()), images.to_srgb(pattern), atol=0.6 / 255)
-    for frame, pattern in zip(open_frames(film), patterns(done), strict=True):
-        looks = (SCENE.T @ pattern.ravel()).reshape(GRID)
-        assert np.linalg.norm(looks - frame.picture()) < 1e-2 * np.linalg.norm(looks)
-    again = compensate_frames(
-        T, film, tmp_path / "patterns", video=out, rtol=1e-4, batch=4, resume=True, fps=10
-    )
+        assert np.linalg.norm(seen(pattern[None])[0] - given.picture()) < 1e-2 * np.linalg.norm(
+            given.picture()
+        )
+    common: dict[str, Any] = {"video": out, "rtol": 1e-4, "batch": 4, "resume": True}
+    again = compensate_frames(T, film, tmp_path / "patterns", fps=10, **common)
     assert again.solved == 0
     assert again.records == done.records
     assert open_frames(out).fps == pytest.approx(10.0)
 
 
-def test_only_the_first_frames_and_then_the_rest(T, source, tmp_path):
-    whole = compensate_frames(T, source, tmp_path / "whole", batch=4)
-    done = compensate_frames(T, source, tmp_path / "part", batch=4, frames=6)
-    assert len(done.records) == 6
-    done = compensate_frames(T, source, tmp_path / "part", batch=4, resume=True)
-    assert done.solved == COUNT - 4  # the second batch was not whole
-    assert everything(tmp_path / "part") == everything(tmp_path / "whole")
-    assert done.records == whole.records
-
-
-def test_frames_are_scaled_when_asked(T, source, tmp_path):
-    fill(tmp_path / "in", [np.full((4, 16), 0.2), np.full((4, 16), 0.3)])
-    with pytest.raises(
-        InputError, match=r"frame 1 of 2 is 4 x 16 pixels, but the camera has 8 x 8; give res"
-    ):
-        compensate_frames(T, tmp_path / "in", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    done = compensate_frames(T, tmp_path / "in", tmp_path / "out", resize=True, format="exr")
-    exact = ltcl.compensate(T, np.full(GRID, 0.2)).pattern
-    np.testing.assert_allclose(patterns(done)[0], exact, rtol=0.02, atol=1e-3)
+def test_a_matroska_whose_sound_outlasts_its_picture_loses_no_batch(T, tmp_path, caplog):
+    film = tmp_path / "film.mkv"
+    write_video(film, seen(LIGHT))
+    data = film.read_bytes()
+    place = data.index(b"\x44\x89\x88") + 3  # its duration
+    (duration,) = struct.unpack_from(">d", data, place)
+    film.write_bytes(data[:place] + struct.pack(">d", 1.2 * duration) + data[place + 8 :])
+    done = compensate_frames(T, film, tmp_path / "out", batch=8, video=tmp_path / "out.avi")
+    assert len(done.records) == COUNT
+    assert open_frames(tmp_path / "out.avi").count == COUNT
+    assert f"{film}: 13 of 16 frames can be read" in caplog.text
 
 
 @pytest.mark.parametrize(
-    ("bad", "part"),
-    [
-        (b"", "frame 11 of 13 cannot be read: f10.exr: the file is empty"),
-        (b"no picture", "frame 11 of 13 cannot be read: f10.exr: is no EXR picture"),
-        (np.ones((5, 8)), "frame 11 of 13 is 5 x 8 pixels; it must be 8 x 8 as frame 1"),
-        (np.full(GRID, np.nan), "frame 11 of 13 cannot be read: f10.exr: the picture has 64 NaN"),
-    ],
+    ("bad", "text"), [(b"", "empty"), (b"no picture", "f10"), (np.ones((5, 8)), "5 x 8")]
 )
-@pytest.mark.parametrize("mended", [True, False])
-def test_a_bad_frame_is_one_line_and_those_before_stay(T, source, tmp_path, bad, part, mended):
+def test_a_bad_frame_is_one_line_and_those_before_stay(T, source, tmp_path, bad, text):
     folder, out = tmp_path / "in", tmp_path / "out"
     shutil.copytree(source, folder)
+    images.write(folder / "f10.exr", np.ones((5, 8)))
     if isinstance(bad, bytes):
         (folder / "f10.exr").write_bytes(bad)
-    else:
-        write_any(folder / "f10.exr", bad)
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match=rf"f10\.exr.*{text}.*; 8 frame\(s\) are done.*resume=True") as error:
         compensate_frames(T, folder, out, batch=4)
-    assert part in str(error.value)
-    assert str(error.value).endswith(
-        f"; 8 frame(s) are done and stay in {out}, resume=True goes on from there"
-    )
     assert "\n" not in str(error.value)
     assert len(list(out.glob("pattern_*.png"))) == 8
-    before = {name: content for name, content in everything(out).items() if name.startswith("pattern")}
-    if not mended:
-        done = compensate_frames(T, folder, out, batch=4, frames=10, resume=True)
-        assert done.solved == 2
-        return
     shutil.copy(source / "f10.exr", folder / "f10.exr")
-    done = compensate_frames(T, folder, out, batch=4, resume=True)
-    assert done.solved == COUNT - 8
-    assert before.items() <= everything(out).items()
+    assert compensate_frames(T, folder, out, batch=4, resume=True).solved == COUNT - 8
     compensate_frames(T, source, tmp_path / "whole", batch=4)
     assert everything(out) == everything(tmp_path / "whole")
 
 
-def write_any(path: Path, picture: np.ndarray) -> None:
-    """An EXR of any values; `ltcl.images` writes no NaN."""
-    import OpenEXR
-
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, {"Y": picture.astype(np.float32)}).write(str(path))
-
-
-def test_a_truncated_video_keeps_what_could_be_read(T, tmp_path):
-    film, out = tmp_path / "film.mkv", tmp_path / "out"
-    write_video(film, seen(LIGHT))
-    whole = film.read_bytes()
-    film.write_bytes(whole[: len(whole) * 2 // 3])
-    found = []
-    with pytest.raises(FileError):
-        found.extend(open_frames(film))
-    readable = len(found)
-    assert 4 <= readable < COUNT
-    batch = 2
-    with pytest.raises(
-        FileError, match=f"frame {readable + 1} of 13 cannot be read: .*; .* are done and stay"
-    ):
-        compensate_frames(T, film, out, batch=batch)
-    assert len(list(out.glob("pattern_*.png"))) == readable // batch * batch
-    done = compensate_frames(T, film, out, batch=batch, resume=True, frames=readable)
-    assert len(done.records) == readable
-    film.write_bytes(whole)
-    compensate_frames(T, film, out, batch=batch, resume=True)
-    compensate_frames(T, film, tmp_path / "whole", batch=batch)
+def test_resuming_makes_what_is_missing_and_an_earlier_run_is_not_begun_anew(T, source, tmp_path):
+    whole = compensate_frames(T, source, tmp_path / "whole", batch=4, resume=True)
+    out = tmp_path / "out"
+    assert len(compensate_frames(T, source, out, batch=4, frames=6).records) == 6
+    before = everything(out)
+    with pytest.raises(InputError, match=r"out: holds 6 frame\(s\) of an earlier run; give resume=True"):
+        compensate_frames(T, source, out, batch=4)
+    assert everything(out) == before
+    done = compensate_frames(T, source, out, batch=4, resume=True)
+    assert done.solved == COUNT - 4  # the second batch was not whole
+    assert done.records == whole.records
+    (out / "pattern_000006.png").unlink()
+    (out / ".pattern_000006-0123456789ab.png").write_bytes(b"of a killed run")
+    assert compensate_frames(T, source, out, batch=4, resume=True).solved == 4
     assert everything(out) == everything(tmp_path / "whole")
 
 
-def test_an_earlier_run_is_not_begun_anew(T, source, tmp_path):
-    compensate_frames(T, source, tmp_path / "out", frames=2)
-    before = everything(tmp_path / "out")
-    with pytest.raises(InputError, match=r"out: holds 2 frame\(s\) of an earlier run; give resume=True"):
-        compensate_frames(T, source, tmp_path / "out")
-    assert everything(tmp_path / "out") == before
+class Projector:
+    """Its curve, as a bound method, which has no identity of its own."""
+
+    def __init__(self, gamma: float) -> None:
+        self.gamma = gamma
+
+    def codes(self, light: np.ndarray) -> np.ndarray:
+        return np.clip(light, 0, 1) ** (1 / self.gamma)
 
 
 @pytest.mark.parametrize(
-    ("changed", "part"),
+    ("changed", "text"),
     [
-        ({"rtol": 1e-3}, "that run had rtol=0.01, this one has 0.001"),
-        ({"gain": 0.5}, "that run had gain=1.0, this one has 0.5"),
-        ({"bounds": (0.0, 2.0)}, "that run had bounds=[0.0, 1.0], this one has [0.0, 2.0]"),
-        ({"batch": 3}, "that run had batch=4, this one has 3"),
-        ({"format": "exr"}, "that run had format='png', this one has 'exr'"),
-        ({"background": np.full(GRID, 0.1)}, "that run had background=None, this one has '8 x 8, sha256"),
-        ({"encoding": "linear"}, "that run had encoding='auto', this one has 'linear'"),
+        ({"rtol": 1e-3}, "rtol=0.01, this one has 0.001"),
+        ({"gain": 0.5}, "gain=1.0, this one has 0.5"),
+        ({"bounds": (0.0, 2.0)}, r"bounds=\[0.0, 1.0\], this one has \[0.0, 2.0\]"),
+        ({"batch": 3}, "batch=4, this one has 3"),
+        ({"format": "exr"}, "format='png', this one has 'exr'"),
+        ({"background": np.full(GRID, 0.1)}, "background=None, this one has '8 x 8, sha256"),
+        ({"codes": Projector(2.2).codes}, "codes='sha256"),
+        ({"codes": None}, "codes='sha256 .*', this one has None"),
+        ({"exact": ltcl.Transport(NEARLY, GRID)}, "exact='Transport, sha256"),
     ],
 )
-def test_other_settings_are_refused_by_their_name(T, source, tmp_path, changed, part):
-    common: dict[str, Any] = {"batch": 4}
-    compensate_frames(T, source, tmp_path / "out", frames=8, rtol=0.01, **common)  # which is usual
+def test_other_settings_are_refused_by_their_name(T, source, tmp_path, changed, text):
+    exact = ltcl.Transport(SCENE.T, GRID)
+    common: dict[str, Any] = {"batch": 4, "rtol": 0.01, "codes": Projector(1.8).codes, "exact": exact}
+    compensate_frames(T, source, tmp_path / "out", frames=4, **common)
     before = everything(tmp_path / "out")
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match=f"that run had {text}") as error:
         compensate_frames(T, source, tmp_path / "out", resume=True, **{**common, **changed})
-    assert part in str(error.value)
     assert "\n" not in str(error.value)
     assert everything(tmp_path / "out") == before
+    common["codes"] = Projector(1.8).codes  # another object, the same curve
+    assert compensate_frames(T, source, tmp_path / "out", frames=5, resume=True, **common).solved == 1
 
 
-def test_another_T_is_refused_and_the_same_one_known_again(T, source, tmp_path, device):
-    compensate_frames(T, source, tmp_path / "out", frames=8)
-    other = SCENE.T.copy()
-    other[5, 7] *= 1.0001
-    for T_other in (other, SCENE.T.astype(np.float32), [SCENE.T] * 3):
-        with pytest.raises(InputError, match="that run was with another T"):
-            compensate_frames(ltcl.Transport(T_other, GRID), source, tmp_path / "out", resume=True)
+def test_another_T_and_other_frames_are_refused_and_the_same_ones_known_again(T, source, tmp_path, device):
+    folder, out = tmp_path / "in", tmp_path / "out"
+    shutil.copytree(source, folder)
+    compensate_frames(T, folder, out, frames=8)
+    for matrix in (NEARLY, SCENE.T.astype(np.float32), [SCENE.T] * 3):
+        with pytest.raises(InputError, match="another T"):
+            compensate_frames(ltcl.Transport(matrix, GRID), folder, out, resume=True)
     ltcl.save(tmp_path / "T.npz", T)
     again = ltcl.load(tmp_path / "T.npz", first_bounce=SCENE.F)  # compensation does not depend on it
-    assert compensate_frames(again, source, tmp_path / "out", resume=True).solved == COUNT - 8
-
-
-def test_operators_without_entries_are_known_by_their_products(source, tmp_path, device):
-    from scipy.sparse.linalg import aslinearoperator
-
-    def T(matrix):
-        return ltcl.Transport(aslinearoperator(matrix), GRID, first_bounce=SCENE.F, device=device)
-
-    compensate_frames(T(SCENE.T), source, tmp_path / "out", frames=8)
-    with pytest.raises(InputError, match="that run was with another T"):
-        compensate_frames(T(1.001 * SCENE.T), source, tmp_path / "out", resume=True)
-    nearly = SCENE.T * (1.0 + 1e-7)  # as products in another order may be
-    assert compensate_frames(T(nearly), source, tmp_path / "out", resume=True).solved == COUNT - 8
-
-
-def test_what_T_is_off_by_is_told_and_not_compared(T):
-    """It depends on the first bounce, and patterns do not."""
-    known = identity.of_transport(T)
-    assert known["error"] == T.error == 0.0
-    assert identity.same_transport(known, {**known, "error": 0.01})
-    assert not identity.same_transport(known, {**known, "channels": 3})
-
-
-def test_other_frames_are_refused_by_the_first(T, source, tmp_path):
-    folder = tmp_path / "in"
-    shutil.copytree(source, folder)
-    compensate_frames(T, folder, tmp_path / "out", batch=4, frames=8)
+    assert compensate_frames(again, folder, out, resume=True, frames=9).solved == 1
+    for scale in (1.0, 1.0 + 1e-9, 1.001):  # without entries: known by its products
+        matrix = aslinearoperator(scale * SCENE.T)
+        operator = ltcl.Transport(matrix, GRID, first_bounce=SCENE.F, device=device)
+        with pytest.raises(InputError, match="another T") if scale > 1.0001 else contextlib.nullcontext():
+            compensate_frames(operator, folder, tmp_path / "operator", resume=True, frames=9)
     (folder / "f3.exr").write_bytes((source / "f4.exr").read_bytes())
-    with pytest.raises(
-        InputError, match="frame 4 of 13 is not what it was when its pattern was made"
-    ) as error:
-        compensate_frames(T, folder, tmp_path / "out", batch=4, resume=True)
+    with pytest.raises(InputError, match=r"frame 4 \(f3\.exr\) has changed") as error:
+        compensate_frames(T, folder, out, resume=True)
     assert "goes on from there" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b'{"format": 9}', b'{"format": 1, "frames": [{}]}', LISTED, b"\xff"]
+    "content", [b"", b"{", b"[]", b'{"format": 9}', b'{"format": 2, "frames": [{}]}', b"\xff"]
 )
 def test_a_damaged_list_is_refused(T, source, tmp_path, content):
     (tmp_path / "frames.json").write_bytes(content)
     for resume in (False, True):
-        with pytest.raises(
-            FileError, match=r"frames\.json: (is no list of frames|the file is empty)"
-        ) as error:
+        with pytest.raises(FileError, match=r"frames\.json: .*(damaged|empty)") as error:
             compensate_frames(T, source, tmp_path, resume=resume)
         assert "\n" not in str(error.value)
     assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_a_lost_pattern_is_made_again(T, source, tmp_path):
-    compensate_frames(T, source, tmp_path / "out", batch=4)
-    before = everything(tmp_path / "out")
-    (tmp_path / "out/pattern_000006.png").unlink()
-    assert compensate_frames(T, source, tmp_path / "out", batch=4, resume=True).solved == 4
-    assert everything(tmp_path / "out") == before
-
-
-def test_resuming_nothing_begins(T, source, tmp_path):
-    assert compensate_frames(T, source, tmp_path / "out", resume=True).solved == COUNT
 
 
 @pytest.mark.parametrize(
@@ -421,83 +302,60 @@ def test_resuming_nothing_begins(T, source, tmp_path):
     [
         ({"batch": 0}, InputError, "batch is 0"),
         ({"frames": 0}, InputError, "frames is 0"),
-        ({"format": "gif"}, InputError, "format is 'gif'; it must be one of png, exr"),
-        ({"fps": -1}, InputError, "fps is -1"),
+        ({"format": "gif"}, InputError, "format is 'gif'.* png, exr"),
         ({"gain": 0}, InputError, "gain is 0"),
         ({"loss": 0.1}, InputError, "loss is 0.1, but gain is 1.0"),
         ({"bounds": (1, 0)}, InputError, r"bounds is \(1, 0\)"),
         ({"video": "a.gif"}, FileError, r"a\.gif: extension \.gif is unknown"),
-        (
-            {"exact": np.eye(64)},
-            InputTypeError,
-            "exact is a ndarray; it must be a ltcl.Transport",
-        ),
+        ({"exact": np.eye(64)}, InputTypeError, "exact is a ndarray"),
         ({"nonsense": 1}, InputTypeError, "frames 1 to 8: unknown option 'nonsense'"),
-        ({"encoding": "log"}, InputError, "encoding is 'log'"),
-        ({"weights": [[1.0], [1.0, 2.0]]}, InputError, "weights is ragged"),
+        ({"codes": "sRGB"}, InputTypeError, "codes is 'sRGB'"),
+        ({"weights": np.ones((8, *GRID))}, InputError, "weights holds 8 frame"),
         ({"background": np.ones((3, 3))}, InputError, r"background has shape \(3, 3\)"),
+        ({"T": SCENE.T}, InputTypeError, "T is a ndarray"),
+        ({"T": ltcl.Transport(np.eye(15), (3, 5)), "video": "a.mkv"}, InputError, "frames are 3 x 5 pixels"),
+        ({"source": "nowhere"}, FileError, "nowhere: no such file"),
     ],
 )
 def test_bad_settings_leave_no_folder(T, source, tmp_path, options, error, text):
     with pytest.raises(error, match=text):
-        compensate_frames(T, source, tmp_path / "out", **options)
+        compensate_frames(**{"T": T, "source": source, "out": tmp_path / "a" / "out", **options})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_bad_arguments(T, source, tmp_path, device):
-    with pytest.raises(InputTypeError, match="T is a ndarray"):
-        compensate_frames(SCENE.T, source, tmp_path / "out")  # pyright: ignore[reportArgumentType]
-    odd = ltcl.Transport(np.eye(15), (3, 5), device=device)
-    with pytest.raises(InputError, match="frames are 3 x 5 pixels; those of a video must be even"):
-        compensate_frames(odd, source, tmp_path / "out", video="a.mkv")
-    with pytest.raises(FileError, match="nowhere: no such file"):
-        compensate_frames(T, tmp_path / "nowhere", tmp_path / "out")
-    with pytest.raises(InputError, match=r"out is .*, where the frames are; it must be another place"):
+def test_bad_places_and_solves(T, source, tmp_path, device):
+    with pytest.raises(InputError, match=r"out is .*, where the frames are"):
         compensate_frames(T, source, source)
     film = tmp_path / "film.mkv"
     write_video(film, seen(LIGHT))
     with pytest.raises(InputError, match=r"video is .*film\.mkv, where the frames are"):
         compensate_frames(T, film, tmp_path / "out", video=film)
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(FileError):
+    with pytest.raises(FileError, match="is a file"):
         compensate_frames(T, source, tmp_path / "file")
     assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_a_solve_that_fails_tells_the_frames(device, source, tmp_path):
-    far = lambertian(64, 3.0, seed=72)
-    T = ltcl.Transport(far.T, GRID, device=device)
+    far = ltcl.Transport(lambertian(64, 3.0, seed=72).T, GRID, device=device)
     with pytest.raises(ConvergenceError, match="frames 1 to 8: jacobi: diverged") as error:
-        compensate_frames(T, source, tmp_path / "out", method="jacobi")
+        compensate_frames(far, source, tmp_path / "out", method="jacobi")
     assert not error.value.solution.converged
     assert not (tmp_path / "out").exists()
 
 
-def test_an_interrupt_at_any_file_costs_its_batch_at_most(T, source, tmp_path, monkeypatch):
-    compensate_frames(T, source, tmp_path / "whole", batch=4, gain="auto")
-    replace, moved = os.replace, []
+@pytest.mark.skipif(sys.platform == "win32", reason="no flock there")
+def test_a_second_run_in_the_folder_is_refused_at_once(T, source, tmp_path):
+    out, refused = tmp_path / "out", []
 
-    def interrupted(*paths, **options):
-        moved.append(paths)
-        if len(moved) % 6 == 5:
-            raise KeyboardInterrupt
-        replace(*paths, **options)
+    def second(step, done, total):
+        before = everything(out)
+        for resume in (False, True):
+            with pytest.raises(FileError, match="out: another run writes there") as error:
+                compensate_frames(T, source, out, batch=4, resume=resume)
+            refused.append(str(error.value))
+        assert everything(out) == before
 
-    monkeypatch.setattr(files.os, "replace", interrupted)
-    ends = 0
-    for _ in range(50):
-        listed = tmp_path / "out/frames.json"
-        before = len(json.loads(listed.read_text())["frames"]) if listed.exists() else 0
-        try:
-            compensate_frames(T, source, tmp_path / "out", batch=4, gain="auto", resume=True)
-            break
-        except KeyboardInterrupt:
-            ends += 1
-            after = len(json.loads(listed.read_text())["frames"]) if listed.exists() else 0
-            assert after >= before
-            assert after in (0, 4, 8, 12, 13)
-    assert ends >= 2
-    assert everything(tmp_path / "out") == everything(tmp_path / "whole")
+    assert compensate_frames(T, source, out, batch=4, progress=second).solved == COUNT
+    assert len(refused) == 10
+    assert compensate_frames(T, source, out, batch=4, resume=True).solved == 0
 
 
 RUN = """
@@ -507,22 +365,19 @@ import ltcl
 
 _, matrix, source, out = sys.argv
 T = ltcl.Transport(np.load(matrix), (8, 8))
-say = lambda done, total: print(done, flush=True)
+say = lambda step, done, total: print(done, flush=True)
 ltcl.batch.compensate_frames(T, source, out, batch=2, gain="auto", resume=True, appearance=True, progress=say)
 """
 
 
 def test_a_killed_run_goes_on_to_the_same_bytes(T, tmp_path):
-    source, matrix = tmp_path / "in", tmp_path / "T.npy"
-    np.save(matrix, SCENE.T)
-    fill(source, seen(random.uniform(0.2, 0.9, (60, *GRID))))
+    np.save(tmp_path / "T.npy", SCENE.T)
+    source = fill(tmp_path / "in", seen(random.uniform(0.2, 0.9, (60, *GRID))))
     common: dict[str, Any] = {"batch": 2, "gain": "auto", "appearance": True}
     compensate_frames(T, source, tmp_path / "whole", **common)
-    wanted = everything(tmp_path / "whole")
-    ended = 0
-    for trial in range(10):
+    for trial in range(8):
         out = tmp_path / f"out{trial}"
-        command = [sys.executable, "-c", RUN, *map(str, (matrix, source, out))]
+        command = [sys.executable, "-c", RUN, str(tmp_path / "T.npy"), str(source), str(out)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
             assert child.stdout is not None
             for _ in range(random.integers(1, 20)):
@@ -531,9 +386,6 @@ def test_a_killed_run_goes_on_to_the_same_bytes(T, tmp_path):
             child.kill()
         listed = out / "frames.json"
         done = len(json.loads(listed.read_text())["frames"]) if listed.exists() else 0
-        made = len(list(out.glob("pattern_*.png")))
-        assert done <= made <= done + 2
-        ended += done < 60
+        assert done <= len(list(out.glob("pattern_*.png"))) <= done + 2
         assert compensate_frames(T, source, out, resume=True, **common).solved == 60 - done
-        assert everything(out) == wanted
-    assert ended > 0
+        assert everything(out) == everything(tmp_path / "whole")

@@ -16,6 +16,7 @@ import pytest
 
 import ltcl
 from ltcl import images
+from ltcl.batch.manifest import locked
 from ltcl.cli import console
 from ltcl.images.frames import open_frames
 
@@ -162,7 +163,7 @@ def test_a_bad_frame_is_one_line_with_what_is_done(
     (frames / "4.png").write_bytes((film / "f4.png").read_bytes()[:60])
     common = ["compensate", transport, frames, "--out", out, "--batch", "2"]
     program(*common).refused(
-        f"{frames}: frame 4 of 5 cannot be read: 4.png: is truncated",
+        f"{frames / '4.png'}: is truncated",
         f"2 frame(s) are done and stay in {out}, --resume goes on from there",
     )
 
@@ -204,7 +205,7 @@ def test_clipped_frames_come_with_advice(
         (["{film}", "--fps", "0"], ["fps is 0.0"]),
         (["{film}", "--gain", "0"], ["--gain is 0.0"]),
         (["{film}", "--low", "2"], ["(--low, --high) is (2.0, 1.0)"]),
-        (["{video}"], ["film.avi: frame 1 of 10 is 4 x 12 pixels, but the camera has 5 x 10; give --resize"]),
+        (["{video}"], ["film.avi: frame 1 ", "is 4 x 12 pixels, but the camera has 5 x 10; give --resize"]),
         (["nowhere.mp4"], ["nowhere.mp4: no such file"]),
         (["{empty}"], ["holds no pictures"]),
     ],
@@ -247,3 +248,14 @@ def test_a_compressed_transport_is_told_and_corrected(
     for frame in list(open_frames(film))[:3]:
         pattern = images.read(tmp_path / "exact" / f"pattern_{frame.number:06}.exr")
         assert np.linalg.norm(T @ pattern - frame.picture()) <= 2e-5 * np.linalg.norm(frame.picture())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no flock there")
+@pytest.mark.parametrize("name", ["film", "picture"])
+def test_a_second_run_in_a_folder_is_refused_at_once(
+    program: Program, transport: Path, film: Path, picture: Path, tmp_path: Path, name: str
+) -> None:
+    command = ["compensate", transport, {"film": film, "picture": picture}[name], "--out", tmp_path / "out"]
+    with locked(tmp_path / "out"):  # as the first one does
+        program(*command).refused("out: another run writes there")
+    assert program(*command).code == 0

@@ -1,99 +1,175 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Nearest hits of rays, beside a plain search in float64 and cases known by hand."""
+"""What rays meet first, and what a viewer, a projector or a camera sees of walls."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ltcl.scenes.blocks import Block
-from ltcl.scenes.box import WALLS
-from ltcl.scenes.rays import cast, clear
+from ltcl.errors import InputError, InputTypeError
+from ltcl.scenes import Block, box, cut, trihedral
+from ltcl.scenes.builders import WALLS
+from ltcl.scenes.rays import cast, clear, sight
+from ltcl.scenes.viewer import Viewer, draw, frame, read
 from ltcl.scenes.walls import Wall
+from tests import reference
 
-FLOOR = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
-SLANTED = Wall("slanted", corner=(0, 0, 1), right=(0.2, 1, 0.3), down=(1.5, 0.1, -0.4))
+FLOOR = WALLS[2]
+# A unit screen one unit in front of an eye that looks along +y: x to the right, z up.
+SCREEN = Wall("screen", corner=(0, 1, 1), right=(1, 0, 0), down=(0, 0, -1))
+EYE = Viewer(eye=(0.5, 0, 0.5), target=(0.5, 1, 0.5))
+# Half as high and wide as it, in front of the middle of the screen: they look twice as large from the eye.
+CARD = Wall("card", corner=(0.375, 0.5, 0.625), right=(0.25, 0, 0), down=(0, 0, -0.25))
 
 
-def test_ray_finds_the_place_on_a_slanted_parallelogram() -> None:
+def test_rays_find_the_place_on_a_slanted_wall_from_its_front() -> None:
+    slanted = Wall("slanted", corner=(0, 0, 1), right=(0.2, 1, 0.3), down=(1.5, 0.1, -0.4))
     rng = np.random.default_rng(0)
     u, v = rng.random((2, 50))
-    targets = np.array(SLANTED.corner) + u[:, None] * SLANTED.right + v[:, None] * SLANTED.down
-    origins = targets + SLANTED.normal + rng.uniform(-0.3, 0.3, (50, 3))
-    hits = cast([SLANTED], origins, 3 * (targets - origins))
+    targets = slanted.points(u, v)
+    origins = targets + slanted.normal + rng.uniform(-0.3, 0.3, (50, 3))
+    hits = cast([slanted], origins, 3 * (targets - origins))
     assert (hits.wall == 0).all()
-    assert hits.u == pytest.approx(u)
-    assert hits.v == pytest.approx(v)
-    assert hits.distance == pytest.approx(1 / 3)
+    np.testing.assert_allclose([hits.u, hits.v, hits.distance], [u, v, np.full(50, 1 / 3)])
+    behind = cast([slanted], 2 * targets - origins, origins - targets)  # black, and it still stops light
+    assert (behind.wall == -1).all()
+    np.testing.assert_allclose(behind.distance, 1)
 
 
-def test_walls_are_black_from_behind_and_still_stop_light() -> None:
-    up = np.array([[0.0, 0.0, 1.0]])
-    ceiling = Wall("ceiling", corner=(0, 0, 2), right=(1, 0, 0), down=(0, 1, 0))
-    start = np.array([[0.5, 0.5, -1.0]])
-    assert cast([ceiling], start, up).wall.tolist() == [0]
-    hits = cast([FLOOR, ceiling], start, up)
-    assert hits.wall.tolist() == [-1]
-    assert hits.distance.tolist() == [1.0]
-
-
-def test_no_ray_leaves_a_closed_box() -> None:
+def test_no_ray_leaves_a_closed_box_and_the_nearest_wall_wins() -> None:
     """Seams and corners included: rays from the middle aim at points of a lattice that holds them all."""
     side = np.linspace(0, 1, 11)
     points = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
     points = points[(np.abs(points - 0.5).max(axis=1)) == 0.5]
-    middle = np.full_like(points, 0.5)
-    hits = cast(WALLS, middle, points - middle)
-    assert (hits.wall >= 0).all()
-    assert hits.distance == pytest.approx(1)
+    for walls in (WALLS, (*WALLS, Wall("beyond", (-1, -1, 3), (3, 0, 0), (0, 3, 0))), WALLS[::-1]):
+        hits = cast(walls, np.full_like(points, 0.5), points - 0.5)
+        assert (hits.wall >= 0).all()
+        assert hits.distance == pytest.approx(1)
 
 
-def test_nearest_of_many_walls_wins_whatever_their_order() -> None:
-    rng = np.random.default_rng(3)
-    walls = [
-        Wall(str(i), *(tuple(v) for v in (rng.random(3), rng.uniform(-1, 1, 3), rng.uniform(-1, 1, 3))))
-        for i in range(8)
-    ]
-    origins, steps = rng.uniform(-1, 2, (900, 3)), rng.uniform(-1, 1, (900, 3))
-    hits, turned = cast(walls, origins, steps), cast(walls[::-1], origins, steps)
-    assert (np.where(hits.wall >= 0, 7 - hits.wall, -1) == turned.wall).all()
-    assert (hits.wall >= 0).sum() > 20
-    alone = np.min([cast([wall], origins, steps).distance for wall in walls], axis=0)
-    assert (hits.distance == alone).all()
+def test_blocks_stop_rays_as_the_twin_says() -> None:
+    block, rng = Block((0.2, 0.3, 0.1), (0.4, 0.3, 0.5)), np.random.default_rng(1)
+    boxes = np.array([(block.low, block.high)])
+    start, end = rng.random((2, 3000, 3))
+    twin = reference.blocked(
+        start, end, np.concatenate([boxes.mean(axis=1), np.array([block.size]) / 2], axis=1)
+    )
+    np.testing.assert_array_equal(clear((), start, end, boxes), ~twin)
+    # Its own faces are in front of it; a ray from the face outwards, along it or over the top passes.
+    hits = cast(block.faces(), start[twin], (end - start)[twin], boxes)
+    outside = ((start < block.low) | (start > block.high)).any(axis=1)[twin]
+    assert (hits.wall[outside] >= 0).all()
+    for place, aim in [
+        ((0.6, 0.4, 0.3), (1, 0.9, 0.9)),
+        ((0.6, 0.4, 0.3), (0.6, 0.9, 0.3)),
+        ((0, 0, 0.6), (1, 1, 0.6)),
+    ]:
+        assert clear((), np.array([place]), np.array(aim, float), boxes).all()
+    assert not clear((), np.array([[0.6, 0.4, 0.3]]), np.array([0.0, 0.4, 0.3]), boxes).any()
+    # A place on a ceiling is reached from its front only.
+    ceiling, floor = Wall("ceiling", (0, 0, 0.7), (1, 0, 0), (0, 1, 0)), start * (1, 1, 0)
+    assert clear([ceiling], floor, np.array([0.3, 0.4, 0.7])).all()
+    assert not clear([ceiling], floor, np.array([0.3, 0.4, 0.9])).any()
 
 
-def test_blocks_stop_rays() -> None:
-    block = np.array([[(0.4, 0.4, 0.2), (0.6, 0.6, 0.5)]])
-    origins = np.array([[0.5, 0.5, 1], [0.5, 0.5, 0.1], [0.1, 0.5, 1], [0.5, 0.5, 0.3], [0.4, 0.5, 1.0]])
-    down = np.broadcast_to([0.0, 0.0, -1.0], (5, 3))
-    hits = cast([FLOOR], origins, down, block)
-    assert hits.wall.tolist() == [-1, 0, 0, -1, 0]  # above, below, beside, inside, along a face
-    assert hits.distance == pytest.approx([0.5, 0.1, 1, 0, 1])
+def test_sight_is_in_the_frame_of_each_patch_and_keeps_to_shadows() -> None:
+    patches, place = cut(WALLS, 2), np.array([0.3, 0.6, 0.4])
+    seen = sight("camera", place, WALLS, patches)
+    assert (seen.share == 1).all()
+    away = place - patches.centre
+    back = np.einsum("nij,ni->nj", patches.frames, seen.towards)
+    assert back == pytest.approx(away / np.linalg.norm(away, axis=1)[:, None])
+    # A lamp at height 2 over x = 0, a plate at height 1 to x = 0.25: shadow to x = 0.5, half the patches.
+    plate = [[(-1, -1, 1), (0.25, 2, 1.001)]]
+    for n, expected in ((4, [0] * 8 + [1] * 8), (1, [0.5])):
+        assert sight("projector", (0, 0.5, 2), [FLOOR], cut([FLOOR], n), plate).share.tolist() == expected
 
 
-def test_wall_on_the_face_of_a_block_is_in_front_of_it() -> None:
-    block = Block(corner=(0.1, 0.2, 0.0), size=(0.3, 0.7, 0.3))
-    rng = np.random.default_rng(4)
-    origins = rng.uniform(-2, 3, (2000, 3))
-    origins = origins[~block.covers(origins)]
-    aims = rng.uniform(block.low, block.high, (len(origins), 3))
-    corners = np.array([(block.low, block.high)])
-    hits = cast(block.faces(), origins, aims - origins, corners)
-    assert (hits.wall >= 0).all()
-    alone = cast((), origins, aims - origins, corners)
-    assert hits.distance == pytest.approx(alone.distance)
-    away = cast(block.faces(), origins + hits.distance[:, None] * (aims - origins), origins - aims, corners)
-    assert np.isinf(away.distance).all()
+@pytest.mark.parametrize(
+    ("place", "part"),
+    [
+        ((0.5, 0.5, 0), r"projector is at \(0.5, 0.5, 0\), on the wall 'floor'"),
+        ((0.5, 0.5, -1), r"projector is at .*, where it faces none of 1 wall"),
+        ((3, 3, 3.5), r"projector is at \(3, 3, 3.5\), in a block"),
+        ((1, 2), r"projector is \(1, 2\); it must be three finite numbers"),
+        ("here", "projector is 'here'"),
+    ],
+)
+def test_bad_places_are_refused(place: Any, part: str) -> None:
+    with pytest.raises((InputError, InputTypeError), match=part):
+        sight("projector", place, [FLOOR], cut([FLOOR], 2), [[(2, 2, 2), (4, 4, 4)]])
 
 
-def test_places_on_surfaces_are_reached_from_their_front() -> None:
-    """A lamp that touches a ceiling, and one on top of a block: rounding must not hide them."""
-    rng = np.random.default_rng(0)
-    points = np.concatenate([rng.random((500, 2)), np.zeros((500, 1))], axis=1)
-    ceiling = Wall("ceiling", corner=(0, 0, 0.7), right=(1, 0, 0), down=(0, 1, 0))  # faces down
-    assert clear([ceiling], points, np.array([0.3, 0.4, 0.7])).all()
-    assert not clear([ceiling], points, np.array([0.3, 0.4, 0.9])).any()
-    block = np.array([[(0.2, 0.2, 0.1), (0.4, 0.4, 0.1 + 0.2)]])
-    top, above = np.array([0.3, 0.3, 0.1 + 0.2]), points + np.array([0, 0, 1])
-    assert clear((), above, top, block).all()
-    assert not clear((), points, top, block).any()
+def test_a_pinhole_shows_a_screen_as_it_is() -> None:
+    """Seen straight, one patch a pixel: drawing reproduces the picture inside a margin of 3 %."""
+    assert frame(Viewer((0.5, -3, 0.5), EYE.target), [SCREEN]).size == pytest.approx(
+        frame(EYE, [SCREEN]).size / 4
+    )
+    picture = np.random.default_rng(0).random((100, 100)).astype(np.float32)
+    image = draw(EYE, [SCREEN], picture, size=106, supersample=1)
+    assert image[3:-3, 3:-3] == pytest.approx(picture, abs=1e-4)
+    assert not np.concatenate([image[:3].ravel(), image[:, -3:].ravel()]).any()
+    fine = np.tile(np.array([[0, 1], [1, 0]], np.float32), (200, 200))
+    assert draw(EYE, [SCREEN], fine, 53, supersample=8)[4:-4, 4:-4] == pytest.approx(0.5, abs=0.02)
+    wide = np.broadcast_to(np.linspace(-1, 1, 300, dtype=np.float32), (100, 300))  # read: its sides are lost
+    inside = np.array([-0.75, -0.25, 0.25, 0.75]) / 3 / 1.06
+    assert read(EYE, [SCREEN], wide, grid=(4, 4))[0] == pytest.approx(inside, abs=0.005)
+    assert read(EYE, [SCREEN], wide.T, grid=(4, 4))[:, 0] == pytest.approx(inside, abs=0.005)
+
+
+@pytest.mark.parametrize("size", [61, 200, 333])
+def test_reading_undoes_drawing_of_smooth_pictures(size: int) -> None:
+    """Also seen at an angle and for any rounding of the image's height; negative values pass."""
+    oblique, (y, x) = Viewer(eye=(-0.4, -0.9, 0.8), target=(0.5, 1, 0.5)), np.mgrid[:16, :16] / 16
+    picture = np.stack([np.sin(3 * x) - 0.5, x * y, 1 - y], axis=-1).astype(np.float32)
+    seen = read(oblique, [SCREEN], draw(oblique, [SCREEN], picture, size, supersample=4), grid=(16, 16))
+    assert seen[1:-1, 1:-1] == pytest.approx(picture[1:-1, 1:-1], abs=0.02)
+
+
+@pytest.mark.parametrize("order", [(SCREEN, CARD), (CARD, SCREEN)])
+def test_the_nearest_wall_shows(order: tuple[Wall, Wall]) -> None:
+    """Whatever the order of the walls: the card covers half of the screen's width."""
+    picture = np.concatenate([np.full((4, 4), 5.0 if wall is CARD else 1.0) for wall in order], axis=1)
+    image = draw(EYE, order, picture, size=106, supersample=2)
+    assert (image == 5).sum() == pytest.approx(50**2, rel=0.05)
+    assert (image == 1).sum() == pytest.approx(100**2 - 50**2, rel=0.05)
+    black = draw(EYE, [SCREEN], np.ones((4, 4)), size=106, supersample=1, screens=[CARD])
+    assert not black[30:76, 30:76].any()
+
+
+def test_hidden_patches_read_nothing_and_partly_hidden_ones_what_shows() -> None:
+    image = np.zeros((106, 106, 3), np.float32)
+    image[:, 53:] = 1
+    for walls, screens in (([SCREEN], [CARD]), ([SCREEN, CARD], [])):
+        wall = read(EYE, walls, image, (8, 8 * len(walls)), screens)[:, :8]
+        assert not wall[2:6, 2:6].any()  # behind the card
+        assert wall[2:6, 6:] == pytest.approx(1)
+    coarse = read(EYE, [SCREEN], image, (2, 2), [CARD])  # a quarter of each patch is hidden
+    assert coarse[..., 0] == pytest.approx(np.array([[0, 1], [0, 1]]), abs=0.03)
+
+
+def test_a_block_hides_what_is_behind_it_and_seams_show_no_cracks(device) -> None:
+    scene = box(10, sides=3, occluder=Block((0.3, 0.35, 0), (0.35, 0.3, 0.5), albedo=0.6), device=device)
+    picture = scene.sample(np.ones((300, 300)))
+    floor, top, left = picture[:, 20:30], picture[:, -10:], picture[:, 40:50]
+    assert not floor[4:6, 4:6].any()  # under the block
+    assert not left.any()  # its face -x, seen from behind
+    assert floor[9] == pytest.approx(1)
+    assert top == pytest.approx(1)
+    slanted = trihedral(2, angle=60)
+    assert slanted.view(np.ones(slanted.grid), size=300)[60:240, 100:200].min() == 1
+
+
+@pytest.mark.parametrize(
+    ("eye", "target", "part"),
+    [
+        ((0.5, 2, 0.5), (0.5, 1, 0.5), "viewer at .* must face the viewer"),  # behind the screen
+        ((0.5, 0, 0.5), (0.5, -1, 0.5), "viewer at .* must face the viewer"),  # looks away
+        ((1, 1, 3), (1, 1, 0), "straight up or down"),
+    ],
+)
+def test_bad_viewers_are_refused(eye: Any, target: Any, part: str) -> None:
+    with pytest.raises(InputError, match=part):
+        frame(Viewer(eye, target), [SCREEN])

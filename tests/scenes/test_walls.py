@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Walls: geometry, the gathered matrix, and how albedos are spread or refused."""
+"""Walls, blocks and patches: places, order, how albedos are spread, and what is refused."""
 
 from __future__ import annotations
 
@@ -8,67 +8,73 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ltcl import checks
-from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.scenes.box import WALLS
-from ltcl.scenes.exchange.cube_tables import parallel, perpendicular
-from ltcl.scenes.walls import Wall, form_factors, spread_albedo
+from ltcl.errors import InputError, InputTypeError
+from ltcl.scenes import Block, cut
+from ltcl.scenes.builders import WALLS
+from ltcl.scenes.walls import Wall, refuse_crossing, spread_albedo
+
+FLOOR = WALLS[2]
+BLOCK = Block(corner=(0.2, 0.3, 0.1), size=(0.4, 0.3, 0.5))
 
 
-def centre(wall: Wall, n: int, row: int, column: int) -> np.ndarray:
-    right, down = np.array(wall.right, float), np.array(wall.down, float)
-    return np.array(wall.corner) + (column + 0.5) / n * right + (row + 0.5) / n * down
-
-
-def test_walls_are_the_six_faces_seen_from_inside() -> None:
+def test_walls_are_the_six_faces_seen_from_inside_and_unroll_seamlessly() -> None:
     for wall in WALLS:
-        middle = centre(wall, 1, 0, 0)
-        assert np.array([0.5, 0.5, 0.5]) - middle == pytest.approx(wall.normal / 2)
+        assert np.array([0.5, 0.5, 0.5]) - wall.outline.mean(axis=0) == pytest.approx(wall.normal / 2)
     assert len({tuple(wall.normal) for wall in WALLS}) == 6
-
-
-def test_upright_walls_unroll_seamlessly() -> None:
-    """left, right, near right, near left: each begins where the one before ends."""
     around = [WALLS[k] for k in (0, 1, 4, 5)]
     for wall, following in zip(around, around[1:] + around[:1], strict=True):
         assert np.add(wall.corner, wall.right).tolist() == list(following.corner)
 
 
-def test_wall_without_area_is_refused() -> None:
-    with pytest.raises(InputError, match=r"wall 'flat' .* no area"):
-        Wall("flat", corner=(0, 0, 0), right=(1, 0, 0), down=(2, 0, 0))
+def test_patches_lie_in_the_order_of_the_picture() -> None:
+    n, patches = 3, cut(WALLS, 3)
+    assert patches.area.sum() == pytest.approx(6)
+    for r, w, c in [(0, 0, 0), (2, 1, 0), (1, 5, 2)]:
+        wall, number = WALLS[w], r * len(WALLS) * n + w * n + c
+        right, down = np.array([wall.right, wall.down]) / n
+        np.testing.assert_allclose(patches.centre[number], wall.corner + (c + 0.5) * right + (r + 0.5) * down)
+        np.testing.assert_allclose(patches.normal[number], wall.normal)
+        np.testing.assert_allclose(patches.frames[number] @ patches.frames[number].T, np.eye(3), atol=1e-15)
 
 
-def test_every_entry_belongs_to_its_pair_of_patches() -> None:
-    """Offsets recomputed in space, from centres and normals, for random pairs."""
-    n, rng = 5, np.random.default_rng(3)
-    F, meeting, facing = form_factors(WALLS, n), perpendicular(n), parallel(n, gap=n)
-    for _ in range(300):
-        (a, r, c), (b, s, d) = rng.integers((6, n, n), size=(2, 3))
-        apart = np.abs(centre(WALLS[a], n, r, c) - centre(WALLS[b], n, s, d)) * n
-        across = np.abs(WALLS[a].normal) + np.abs(WALLS[b].normal) > 0
-        if a == b:
-            expected = 0.0
-        elif across.sum() == 1:
-            expected = facing[tuple(np.round(apart[~across]).astype(int))]
-        else:
-            p, q = np.round(apart[across] - 0.5).astype(int)
-            expected = meeting[round(apart[~across].item()), p, q]
-        assert F[r * 6 * n + a * n + c, s * 6 * n + b * n + d] == pytest.approx(expected, rel=1e-9)
+def test_faces_of_a_block_look_outwards_and_close_it() -> None:
+    middle, flux = (BLOCK.low + BLOCK.high) / 2, 0.0
+    for face in BLOCK.faces():
+        outwards = face.outline.mean(axis=0) - middle
+        np.testing.assert_allclose(np.cross(outwards, face.normal), 0, atol=1e-15)
+        assert outwards @ face.normal > 0
+        assert (np.abs(face.outline - middle) <= np.array(BLOCK.size) / 2 + 1e-12).all()
+        flux += face.area * (outwards + middle) @ face.normal / 3
+    assert flux == pytest.approx(0.4 * 0.3 * 0.5)  # the volume, by Gauss' theorem
+    assert all(face.down == pytest.approx((0, 0, -0.5)) for face in BLOCK.faces()[:4])  # they stand upright
 
 
-@pytest.mark.parametrize("n", [1, 3, 10])
-def test_closed_box_loses_no_light_and_is_reciprocal(n: int) -> None:
-    F = form_factors(WALLS, n)
-    assert F.sum(axis=1) == pytest.approx(np.ones(len(F)), abs=1e-10)
-    assert (F == F.T).all()  # equal areas: a_i F_ij = a_j F_ji
-    assert (F >= 0).all()
+def test_touching_walls_pass() -> None:
+    refuse_crossing(WALLS)
+    for corner, right, down in [
+        ((0.5, 0.2, 1), (0, 0.5, 0), (0, 0, -1)),  # stands on the floor
+        ((1.5, 0.2, 1), (0, 0.5, 0), (0, 0, -3)),  # cuts the plane, not the floor
+        ((0, 0, 0), (1, 0, 0), (0, 1, 0)),  # a floor with two sides
+        ((1, 0, 0), (0, 1, 0), (1, 0, 0)),  # beside it
+        ((0.5, 1, 0.5), (0.5, 0.5, 0), (0, 0, -1)),  # corner to corner
+    ]:
+        refuse_crossing([FLOOR, Wall("other", corner, right, down)])
 
 
-def test_form_factors_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "host_memory", lambda: 10**6)
-    with pytest.raises(MemoryLimitError, match="600 x 600 matrix of form factors needs"):
-        form_factors(WALLS, 10)
+@pytest.mark.parametrize(
+    ("wall", "what"),
+    [
+        (Wall("other", (0.5, 0.2, 1), (0, 0.5, 0), (0, 0, -1.01)), "cut through each other"),
+        (Wall("other", (0.5, 0.9, 0.1), (0, 0.5, 0), (0.1, 0, -1)), "cut through each other"),
+        (Wall("other", (-1, 0.5, -1), (3, 0.1, 3), (0, 0, -0.7)), "cut through each other"),
+        (Wall("other", (0.9, 0.9, 0), (0, 1, 0), (1, 0, 0)), "lie on top of each other"),
+        (Wall("other", (0.2, 0.2, 0), (0, 0.1, 0), (0.1, 0, 0)), "lie on top of each other"),
+    ],
+)
+def test_crossing_walls_are_refused(wall: Wall, what: str) -> None:
+    for pair in ([FLOOR, wall], [wall, FLOOR]):
+        with pytest.raises(InputError, match=f"'floor'.* {what}|'other'.* {what}"):
+            refuse_crossing(pair)
 
 
 COLOURS = np.array([(0.1, 0.2, 0.3), (0.4, 0.5, 0.6)])
@@ -83,38 +89,42 @@ COLOURS = np.array([(0.1, 0.2, 0.3), (0.4, 0.5, 0.6)])
         ([[0.1, 0.2, 0.3]], [[0.1, 0.1], [0.2, 0.2], [0.3, 0.3]]),
         ([[0.5], [0.25]], [[0.5, 0.25]]),
         (COLOURS, COLOURS.T),
-        (0, [[0.0, 0.0]]),
     ],
 )
 def test_albedo_is_spread_over_walls_and_colours(albedo: Any, expected: Any) -> None:
-    patches = spread_albedo(albedo, walls=2, n=3)
-    pictures = patches.reshape(-1, 3, 2, 3)  # (channels, row, wall, column)
+    pictures = spread_albedo(albedo, walls=2, n=3).reshape(-1, 3, 2, 3)  # (channels, row, wall, column)
     assert pictures.tolist() == np.broadcast_to(np.array(expected)[:, None, :, None], pictures.shape).tolist()
 
 
 @pytest.mark.parametrize(
-    ("albedo", "walls", "part"),
+    ("albedo", "part"),
     [
-        ([0.1, 0.2, 0.3], 3, r"one per wall, or one colour\? .* \(3, 1\) .* \(1, 3\)"),
-        ([0.1, 0.2], 3, r"shape \(2,\)"),
-        (np.zeros((2, 2)), 2, r"shape \(2, 2\)"),
-        (1.0, 2, r"outside \[0, 1\), the first 1;"),
-        ([0.5, -0.25], 2, "the first -0.25;"),
-        ([0.5, np.nan], 2, "albedo has 1 NaN"),
+        ([0.1, 0.2, 0.3], r"\(3, 1\) .* \(1, 3\)"),
+        ([0.1, 0.2], r"shape \(2,\)"),
+        (1.0, r"outside \[0, 1\), the first 1;"),
+        ([[0.5, -0.25, 0]], "the first -0.25;"),
+        ([[0.5], [np.nan], [0]], "albedo has 1 NaN"),
+        ("white", "albedo is"),
     ],
 )
-def test_bad_albedos_are_refused(albedo: Any, walls: int, part: str) -> None:
-    with pytest.raises(InputError, match=part):
-        spread_albedo(albedo, walls=walls, n=2)
+def test_bad_albedos_are_refused(albedo: Any, part: str) -> None:
+    with pytest.raises((InputError, InputTypeError), match=part):
+        spread_albedo(albedo, walls=3, n=2)
 
 
-def test_three_walls_take_an_explicit_shape() -> None:
-    mono = spread_albedo([[0.1], [0.2], [0.3]], walls=3, n=1)
-    colour = spread_albedo([[0.1, 0.2, 0.3]], walls=3, n=1)
-    assert mono.tolist() == [[0.1, 0.2, 0.3]]
-    assert colour.tolist() == [[0.1] * 3, [0.2] * 3, [0.3] * 3]
-
-
-def test_albedo_must_be_numbers() -> None:
-    with pytest.raises(InputTypeError, match="albedo is"):
-        spread_albedo("white", walls=2, n=2)
+@pytest.mark.parametrize(
+    ("make", "part"),
+    [
+        (lambda: Wall("flat", (0, 0, 0), (1, 0, 0), (2, 0, 0)), "wall 'flat' .* no area"),
+        (lambda: cut([], 2), "walls is empty"),
+        (lambda: cut(WALLS, 0), "n is 0"),
+        (lambda: Block((0, 0, 0), (0.1, 0, 0.1)), r"block size is \(0.1, 0.0, 0.1\)"),
+        (lambda: Block((0, float("nan"), 0), (1, 1, 1)), "block corner is .*three finite numbers"),
+        (lambda: Block("here", (1, 1, 1)), "block corner is 'here'"),  # pyright: ignore[reportArgumentType]
+        (lambda: Block((0, 0, 0), (1, 1, 1), albedo=1.0), r"outside \[0, 1\)"),
+        (lambda: Block((0, 0, 0), (1, 1, 1), albedo=(0.5, 0.5)), r"block albedo has shape \(2,\)"),
+    ],
+)
+def test_bad_walls_and_blocks_are_refused(make: Any, part: str) -> None:
+    with pytest.raises((InputError, InputTypeError), match=part):
+        make()

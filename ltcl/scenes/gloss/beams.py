@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Exchange of light fields between patches: G of A = K G (eq. 4), found by rays, reciprocal and lossless.
 
-A beam is a patch and a bin of directions over it (`directions`); beam i M + m of N patches and M
+A beam is a patch and a bin of directions over it (`brdf`); beam i M + m of N patches and M
 bins. All rays that leave beam a fall into beams b that point back, and the etendue E (area x projected
 solid angle) shared by two beams is the same from both ends:
 
@@ -29,9 +29,8 @@ import scipy.sparse
 import scipy.stats
 
 from ltcl import checks
-from ltcl.scenes.exchange.geometry import check_blocks
-from ltcl.scenes.gloss import directions as hemisphere
-from ltcl.scenes.patches import Patches, cut
+from ltcl.scenes.gloss import brdf
+from ltcl.scenes.patches import Patches, check_blocks, cut
 from ltcl.scenes.rays import cast
 from ltcl.scenes.walls import Wall
 
@@ -43,36 +42,20 @@ _BYTES = 60  # a ray takes at worst, with an entry of its own in E and in what E
 def exchange(
     walls: Sequence[Wall], n: int, directions: int, rays: int, blocks: Any = (), seed: int = 0
 ) -> scipy.sparse.csr_array:
-    """Light that beams get from beams, (N M, N M): incoming radiance = G outgoing radiance.
+    """Light that beams get from beams, (N M, N M), N = n * n * len(walls): incoming = G outgoing radiance.
 
-    Parameters
-    ----------
-    walls : sequence of Wall
-        Of any size and place; N = n * n * len(walls).
-    n, directions : int
-        Patches along each side of a wall; M, a square number.
-    rays : int
-        Followed from each beam.
-    blocks : array_like, (B, 2, 3)
-        Opaque boxes along the axes, lowest and highest corner.
-    seed : int
-        Of the rays' places.
-
-    Raises
-    ------
-    InputError
-        If a number is out of range.
-    MemoryLimitError
-        If so many rays do not fit in the memory of the host.
+    M `directions` are a square number, `rays` are followed from each beam past boxes (B, 2, 3) along the
+    axes, from places that `seed` decides. InputError: a number is out of range. MemoryLimitError: so many
+    rays do not fit in the memory of the host.
 
     Examples
     --------
-    >>> from ltcl.scenes.box import WALLS
+    >>> from ltcl.scenes.builders import WALLS
     >>> G = exchange(WALLS, 2, directions=16, rays=16)
     >>> G.shape, bool(np.allclose(G.sum(axis=1), 1))  # a closed room
     ((384, 384), True)
     """
-    k, rays = hemisphere.side(directions), checks.count("rays", rays)
+    k, rays = brdf.side(directions), checks.count("rays", rays)
     seed, boxes = checks.count("seed", seed, least=0), check_blocks(blocks)
     patches = cut(walls, n)
     beams = len(patches) * k * k
@@ -110,7 +93,7 @@ def _met(
     u, v = places[..., :1] - 0.5, places[..., 1:2] - 0.5
     right, down, centre = (getattr(patches, edge)[some, None, None] for edge in ("right", "down", "centre"))
     origins = (centre + u * right + v * down).reshape(-1, 3)
-    vectors = hemisphere.from_square(places[..., 2:]).reshape(len(some), -1, 3) @ axes[some]
+    vectors = brdf.from_square(places[..., 2:]).reshape(len(some), -1, 3) @ axes[some]
     vectors = vectors.reshape(-1, 3)
     hits = cast(walls, origins, vectors, blocks)
     good = np.flatnonzero(hits.wall >= 0)
@@ -118,7 +101,7 @@ def _met(
     there = row * (n * len(walls)) + hits.wall[good] * n + column
     back = np.einsum("rij,rj->ri", axes[there], -vectors[good])
     sent = some[good // (bins * rays)] * bins + good // rays % bins
-    got = there * bins + hemisphere.bins(back, k)
+    got = there * bins + brdf.bins(back, k)
     size = len(patches) * bins
     return scipy.sparse.csr_array((np.ones(len(good)), (sent, got)), shape=(size, size))
 

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How solves converge, what an analysis says, and the contact sheet of the demo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ltcl import checks
+from ltcl.analysis import Analysis
+from ltcl.errors import InputError
+from ltcl.images import resize, to_srgb
+from ltcl.plots.page import COLOURS, FAINT, GRID, INK, OTHERS, PAPER, axes_at, figure_of, heading, label_at
+from ltcl.solvers import Solution
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LOWEST = 1e-8  # of a residual worth drawing: float32 products end above
+_WIDTH, _MARGIN, _GAP, _TOP = 1600, 40, 26, 164  # of the contact sheet, in pixels
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A linear picture (h, w, 3), cut off beyond 0 and 1, with a label on its left shoulder and a note."""
+
+    label: str
+    note: str
+    image: np.ndarray = field(repr=False)
+
+
+def convergence(solutions: Mapping[str, Solution], rtol: float, title: str = "Convergence") -> Figure:
+    """Relative residual of several solves of one system against the products they took.
+
+    Solve with ``throw=False``, so that a divergence shows as well. A direct solve becomes a level line.
+    InputError: there is nothing to draw, or rtol is outside (0, 1).
+
+    Examples
+    --------
+    >>> import ltcl
+    >>> S, b = [[1.0, 0.5], [0.5, 1.0]], [1.0, 0.0]
+    >>> figure = convergence({m: ltcl.solve(S, b, m) for m in ("jacobi", "richardson")}, rtol=1e-2)
+    >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    ['jacobi', 'richardson', 'tolerance']
+    """
+    figure = figure_of(900, 560)
+    heading(figure, 34, 26, title, 17)
+    _draw_convergence(figure.add_axes((0.09, 0.13, 0.73, 0.72)), solutions, rtol)
+    return figure
+
+
+def analysis(found: Mapping[str, Analysis]) -> Figure:
+    """Bounds on rho(R) of every transport by name, per channel, and its forecast per method.
+
+    Left the interval that holds rho(R), with the 1 beyond which the paper's series diverges; right the
+    products of each method, where there is a forecast. InputError: there is nothing to draw.
+
+    Examples
+    --------
+    >>> import ltcl
+    >>> T = ltcl.scenes.box(3, albedo=0.8).transport()
+    >>> figure = analysis({"room": ltcl.analyze(T)})
+    >>> [axes.get_title("left") for axes in figure.axes]
+    ['spectral radius of R', 'products to 1 %']
+    """
+    if not found:
+        raise InputError("found is empty; there must be at least one analysis to draw")
+    channels = {
+        name + (f" {colour}" if len(one.channels) == 3 else ""): channel
+        for name, one in found.items()
+        for colour, channel in zip(("red", "green", "blue"), one.channels, strict=False)
+    }
+    figure = figure_of(1300, 330 + 46 * len(channels))
+    heading(figure, 34, 26, "Before solving", 17)
+    left, right = figure.add_axes((0.16, 0.2, 0.33, 0.58)), figure.add_axes((0.58, 0.2, 0.38, 0.58))
+    labels = "rho(R), between its bounds", "products with S, sweeps of Gauss-Seidel"
+    titles = "spectral radius of R", f"products to {100 * next(iter(found.values())).rtol:g} %"
+    for axes, title, label in zip((left, right), titles, labels, strict=True):
+        _dress(axes, label)
+        axes.set_title(title, color=INK, fontsize=13, loc="left", fontweight="bold")
+
+    limit = 1.6 * max(1.0, *(channel.spectral_radius for channel in channels.values()))
+    for row, channel in enumerate(channels.values()):
+        lower, upper = channel.spectral_radius_bounds
+        upper = upper if math.isfinite(upper) else channel.spectral_radius
+        left.barh(row, upper - lower, 0.2, lower, color=COLOURS["chebyshev"], alpha=0.6)
+        left.plot([channel.spectral_radius], [row], "|", color=INK, ms=16, mew=2)
+        certificate = channel.spectral_radius_certificate
+        left.text(limit, row, certificate, color=FAINT, fontsize=9, ha="right", va="center")
+    left.axvline(1.0, color=COLOURS["jacobi"], lw=1.2, ls=(0, (4, 4)))
+    left.set(xlim=(0, limit), ylim=(len(channels) - 0.4, -0.6))
+    left.set_yticks(range(len(channels)), list(channels))
+
+    methods = list(next(iter(channels.values())).products)
+    height, colours = 0.8 / len(channels), _colours(methods)
+    for row, channel in enumerate(channels.values()):
+        for place, name in enumerate(methods):
+            n, y = channel.products[name], place - 0.4 + (row + 0.5) * height
+            bar = right.barh(y, n if math.isfinite(n) else 0, 0.85 * height, color=colours[name])
+            count = f"{n:g}" if math.isfinite(n) else "diverges" if n > 0 else "no forecast"
+            size = float(np.clip(60 * height, 6, 11))
+            right.bar_label(bar, [f"  {count}"], color=FAINT, fontsize=size)
+    right.margins(x=0.25)
+    right.set_ylim(len(methods) - 0.4, -0.6)
+    right.set_yticks(range(len(methods)), methods)
+    return figure
+
+
+def contact_sheet(
+    title: str,
+    subtitle: str,
+    rows: Sequence[Sequence[Panel]],
+    plot: tuple[str, Mapping[str, Solution], float],
+) -> Figure:
+    """A dark page with three rows of panels, large, medium and small, and a plot at the end of the second.
+
+    `plot` holds title, solutions and tolerance of that convergence plot.
+    """
+    inner, small = _WIDTH - 2 * _MARGIN, len(rows[2])
+    widths = (inner - 2 * _GAP) // 3, round(0.236 * inner), (inner - (small - 1) * _GAP) // max(1, small)
+    heights = [
+        round(max((w * panel.image.shape[0] / panel.image.shape[1] for panel in row), default=0))
+        for row, w in zip(rows, widths, strict=True)
+    ]
+    tops = [_TOP, _TOP + heights[0] + 74, _TOP + heights[0] + heights[1] + 148]
+    figure = figure_of(_WIDTH, tops[2] + heights[2] + 30)
+    heading(figure, _MARGIN, 32, title, 26)
+    label_at(figure, _MARGIN, 82, subtitle, size=15, color=FAINT)
+    for row, w, top in zip(rows, widths, tops, strict=True):
+        for place, panel in enumerate(row):
+            _draw_panel(figure, panel, _MARGIN + place * (w + _GAP), top, w)
+    left = _MARGIN + len(rows[1]) * (widths[1] + _GAP) + 70
+    label_at(figure, left, tops[1] - 10, plot[0], size=13.5, fontweight="bold", va="bottom")
+    axes = axes_at(figure, (left, tops[1], _WIDTH - _MARGIN - left - 128, heights[1] - 50))
+    _draw_convergence(axes, *plot[1:])
+    return figure
+
+
+def _draw_panel(figure: Figure, panel: Panel, left: int, top: int, width: int) -> None:
+    height = round(width * panel.image.shape[0] / panel.image.shape[1])
+    size, line = 17 if width > 400 else 13.5, top - 10
+    label_at(figure, left, line, panel.label, size=size, fontweight="bold", va="bottom")
+    # Pictures rarely fill their corners: the note keeps away from the next panel's label.
+    right = left + 0.96 * width
+    label_at(figure, right, line, panel.note, size=size - 1, color=FAINT, va="bottom", ha="right")
+    # Black, as beside the walls of a view, is the page.
+    paper = np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    shown = to_srgb(np.clip(resize(panel.image, (height, width)), 0, 1))
+    shown = np.where(shown.max(axis=-1, keepdims=True) > 0, shown, paper)
+    axes = axes_at(figure, (left, top, width, height))
+    axes.imshow(np.rint(255 * shown).astype(np.uint8), interpolation="none", aspect="auto")
+    axes.axis("off")
+
+
+def _draw_convergence(axes: Axes, solutions: Mapping[str, Solution], rtol: float) -> None:
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
+    checks.number("rtol", rtol, above=0.0, below=1.0)
+    if not solutions:
+        raise InputError("solutions is empty; there must be at least one to draw")
+    _dress(axes, "products with S")
+    axes.set_ylabel("relative residual", color=FAINT, fontsize=12, labelpad=6)
+    products = max([1, *(solution.products for solution in solutions.values())])
+    colours, lowest, highest = _colours(solutions), rtol, 1.0
+    for name, solution in solutions.items():
+        y = np.array([value for value in solution.residuals if np.isfinite(value)] or [1.0])
+        x = np.linspace(0, max(solution.products, 1), len(y))
+        if solution.method == "direct":
+            x, y = np.array([0, products]), np.full(2, solution.residual)
+        y = np.maximum(y, _LOWEST)
+        lowest, highest = min(lowest, float(y.min())), max(highest, float(y.max()))
+        label = name if solution.residual >= _LOWEST else f"{name} \u2193"
+        # Neumann runs on top of Jacobi, which must stay visible.
+        style = (0, (2, 2)) if name == "neumann" else "-"
+        axes.plot(x, y, color=colours[name], lw=2.6, ls=style, clip_on=False, label=label)
+    axes.plot([0, products], [rtol, rtol], color=FAINT, lw=1.2, ls=(0, (4, 4)), label="tolerance")
+    axes.set(yscale="log", xlim=(0, products), ylim=(lowest / 2, 2 * highest))
+    axes.grid(color=GRID, lw=1)
+    axes.yaxis.set_major_locator(LogLocator(10, numticks=8))
+    axes.minorticks_off()
+    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    axes.legend(
+        loc="upper left", bbox_to_anchor=(1.0, 1.03), frameon=False, labelcolor="linecolor", fontsize=11
+    )
+
+
+def _dress(axes: Axes, label: str) -> None:
+    axes.set_facecolor(PAPER)
+    axes.set_xlabel(label, color=FAINT, fontsize=12, labelpad=6)
+    axes.grid(color=GRID, lw=1, axis="x")
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=FAINT, labelsize=11, length=0, pad=7)
+    axes.spines[:].set_visible(False)
+
+
+def _colours(names: Sequence[str] | Mapping[str, object]) -> dict[str, str]:
+    others = iter(OTHERS * (1 + len(names)))
+    return {name: COLOURS.get(name) or next(others) for name in names}

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Damaged, lying and foreign picture files give one clear line: no crash, no print, no huge allocation."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import sys
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ltcl import images
+from ltcl.errors import FileError, LtclError
+
+KINDS = [(".png", 8), (".png", 16), (".jpg", 8), (".bmp", 8), (".tif", 8), (".tif", 16), (".tif", 32)]
+KINDS += [(".exr", 16), (".exr", 32)]
+SUFFIXES = [".png", ".jpg", ".tif", ".bmp", ".exr"]
+MUTANTS = 60
+
+
+def good(folder: Path, suffix: str, bits: int | None = None, shape: tuple[int, ...] = (20, 30, 3)) -> bytes:
+    images.write(folder / f"good{suffix}", np.linspace(0, 1, int(np.prod(shape))).reshape(shape), bits=bits)
+    return (folder / f"good{suffix}").read_bytes()
+
+
+def refusal(path: Path, data: bytes) -> str:
+    """Message of the FileError that reading `data` gives."""
+    path.write_bytes(data)
+    with pytest.raises(FileError) as error:
+        images.read(path)
+    text = str(error.value)
+    assert text.startswith(f"{path}: ")
+    assert "\n" not in text
+    return text
+
+
+def mutant(data: bytes, random: np.random.Generator) -> bytes:
+    """`data` cut off, with bytes appended, or with up to three bytes changed, more often near its begin."""
+    changed, kind = bytearray(data), random.random()
+    if kind < 0.25:
+        return data[: random.integers(1, len(data))]
+    if kind < 0.35:
+        return data + random.bytes(int(random.integers(1, 100)))
+    for _ in range(random.integers(1, 4)):
+        changed[random.integers(min(len(data), 400 if kind < 0.7 else len(data)))] = random.integers(256)
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(("suffix", "bits"), KINDS)
+@pytest.mark.parametrize("shape", [(20, 30, 3), (20, 30)])
+def test_a_mutant_gives_a_picture_or_one_line_that_names_it(tmp_path, capfd, suffix, bits, shape):
+    data, path = good(tmp_path, suffix, bits, shape), tmp_path / f"bad{suffix}"
+    random, refused = np.random.default_rng(3), 0
+    for _ in range(MUTANTS):
+        path.write_bytes(mutant(data, random))
+        try:
+            picture = images.read(path)
+        except LtclError as error:
+            message, refused = str(error), refused + 1
+            assert message.startswith(f"{path}: ")
+            assert "\n" not in message
+        else:
+            assert picture.dtype == np.float32
+            assert np.isfinite(picture).all()
+    assert refused > MUTANTS / 10
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert suffix == ".exr" or err == ""  # OpenEXR itself writes of damaged pixels, and cannot be told not to
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_truncated_files_and_any_flip_in_a_png_are_refused(tmp_path, suffix):
+    data, path = good(tmp_path, suffix), tmp_path / f"bad{suffix}"
+    for share in (0.02, 0.3, 0.5, 0.9, 0.99):
+        refusal(path, data[: int(len(data) * share)])
+    for place in np.linspace(0, len(data) - 5, 60).astype(int) if suffix == ".png" else ():
+        refusal(path, data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :])
+
+
+def resized(suffix: str, data: bytes, h: int, w: int) -> bytes:
+    """`data` with a header that declares (h, w), all checksums correct."""
+    changed = bytearray(data)
+    if suffix == ".png":
+        changed[16:24] = struct.pack(">II", w, h)
+        changed[29:33] = struct.pack(">I", zlib.crc32(changed[12:29]))
+    elif suffix == ".jpg":
+        place = data.index(b"\xff\xc0")
+        changed[place + 5 : place + 9] = struct.pack(">HH", min(h, 65535), min(w, 65535))
+    elif suffix == ".bmp":
+        changed[18:26] = struct.pack("<ii", w, h)
+    elif suffix == ".tif":
+        for tag, value in ((256, w), (257, h)):
+            for kind in (3, 4):  # stored as SHORT or LONG; becomes LONG
+                place = data.find(struct.pack("<HHI", tag, kind, 1))
+                if place >= 0:
+                    changed[place : place + 12] = struct.pack("<HHII", tag, 4, 1, value)
+    else:
+        for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+            place = data.index(name) + len(name) + 4
+            changed[place : place + 16] = struct.pack("<4i", 0, 0, w - 1, h - 1)
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (60000, 60000), (30000, 30000), (0, 5)])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_absurd_sizes_are_refused_before_decoding(tmp_path, capfd, suffix, size):
+    refusal(tmp_path / f"bad{suffix}", resized(suffix, good(tmp_path, suffix), *size))
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_no_picture_is_refused(tmp_path, capfd, suffix):
+    path = tmp_path / f"bad{suffix}"
+    for data in (
+        b"a letter, no picture; " * 30,
+        b"\x89PNG\r\n\x1a\n",
+        b"\x76\x2f\x31\x01\x02\0\0\0",
+        b"II*\0",
+    ):
+        refusal(path, data)
+    assert "empty" in refusal(path, b"")
+    path.unlink()
+    with pytest.raises(FileError, match="no such file"):
+        images.read(path)
+    path.mkdir()
+    with pytest.raises(FileError, match="folder"):
+        images.read(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_threads_leave_stdout_and_the_log_level_as_they_were(tmp_path):
+    paths = [tmp_path / f"bad{number}{suffix}" for suffix in SUFFIXES for number in range(8)]
+    for path in paths:
+        data = good(tmp_path, path.suffix)
+        path.write_bytes(data[: len(data) // 2] if path.stem.endswith("1") else data)
+
+    def shape(path: Path) -> tuple[int, ...]:
+        with contextlib.suppress(FileError):
+            return images.read(path).shape
+        return ()
+
+    before = sys.stdout, os.fstat(2).st_ino, cv2.utils.logging.getLogLevel()
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(shape, paths)) == [() if "bad1" in path.stem else (20, 30, 3) for path in paths]
+    assert (sys.stdout, os.fstat(2).st_ino, cv2.utils.logging.getLogLevel()) == before
+
+
+def png(data: bytes, depth: int = 8) -> bytes:
+    """One of 4 x 3 pixels whose checksums are right, whatever is in it."""
+    head = struct.pack(">IIBBBBB", 4, 3, depth, 0, 0, 0, 0)
+    chunks = [b"IHDR" + head, b"IDAT" + data, b"IEND"]
+    sealed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(sealed)
+
+
+ROWS = b"\0abcd" * 3
+WRONG = [
+    b"nothing that zlib wrote",
+    zlib.compress(b"\x09" + ROWS[1:]),
+    zlib.compress(ROWS[:7]),
+]  # 9 is no filter
+
+
+@pytest.mark.parametrize("data", [*map(png, WRONG), png(zlib.compress(ROWS), depth=7)])
+def test_a_png_with_right_checksums_and_wrong_contents_is_refused(tmp_path, capfd, data):
+    refusal(tmp_path / "a.png", data)
+    assert capfd.readouterr().err == ""

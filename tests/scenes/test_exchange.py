@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Exact form factors: closed forms at right angles, closed rooms, parts and wholes, sampling, limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ltcl import checks
+from ltcl.errors import MemoryLimitError
+from ltcl.scenes import cut
+from ltcl.scenes.builders import WALLS
+from ltcl.scenes.exchange import form_factors, of_pairs, of_walls
+from ltcl.scenes.walls import Vector, Wall
+from tests.scenes.closed_forms import closed_room, parallel, perpendicular, sampled, slope
+
+FLOOR = WALLS[2]
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_faces_of_the_cube_meet_the_closed_forms(n: int) -> None:
+    """All pairs of all walls, which touch along an edge, at a corner, or lie apart."""
+    patches, meeting, facing = cut(WALLS, n), perpendicular(n), parallel(n, n)
+    F = form_factors(WALLS, n)
+    apart = np.abs(patches.centre[:, None] - patches.centre) * n
+    across = (np.abs(patches.normal[:, None]) + np.abs(patches.normal)) > 0.5
+    for i, j in np.random.default_rng(0).integers(len(F), size=(300, 2)):
+        along, away = apart[i, j][~across[i, j]], apart[i, j][across[i, j]]
+        if len(along) == 2:
+            expected = facing[tuple(np.round(along).astype(int))] if away[0] > 0.5 else 0.0
+        else:
+            expected = meeting[(round(along.item()), *np.round(away - 0.5).astype(int))]
+        assert F[i, j] == pytest.approx(expected, rel=1e-9, abs=1e-15)
+
+
+@pytest.mark.parametrize("angle", [1, 20, 60, 89.999, 135, 179])
+def test_coarse_patches_average_fine_ones(angle: float) -> None:
+    """6 x 6 patches add up to 2 x 2 and to whole walls, though other formulas serve other pairs."""
+    fine = of_walls(slope(angle), FLOOR, 6)
+    coarse = fine.reshape(2, 3, 2, 3, 2, 3, 2, 3).sum(axis=(1, 3, 5, 7))
+    np.testing.assert_allclose(coarse, of_walls(slope(angle), FLOOR, 2), rtol=1e-7)
+    np.testing.assert_allclose(fine.sum(), of_walls(slope(angle), FLOOR, 1).item(), rtol=1e-7)
+
+
+def test_far_entries_fall_as_they_must() -> None:
+    """Along the seam F falls as d^-4: p q / (pi d^4) at p = q = 1/2."""
+    table = of_walls(WALLS[0], WALLS[1], 60)[0, -1, :, 0] * 60**2
+    far = np.array([40, 50, 59])
+    np.testing.assert_allclose(table[far] * far**4, 0.25 / np.pi, rtol=5e-3)
+
+
+TEN_TIMES = [X, (0, 0.1, 0), (0.1, 0, 1)]  # patches ten times as long as wide
+NARROW = [X, (float(np.cos(np.radians(8))), float(np.sin(np.radians(8))), 0.0), Z]
+
+
+@pytest.mark.parametrize("edges", [[X, (0.5, 0.8, 0), (0.3, 0.2, 0.9)], NARROW, TEN_TIMES, [X, Y, Z]])
+@pytest.mark.parametrize("n", [1, 4, 9])
+def test_closed_rooms_lose_no_light(edges: list[Vector], n: int) -> None:
+    walls = closed_room(*edges)
+    F, area = form_factors(walls, n), cut(walls, n).area
+    np.testing.assert_allclose(F.sum(axis=1), 1, rtol=1e-7 if edges[-1] != Z else 1e-9)
+    assert F.min() >= 0
+    np.testing.assert_allclose(area[:, None] * F, (area[:, None] * F).T, rtol=1e-14)
+    if n < 9:  # pairs of a list take outlines, however far: the same
+        i, j = np.nonzero(F)
+        np.testing.assert_allclose(of_pairs(cut(walls, n), i, j), F[i, j], rtol=1e-6, atol=1e-12)
+
+
+# No edge in common with the others, cut by their planes and not square.
+SCREEN = Wall("screen", (0.2, 0.3, 0.9), (0.3, 0.5, -0.2), (0.1, -0.1, -0.6))
+
+
+@pytest.mark.parametrize(
+    "walls", [(slope(30), FLOOR), (slope(120), FLOOR), (SCREEN, FLOOR), (SCREEN, WALLS[5])]
+)
+def test_walls_at_any_angle_agree_with_sampling(walls: tuple[Wall, Wall]) -> None:
+    mean, error = sampled(*walls, samples=400_000)
+    assert of_walls(*walls, 2).sum() == pytest.approx(mean, abs=5 * error)
+
+
+def test_a_long_wedge_takes_what_its_opening_lets_go() -> None:
+    """Strips of infinite length that share an edge: F = 1 - sin(angle / 2); the ends take 1 / length."""
+    for angle in (20, 60, 90, 150):
+        parts = []
+        for length in (200.0, 400.0):
+            floor = Wall("floor", FLOOR.corner, (0.0, length, 0.0), FLOOR.down)
+            parts.append(of_walls(slope(angle, width=length), floor, 1).item() / length)
+        assert 2 * parts[1] - parts[0] == pytest.approx(1 - np.sin(np.radians(angle / 2)), abs=2e-4)
+
+
+def test_walls_that_face_away_exchange_nothing_and_others_what_is_in_front() -> None:
+    back = Wall("back", corner=(0, 0, 0.5), right=(1, 0, 0), down=(0, 1, 0))  # looks down
+    above = Wall("above", corner=(0, 0, 1), right=(0, 1, 0), down=(1, 0, 0))  # looks up
+    assert of_walls(back, FLOOR, 2).min() > 0
+    for pair in ((above, FLOOR), (above, back), (FLOOR, Wall("next", (1, 0, 0), (0, 1, 0), (1, 0, 0)))):
+        assert not of_walls(*pair, 3).any()
+    # A wall in the middle of a row of patches: the part of the floor beyond shows to neither.
+    across = Wall("across", corner=(0.3, 0, 1), right=(0, 1, 0), down=(0, 0, -1))  # looks along +x
+    front = Wall("front", corner=(0.3, 0, 0), right=(0, 1, 0), down=(0.7, 0, 0))
+    light = of_walls(across, FLOOR, 5)
+    assert light.sum() == pytest.approx(of_walls(across, front, 1).item(), rel=1e-9)
+    assert not light[:, :, 0].any()  # behind
+    assert light[:, :, 1].min() > 0  # cut
+
+
+def test_too_many_patches_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "host_memory", lambda: 8 * 18**2 - 1)
+    with pytest.raises(MemoryLimitError, match="18 x 18"):
+        form_factors((slope(50), FLOOR), 3)

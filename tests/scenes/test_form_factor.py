@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Bounces that store no matrix, and rays past boxes: against their twins, exact matrices and in solves."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl.device import Device
+from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.operators import IdentityPlus
+from ltcl.scenes import Block, CornerRows, FormFactor, Patches, box, cut, dihedral, visibility
+from ltcl.scenes.builders import WALLS
+from ltcl.scenes.exchange import form_factors
+from ltcl.scenes.visibility import Rays
+from ltcl.scenes.walls import Wall
+from tests import gallery, reference
+from tests.operators import helpers
+from tests.scenes.closed_forms import closed_room
+
+BLOCK = [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
+TABLE = Block((0.25, 0.25, 0.0), (0.5, 0.25, 0.5), albedo=0.5)
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def launched(request: pytest.FixtureRequest, device: Device, monkeypatch: pytest.MonkeyPatch) -> Device:
+    """The device as it launches here, and as GPUs do: one patch a lane in place of eight."""
+    monkeypatch.setattr(Device, "is_cpu", property(lambda _: request.param == "cpu"))
+    return device
+
+
+def tiles(count: int) -> Patches:
+    """Parallelograms of many sizes around a middle, most of which see each other."""
+    rng = np.random.default_rng(count)
+    out = rng.normal(size=(count, 3))
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    right = np.cross(out, rng.normal(size=(count, 3)))
+    scale = rng.uniform(0.02, 0.1, (count, 1))
+    return Patches(3 * out, scale * right, scale * (np.cross(right, out) + 0.3 * right))
+
+
+# A patch on the floor, and one 20 sizes away that stands half below its plane: both see but a part.
+ASTRIDE = Patches(
+    np.eye(3)[[0, 0]] * [[0], [20]] + [[0, 0, 0], [0, 0, 0.1]], np.eye(3)[:2], np.eye(3)[[1, 2]] * [[-1], [1]]
+)
+SCENES = {
+    "astride a plane": (ASTRIDE, None),
+    "1 patch": (cut(WALLS[:1], 1), None),
+    "2 patches": (cut(WALLS[:2], 1), None),
+    "53 tiles": (tiles(53), None),
+    "room": (cut(WALLS, 3), None),
+    "tiles around a block": (tiles(23), [[(-1, -1, -1), (1, 1, 1)]]),
+    "two blocks": (cut(WALLS, 3), [*BLOCK, [(0.4, 0.6, 0.2), (0.6, 0.7, 0.9)]]),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_products_meet_their_twin(launched, name):
+    patches, blocks = SCENES[name]
+    albedo = np.linspace(0.2, 0.9, len(patches))
+    A = FormFactor(patches, albedo, blocks, launched)
+    G = reference.form_factor_entries(
+        A._geometry.get()[:, : len(patches)], A._blocks.get()[: len(blocks or ())]
+    )
+    kernel, near = albedo[:, None] * G * A._area.get().astype(np.float64), A._near.to_dense()
+    matrix, dense = kernel + near, A.to_dense()
+    # An entry is some 30 roundings; corrections cancel kernel values, which then count with their size.
+    size = np.abs(kernel) + np.abs(near) + np.abs(matrix)
+    off = np.abs(dense - matrix) > 1e-4 * size
+    if blocks is not None:  # a ray that grazes a block counts either way
+        assert np.count_nonzero(off) <= 0.01 * off.size
+        matrix = dense
+    for k in helpers.COLUMNS if name == "53 tiles" else (None, 5):
+        x, y = gallery.vectors(len(patches), k), gallery.vectors(len(patches), k, 2)
+        for apply, twin, bound in ((A.apply, matrix, size), (A.apply_transpose, matrix.T, size.T)):
+            out = apply(launched.upload(x), None, scale=-0.75, add=launched.upload(y)).get()
+            error = 32 * reference.product_error(bound, x, -0.75, y)
+            helpers.close(out, reference.dense_matvec(twin, x, -0.75, y), error)
+
+
+def wing(angle: float) -> Wall:
+    """A wall that rises from the edge of the floor along y, `angle` degrees from the floor."""
+    turn = np.radians(angle)
+    return Wall("wing", corner=(0, 0, 0), right=(float(np.cos(turn)), 0, float(np.sin(turn))), down=(0, 1, 0))
+
+
+def smooth(patches: Patches) -> np.ndarray:
+    """Three smooth pictures, (N, 3)."""
+    x, y, z = patches.centre.T
+    return np.stack([np.ones_like(x), 1 + np.sin(3 * x + 1) * np.cos(2 * y) + z, z**2], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("walls", "n"),
+    [(WALLS, 1), (WALLS, 8), (WALLS[:3], 8), (WALLS[:2], 20)]
+    + [((wing(angle), WALLS[2]), 12) for angle in (30, 70, 130)]
+    + [(closed_room((1000.0, 0, 0), (0, 1000.0, 0), (700.0, 0, 700.0)), 6)],
+)
+def test_products_are_those_of_the_exact_matrix(device, walls, n):
+    """F x within 1e-4 of the largest value for smooth x; F within `error` where areas are equal."""
+    patches, F = cut(walls, n), form_factors(walls, n)
+    A, x = FormFactor(patches, device=device), smooth(cut(walls, n))
+    np.testing.assert_array_less(np.abs(A @ x - F @ x).max(axis=0), 1e-4 * (F @ x).max(axis=0))
+    if np.ptp(patches.area) < 1e-9 * patches.area.max():
+        assert np.linalg.norm(A.to_dense() - F, 2) <= A.error == 1e-4
+    assert not A.diagonal().any()
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        Block((0.31, 0.23, 0), (0.37, 0.29, 0.43), albedo=0.5),  # on the floor, faces cut patches
+        Block((0.25, 0.25, 0.25), (0.5, 0.5, 0.25), albedo=(0.5, 0.3, 0.2)),  # faces between patches
+        Block((0, 0.4, 0), (0.3, 0.6, 0.7), albedo=0.5),  # in a corner
+        None,
+    ],
+)
+def test_a_scene_gives_its_operators(device, block):
+    """Against exact form factors times 256 rays a pair: 1.5 % of the norm, and light through them as good."""
+    room = box(8, albedo=0.5, occluder=block, device=device)
+    l_d = np.random.default_rng(2).random(len(room.area))
+    matrices = room.A if room.channels == 3 else (room.A,)
+    for A, dense in zip(FormFactor.of(room, device), matrices, strict=True):
+        assert np.linalg.norm(A.to_dense() - dense) < (0.015 if block else 1e-4) * np.linalg.norm(dense)
+        assert A.row_sums().max() < 0.51
+        light = ltcl.solve(IdentityPlus(A, sign=-1), l_d, rtol=1e-4).x
+        expected = np.linalg.solve(np.eye(len(l_d)) - dense, l_d)
+        assert np.linalg.norm(light - expected) < 0.01 * np.linalg.norm(expected)
+    with pytest.raises(InputError, match=r"scene has walls of 1 x 4 patches; they must be n x n"):
+        FormFactor.of(dataclasses.replace(dihedral(2), grid=(1, 8)), device)
+
+
+def test_launches_in_slabs_give_the_same(device, monkeypatch):
+    patches, blocks = cut(WALLS, 3), np.array(BLOCK)
+    A, x = FormFactor(patches, 0.5, device=device), device.upload(gallery.vectors(54, 5))
+    whole, seen = A.apply(x).get(), visibility(patches, BLOCK, device)
+    monkeypatch.setattr("ltcl.scenes.form_factor._LAUNCH", 7 * 56)
+    monkeypatch.setattr(sys.modules[Rays.__module__], "_LAUNCH", 54 * 16 * 7)
+    helpers.same_rows(device, whole, A.apply(x).get(), reference.product_error(A.to_dense(), x.get()))
+    np.testing.assert_array_equal(visibility(patches, BLOCK, device), seen)
+    i, j = np.triu_indices(54, 1)
+    np.testing.assert_array_equal(Rays(patches, blocks, device, 4).pairs(i, j), seen[i, j])
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 53])
+@pytest.mark.parametrize(("boxes", "samples"), [(1, 1), (2, 3), (5, 4)])
+def test_rays_meet_their_twin(launched, count, boxes, samples):
+    rng = np.random.default_rng(count)
+    patches = Patches(*rng.uniform(-1, 1, (3, count, 3)) * np.array([3, 0.3, 0.3])[:, None, None])
+    low = rng.uniform(-3, 2, (boxes, 3))
+    blocks = np.stack([low, low + rng.uniform(0.2, 2, (boxes, 3))], axis=1)
+    seen = visibility(patches, blocks, launched, samples=samples)
+    rays = Rays(patches, blocks, launched, samples)
+    starts, ends = (
+        points.get().reshape(samples**2, 3, -1)[..., :count] for points in (rays._starts, rays._ends)
+    )
+    expected = reference.form_factor_visible(starts, ends, rays._normals.get()[:, :count], rays._blocks.get())
+    # A ray that grazes a box or a plane to rounding counts either way: one in a hundred entries at most.
+    assert np.count_nonzero(np.abs(seen - expected) > 1e-6) <= 0.01 * count**2
+    np.testing.assert_array_equal(seen, seen.T)
+
+
+def test_boxes_hide_what_is_behind_them_and_nothing_else(device):
+    patches = cut((WALLS[1], WALLS[5]), 3)  # x = 0 and x = 1
+    across = np.abs(patches.centre[:, None, 0] - patches.centre[:, 0]) > 0.5
+    np.testing.assert_array_equal(visibility(patches, [[(0.4, -1, -1), (0.6, 2, 2)]], device), ~across)
+    assert visibility(patches, [[(2, 2, 2), (3, 3, 3)]], device).min() == 1.0
+    room = (*WALLS, *TABLE.faces())
+    seen, wall = visibility(cut(room, 4), BLOCK, device), np.arange(16 * 12) // 4 % 12
+    assert seen[wall >= 6].min() == 1.0  # a box does not block its own faces
+    assert seen[np.ix_(wall < 6, wall < 6)].min() < 1.0
+    # Rays within the plane of a face, and along an edge, pass.
+    ends = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0], [-1.0, -1.0, 1.0], [1.0, -1.0, 1.0]])
+    specks = Patches(ends, np.full((4, 3), [0, 1e-9, 0]), np.full((4, 3), [1e-9, 0, 0]))
+    assert visibility(specks, [[(-0.5, -1.0, 0.0), (0.5, 0.5, 1.0)]], device).min() == 1.0
+
+
+@pytest.mark.parametrize("make", [FormFactor, visibility])
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        ({"patches": [1]}, "patches is a list"),
+        ({"patches": Patches(*np.zeros((3, 0, 3)))}, "patches are 0"),
+        ({"patches": Patches(*np.ones((3, 6, 3)))}, "6 without area, the first at 0"),
+        ({"patches": Patches(np.full((6, 3), np.nan), *np.ones((2, 6, 3)))}, "patches.centre has 18 NaN"),
+        ({"blocks": [[(0, 0, 0), (1, 1, -1)]]}, "the first must be below"),
+        ({"blocks": [[(0, 0, 0), (1, 1, np.nan)]]}, "blocks has 1 NaN"),
+        ({"albedo": 1.0}, r"albedo has 1 value\(s\) outside \[0, 1\)"),
+        ({"albedo": [0.5, 0.5]}, r"albedo has shape \(2,\); it must be \(\) or \(6,\)"),
+        ({"samples": 65}, "samples is 65; it must be at most 64"),
+    ],
+)
+def test_bad_input_is_refused(device, make: Any, arguments: dict[str, Any], part: str):
+    if (make is visibility and "albedo" in arguments) or (make is FormFactor and "samples" in arguments):
+        return
+    with pytest.raises((InputError, InputTypeError), match=part):
+        make(**{"patches": cut(WALLS, 1), "blocks": BLOCK, "device": device, **arguments})
+
+
+def test_what_does_not_fit_is_refused(device, monkeypatch):
+    monkeypatch.setattr("ltcl.checks.host_memory", lambda: 64)
+    with pytest.raises(MemoryLimitError, match="the visibility of 6 x 6 patches needs 144 B"):
+        visibility(cut(WALLS, 1), BLOCK, device)
+    monkeypatch.setattr(device, "memory", 1000)
+    with pytest.raises(MemoryLimitError, match="the geometry of 24 patches needs"):
+        FormFactor(cut(WALLS, 2), device=device)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_rows_of_a_corner_are_those_of_the_dihedral(n):
+    rows, scene = CornerRows(n, albedo=(0.5, 0.25)), dihedral(n, albedo=(0.5, 0.25))
+    assert (rows.grid, rows.shape) == (scene.grid, (2 * n * n, 2 * n * n))
+    np.testing.assert_array_equal(rows.first_bounce, scene.first_bounce)
+    for start, stop in ((0, 2 * n * n), (n, n + 1), (1, 2 * n), (0, 0)):
+        np.testing.assert_allclose(rows.rows(start, stop), scene.A[start:stop], rtol=1e-6, atol=1e-9)
+    for x in (gallery.vectors(2 * n * n, None), gallery.vectors(2 * n * n, 3)):
+        np.testing.assert_allclose(rows.matmat(x), scene.A @ x, rtol=1e-6, atol=1e-6)
+    for bad, part in (
+        (lambda: rows.matmat(np.ones((3, 2))), r"x has shape \(3, 2\)"),
+        (lambda: rows.rows(3, 2), "rows 3 to 2"),
+        (lambda: CornerRows(2, (0.5, 0.4, 0.3)), "albedo has 3 colours"),
+    ):
+        with pytest.raises(InputError, match=part):
+            bad()

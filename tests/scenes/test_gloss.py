@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Glossy scenes: bins, lobes and beams keep light; eq. 28 and 29; limits; an integral without bins."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.stats
+
+import ltcl
+from ltcl import checks
+from ltcl.diagnostics import reciprocity_defect
+from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.scenes import Block, GlossyScene, box, cut, dihedral, glossy, trihedral
+from ltcl.scenes.builders import WALLS
+from ltcl.scenes.gloss import brdf
+from ltcl.scenes.gloss.beams import exchange
+from ltcl.scenes.walls import Wall
+
+PROJECTOR, CAMERA = (1.5, 0.9, 0.8), (0.8, 1.6, 0.4)
+BLOCK = Block(corner=(0.3, 0.3, 0.0), size=(0.3, 0.3, 0.4), albedo=0.5)
+VECTORS = brdf.from_square(np.random.default_rng(0).random((40, 2)))
+
+
+def corner(n: int = 3, gloss: Any = 0.6, exponent: Any = 10, **options: Any) -> GlossyScene:
+    options = {"projector": PROJECTOR, "camera": CAMERA, "directions": 16, "rays": 32, **options}
+    return glossy(dihedral(n), n, gloss=gloss, exponent=exponent, **options)
+
+
+@pytest.fixture(scope="module")
+def scene() -> GlossyScene:
+    return corner(albedo=0.6)
+
+
+@pytest.mark.parametrize("k", [2, 3, 8])
+def test_bins_hold_equal_projected_solid_angles(k: int) -> None:
+    """Directions of a cosine law, made by rejection from a square: each bin gets its share."""
+    points = np.random.default_rng(1).uniform(-1, 1, (200_000, 2))
+    points = points[(points**2).sum(axis=1) < 1]
+    counts = np.bincount(brdf.bins(np.column_stack([points, np.sqrt(1 - (points**2).sum(axis=1))]), k))
+    assert counts == pytest.approx(np.full(k * k, len(points) / k**2), abs=5 * (len(points) / k**2) ** 0.5)
+    places = brdf.lattice(k, points=4)
+    np.testing.assert_array_equal(
+        brdf.bins(places, k), np.broadcast_to(np.arange(k * k)[:, None], (k * k, 16))
+    )
+    np.testing.assert_allclose(np.linalg.norm(places, axis=-1), 1)
+
+
+@pytest.mark.parametrize(("k", "exponent"), [(2, 1), (4, 20), (8, 0.5), (8, 512)])
+def test_lobes_return_all_light_and_are_reciprocal(k: int, exponent: float) -> None:
+    shine, other = brdf.lobe(exponent, k), VECTORS[::-1]
+    assert shine.between.mean(axis=1) == pytest.approx(1, rel=1e-12)
+    assert (shine.between == shine.between.T).all()
+    assert shine.between.min() > 0
+    assert shine.towards(VECTORS).mean(axis=1) == pytest.approx(1, rel=1e-12)
+    assert shine.direct(VECTORS, other) == pytest.approx(shine.direct(other, VECTORS), rel=1e-12)
+
+
+def test_single_directions_see_the_lobe_as_sharp_as_it_is() -> None:
+    """The mean over a fine sky is 1 without bins, and it is brightest near the mirror direction."""
+    sky = brdf.lattice(60, 2).reshape(-1, 3)
+    for v in brdf.from_square(np.array([[0.5, 0.5], [0.7, 0.5], [0.3, 0.35]])):
+        here = np.broadcast_to(v, sky.shape)
+        assert brdf.lobe(12, 12).direct(here, sky).mean() == pytest.approx(1, abs=0.02)
+        assert sky[np.argmax(brdf.lobe(200, 10).direct(here, sky))] @ (v * (-1, -1, 1)) > np.cos(0.1)
+
+
+@pytest.mark.parametrize(
+    "walls",
+    [
+        WALLS,
+        WALLS[:3],
+        (Wall("a", (1, 0, 2), (-1, 0, 0), (0, 0, -2)), Wall("b", (0, 0, 1), (0, 3, 0.5), (0, 0, -1))),
+    ],
+)
+def test_beams_exchange_the_same_light_both_ways(walls: tuple[Wall, ...]) -> None:
+    G, area = exchange(walls, 3, directions=16, rays=64), cut(walls, 3).area
+    E = np.repeat(area, 16)[:, None] * G.toarray()
+    np.testing.assert_allclose(E, E.T, atol=1e-6 * E.max())
+    assert G.sum(axis=1).max() <= 1 + 1e-12
+    assert len(walls) < 6 or G.sum(axis=1).min() >= 1 - 1e-12  # a closed room keeps all light
+    again, other = (exchange(walls, 3, 16, 64, seed=seed) for seed in (0, 4))
+    assert (again.toarray() == G.toarray()).all()
+    assert (other.toarray() != G.toarray()).any()
+    curtain = exchange((WALLS[0], WALLS[4]), 2, 16, 16, blocks=[[(-1, 0.4, -1), (2, 0.5, 2)]])
+    assert curtain.sum() == 0
+
+
+@pytest.mark.parametrize("gloss", [0.0, 0.7, [0, 1, 0.2, 0, 0.5, 0.9]])
+def test_white_furnace(gloss: Any) -> None:
+    """In a closed room, light that is 1 everywhere and to all sides is `albedo` after a bounce."""
+    place: dict[str, Any] = {"projector": (0.5, 0.5, 0.5), "camera": (0.3, 0.6, 0.4)}
+    room = glossy(box(2), 2, 0.8, gloss, 30, **place, directions=16, rays=16)
+    assert room.A @ np.ones(room.A.shape[1]) == pytest.approx(0.8, rel=1e-12)
+    leaving = (room.K @ (room.Q @ np.ones(24))).reshape(24, 17)[:, :-1]
+    assert leaving.mean(axis=1) == pytest.approx(0.8, rel=1e-12)  # the projector's light as well
+
+
+def test_transport_solves_equation_28_and_bounces_equation_29(scene: GlossyScene) -> None:
+    A, pattern = scene.A @ np.eye(scene.A.shape[0]), np.random.default_rng(1).random(scene.grid)
+    expected = scene.P @ np.linalg.solve(np.eye(len(A)) - A, scene.K @ scene.Q.toarray())
+    (T,) = scene.matrices()
+    np.testing.assert_allclose(T, expected, atol=2e-8)
+    np.testing.assert_allclose(
+        (scene.P @ scene.K @ scene.Q).toarray(), np.diag(scene.first_bounce), atol=1e-15
+    )
+    bounces, light = scene.bounces(pattern, 40), scene.K @ (scene.Q @ pattern.ravel())
+    assert bounces.sum(axis=0).ravel() == pytest.approx(T @ pattern.ravel(), rel=1e-6)
+    for bounce in bounces[:4]:
+        assert bounce.ravel() == pytest.approx(scene.P @ light, rel=1e-6)
+        light = A @ light
+    x, y = np.random.default_rng(0).random((2, len(A)))
+    assert (scene.A @ x) @ y == pytest.approx(x @ (scene.A.H @ y), rel=1e-12)
+    wanted = T @ np.random.default_rng(3).uniform(0.2, 0.8, 18)
+    result = ltcl.compensate(scene.transport(), wanted.reshape(scene.grid), rtol=1e-5)
+    assert (result.clipped, result.error) == (0, pytest.approx(0, abs=1e-4))
+
+
+def test_colours_and_frames() -> None:
+    colour = corner(2, albedo=(0.8, 0.4, 0.2))
+    patterns = np.random.default_rng(2).random((2, *colour.grid, 3))
+    bounces = colour.bounces(patterns, 2)
+    assert bounces.shape == (3, 2, 2, 4, 3)
+    for channel, albedo in enumerate((0.8, 0.4, 0.2)):
+        grey = corner(2, albedo=albedo)
+        assert bounces[:, 1, ..., channel] == pytest.approx(grey.bounces(patterns[1, ..., channel], 2))
+        assert colour.matrices()[channel] == pytest.approx(grey.matrices()[0])
+    assert len(colour.A) == len(colour.K) == colour.transport().channels == len(colour.first_bounce) == 3
+
+
+def test_without_gloss_it_is_the_diffuse_scene_and_reciprocal() -> None:
+    matte = corner(4, gloss=0, albedo=[0.7, 0.4])
+    np.testing.assert_allclose(matte.matrices()[0], matte.matte.matrices()[0], atol=2e-8)
+    assert reciprocity_defect(matte.matrices()[0], matte.first_bounce) < 1e-6
+    shiny, sharp = corner(4, 0.4), trihedral(3, angle=70)
+    assert reciprocity_defect(shiny.matrices()[0], shiny.first_bounce) > 0.02
+    room = glossy(sharp, 3, projector=sharp.viewer.eye, directions=16, rays=256)
+    error = np.linalg.norm(room.matte.form_factors - sharp.form_factors)
+    assert error < 0.03 * np.linalg.norm(sharp.form_factors)
+
+
+def first_bounce_by_integration(gloss: float, exponent: float) -> float:
+    """Light from left to right wall of `dihedral(1)` to the camera, by rays in closed form, without bins."""
+    shine = brdf.lobe(exponent, 16)
+    u, v, a, b = scipy.stats.qmc.Sobol(4, scramble=False).random_base2(12).T + 2.0**-13
+    radius, angle = np.sqrt(a), 2 * np.pi * b
+    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - a)  # z along +x, off the right wall
+    distance = np.where(x < 0, -u / x, np.inf)  # to y = 0; x here is along +y of the room
+    reached = distance * z, v + distance * y
+    room = np.column_stack([z, x, y])[(reached[0] < 1) & (reached[1] > 0) & (reached[1] < 1)]
+
+    def reflect(normal: tuple[int, int, int], place: Any, centre: Any, other: np.ndarray) -> np.ndarray:
+        # Any frame does for an isotropic lobe.
+        axes, away = (
+            np.stack([np.roll(normal, 1), np.roll(normal, 2), normal], axis=1),
+            np.subtract(place, centre),
+        )
+        one = np.broadcast_to(away / np.linalg.norm(away), room.shape)
+        return 1 - gloss + gloss * shine.direct(one @ axes, other @ axes)
+
+    lit = reflect((0, 1, 0), PROJECTOR, (0.5, 0, 0.5), -room)
+    seen = reflect((1, 0, 0), CAMERA, (0, 0.5, 0.5), room)
+    return float((lit * seen).sum() / len(u))
+
+
+def test_first_bounce_approaches_an_integral_without_bins() -> None:
+    expected, errors = first_bounce_by_integration(0.8, 8), []
+    for directions in (4, 16, 64):
+        scene = corner(1, 0.8, 8, albedo=0.5, directions=directions, rays=16384 // directions)
+        errors.append(abs(scene.bounces(np.array([[1, 0]]), 1)[1, 0, 1] / 0.25 / expected - 1))
+    assert errors[0] > 2 * errors[1] > 4 * errors[2]  # about as 1 / directions
+    assert errors[2] < 0.04
+
+
+def test_a_glossy_block_casts_a_shadow_and_shows_a_highlight() -> None:
+    """What the block hides is dark; a black one takes light away."""
+    cube = box(1, sides=3, occluder=BLOCK)
+    gloss = [0.8 if wall.name.startswith("block") else 0.0 for wall in cube.walls]
+    options: dict[str, Any] = {"projector": (0.9, 0.2, 1.4), "camera": (0.15, 0.75, 1.4), "rays": 16}
+    room = glossy(cube, 5, 0.5, gloss, 100, **options, directions=36)
+    direct = room.picture(room.first_bounce).reshape(5, len(cube.walls), 5)
+    names = [wall.name for wall in cube.walls]
+    floor, top = direct[:, names.index("floor")], direct[:, names.index("block top")]
+    assert floor[2, 2] == 0  # below the block
+    assert floor[4, 4] == pytest.approx(0.5)
+    assert (direct[:, names.index("block -x")] == 0).all()
+    assert top.max() > 20 * 0.5 * (1 - 0.8)  # of the matte part
+    # Halfway between projector and camera, which are as high above it.
+    assert np.unravel_index(np.argmax(top), top.shape) == (3, 2)
+    assert room.transport(room.first_bounce, on_dark="mask").masked.sum() == (direct == 0).sum() > 0
+    dark = glossy(WALLS[:3], 4, blocks=[Block(BLOCK.corner, BLOCK.size)], **options, directions=16)
+    of_scene = glossy(box(1, sides=3, occluder=dark.matte.blocks[0]), 4, **options, directions=16)
+    assert (of_scene.matrices()[0] == dark.matrices()[0]).all()
+    free = glossy(WALLS[:3], 4, **options, directions=16).matte
+    assert (free.form_factors.sum(axis=1) - dark.matte.form_factors.sum(axis=1)).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({"gloss": -0.1}, "gloss has the value -0.1"),
+        ({"exponent": 129}, "exponent is 129; it must be at most 128"),
+        ({"directions": 3}, "directions is 3"),
+        ({"directions": 60}, "directions is 60; it must be a square number"),
+        ({"seed": -1}, "seed is -1"),
+        ({"projector": (0, 0.5, 0.5)}, "projector is at .*, on the wall 'right'"),
+        ({"camera": (-1, -1, 0.5)}, "camera is at .*, where it faces none of 2 wall"),
+        ({"room": 5}, "room is 5"),
+        ({"room": WALLS[:2], "camera": None}, "camera is None"),
+        ({"blocks": [[(0, 0, 0), (1, 1, 1)]]}, "blocks is .* ltcl.scenes.Block"),
+    ],
+)
+def test_bad_scenes_are_refused(change: dict[str, Any], part: str) -> None:
+    options = {
+        "room": dihedral(2),
+        "n": 2,
+        "projector": PROJECTOR,
+        "camera": CAMERA,
+        "directions": 16,
+        **change,
+    }
+    with pytest.raises((InputError, InputTypeError), match=part):
+        glossy(**options)
+
+
+def test_memory_and_patterns_are_checked_first(monkeypatch: pytest.MonkeyPatch, scene: GlossyScene) -> None:
+    with pytest.raises(InputError, match="pattern has shape"):
+        scene.bounces(np.ones((2, 2)), 1)
+    with pytest.raises(InputError, match="count is -1"):
+        scene.bounces(np.ones(scene.grid), -1)
+    with pytest.raises(MemoryLimitError, match=r"glossy dihedral, 20000000000 patches .* needs"):
+        glossy(dihedral(2), 10**5, projector=PROJECTOR)
+    monkeypatch.setattr(checks, "host_memory", lambda: 1 << 10)
+    with pytest.raises(MemoryLimitError, match="transport of glossy dihedral, 1 of 18 x 18, needs"):
+        scene.matrices()
