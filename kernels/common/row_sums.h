@@ -6,8 +6,7 @@
 #include "common/lanes.h"
 
 #define COLUMN(j) (sparse ? columns[j] : (j))  // every call says by a constant whether the row is sparse
-// 16 entries side by side: a pixel of a transport sees many such runs.
-#define RUN(j) ((j) + 16 <= end && COLUMN((j) + 15) == COLUMN(j) + 15)
+#define RUN(j) ((j) + 16 <= end && COLUMN((j) + 15) == COLUMN(j) + 15)  // 16 side by side: most light comes so
 
 // Every `step`-th entry from j on.
 static inline void row_add(
@@ -59,10 +58,11 @@ static inline lanes row_sum(
     bool runs = false;
     while (j + 4 <= end) {
         if (RUNS && RUN(j)) {
-            add_run(&even, LOAD8(values + j), x + COLUMN(j) * K);
-            add_run(&odd, LOAD8(values + j + 8), x + (COLUMN(j) + 8) * K);
             runs = true;
-            j += 16;
+            for (; RUN(j); j += 16) {
+                add_run(&even, LOAD8(values + j), x + COLUMN(j) * K);
+                add_run(&odd, LOAD8(values + j + 8), x + (COLUMN(j) + 8) * K);
+            }
         } else {
             s0 = PRODUCT(j) + s0;
             s1 = PRODUCT(j + 1) + s1;
