@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Check that a wheel and a source archive hold every file of the checkout that belongs in them.
 
+The wheel's description must not point into the repository: a package index shows it without the files.
+
 Usage: python .ci/check_archives.py dist/ltcl-*.whl dist/ltcl-*.tar.gz
 """
 
 from __future__ import annotations
 
+import re
 import sys
 import tarfile
 import zipfile
@@ -32,6 +35,13 @@ def missing(archive: Path) -> set[str]:
         return wanted - {name.partition("/")[2] for name in sdist.getnames()}
 
 
+def broken_links(wheel: Path) -> list[str]:
+    """Targets of links and pictures in the wheel's description that are paths."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return re.findall(r"\]\(((?!https?:|#)[^)]*)\)", archive.read(name).decode())
+
+
 def main(names: list[str]) -> int:
     """Report on each archive; return the exit status."""
     archives = [Path(name) for name in names]
@@ -46,6 +56,9 @@ def main(names: list[str]) -> int:
         lost = sorted(missing(archive))
         print(f"{archive.name}:", f"lacks {', '.join(lost)}" if lost else "complete")
         status |= bool(lost)
+        if archive.suffix == ".whl" and (broken := broken_links(archive)):
+            print(f"{archive.name}: its description points to {', '.join(broken)}")
+            status = 1
     return status
 
 

@@ -1,16 +1,14 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Least squares within bounds between two products (`ltcl/solvers/bounded.py`): x is (rows, k), r is (height, k).
 //
-// z is the part of -g that may be followed: 0 where x is at a bound and -g points out. lower and upper hold one value a
-// row; w, squares of weights, counts where weighted == 1. `numbers` holds k columns by rows: alpha, the curvature <A d,
-// A d> of the last d, or 0 where it tells nothing of the next, lambda; from row 4 on the 2 sums of bounded_look by
-// slices; then those of w r r. Items, groups, partial sums and `scratch`: common/columns.h.
+// z is -g, or 0 where x is at a bound and -g points out. lower and upper hold one value a row; w, squares of weights,
+// counts where weighted == 1. `numbers` holds k columns by rows: alpha, the curvature <A d, A d> of the last d, or 0
+// where the next is not conjugate, lambda; from row 4 on the 2 sums of bounded_look by slices; then those of w r r.
+// Items, groups, partial sums and `scratch`: common/columns.h.
 
 #include "common/columns.h"
 
-// Of d: a shorter step tells that clipping has bent d far from p, and conjugacy is lost. With 1/2 in place of 1/4
-// lengths and steps may take turns around it for ever, and only every second direction is conjugate.
-#define STRAIGHT 0.25f
+#define STRAIGHT 0.25f  // of d: below, clipping has bent d, which is no longer conjugate; 1/2 refuses every second d
 #define NUMBER(row) numbers[(row) * k + s.origin + j]
 
 static inline real bounded_free(real x, real g, real lower, real upper)
@@ -18,16 +16,15 @@ static inline real bounded_free(real x, real g, real lower, real upper)
     return (g > 0 ? x <= lower : x >= upper) ? 0 : -g;
 }
 
-// Sums: g.d, d.d; and the largest share of the way to its bound that an entry of x + d has gone. Columns rest where
-// rest[column]. scratch: 2 more a column.
+// Sums: g.d, d.d; and the largest share of the way to its bound that an entry of x + d has gone; columns with
+// rest[column] rest. scratch: 2 more a column.
 kernel void bounded_direction(
     int rows, int k, int slices, global const int *rest, global const real *numbers, global const real *lower,
     global const real *upper, global const real *x, global const real *g, global real *d, global real *sums,
     global real *shares, local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *totals = scratch + get_local_size(0), *alphas = totals, *betas = totals + s.width;
-    columns_totals(numbers + 4 * k, slices, 2, 0, k, s, totals, scratch);
+    local real *alphas = columns_totals(numbers + 4 * k, slices, 2, 0, k, s, scratch, 0), *betas = alphas + s.width;
     EACH_COLUMN(j) {
         betas[j] = NUMBER(1) > 0 ? -betas[j] / NUMBER(1) : 0;  // -z.h / <A d, A d>
         alphas[j] = rest[s.origin + j] ? 0 : NUMBER(0);
@@ -50,8 +47,8 @@ kernel void bounded_direction(
     columns_sum(most, shares + get_group_id(0) * k, 1, s, scratch);
 }
 
-// `sums` and `shares` are of bounded_direction, `curvatures` the sums of w Ad Ad;
-// of 0 slices nothing moves. u = w r; it may be r where w does not count. scratch: 4 more a column.
+// `sums` and `shares` are of bounded_direction, `curvatures` the sums of w Ad Ad; of 0 slices nothing moves. u = w r,
+// which may be r where w does not count. scratch: 4 more a column.
 kernel void bounded_move(
     int rows, int k, int height, int slices, int weighted, global real *numbers, global const real *sums,
     global const real *shares, global const real *curvatures, global const real *lower, global const real *upper,
@@ -59,10 +56,9 @@ kernel void bounded_move(
     global real *u, local real *scratch)
 {
     share s = columns_share(rows, k);
-    local real *totals = scratch + get_local_size(0), *lambdas = totals;
-    columns_totals(sums, slices, 2, 0, k, s, totals, scratch);
-    columns_totals(shares, slices, 1, 1, k, s, totals + 2 * s.width, scratch);
-    columns_totals(curvatures, slices, 1, 0, k, s, totals + 3 * s.width, scratch);
+    local real *totals = columns_totals(sums, slices, 2, 0, k, s, scratch, 0), *lambdas = totals;
+    columns_totals(shares, slices, 1, 1, k, s, scratch, 2);
+    columns_totals(curvatures, slices, 1, 0, k, s, scratch, 3);
     EACH_COLUMN(j) {
         const real gd = totals[j], dd = totals[s.width + j], curvature = totals[3 * s.width + j];
         const bool moves = gd < 0 && curvature > 0 && isfinite(curvature);

@@ -2,8 +2,7 @@
 // Product of a matrix in compressed sparse rows with K right-hand sides, and steps of an iteration along one; see
 // common/product.h for the two kernels, their arguments and defines.
 //
-// Layout: pointers[rows + 1] counts from 0 within the slab; columns and values follow it, columns ascending and
-// unique within a row.
+// Layout: pointers[rows + 1] counts from 0 within the slab; columns, ascending and unique in a row, and values.
 
 #include "common/row_sums.h"
 #include "common/product.h"

@@ -2,11 +2,10 @@
 // Product of a dense row-major matrix with K right-hand sides, steps of an iteration along one (see common/product.h
 // for these two kernels, their arguments and defines), and products with its transpose:
 //
-//   dense_rmatvec  one work-item a strip of columns, down the rows of chunk get_global_id(1); where there are several,
-//                  it adds them up, too: their sums are a matrix, whose transpose is multiplied by ones
+//   dense_rmatvec  one work-item a strip of columns, down the rows of chunk get_global_id(1); the sums of several
+//                  chunks are a matrix, whose transpose is multiplied by ones
 //
-// Required define besides K: STRIP: 256 on CPUs, long enough to be read as a stream, 1 on GPUs.
-// Layout: a slab of `rows` rows of `width` reals.
+// Required define besides K: STRIP: 256 on CPUs, read as a stream, 1 on GPUs. Layout: `rows` rows of `width` reals.
 
 #include "common/row_sums.h"
 #include "common/product.h"
@@ -27,7 +26,6 @@ kernel void dense_matvec_group(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *sc
     BY_GROUP(row_add(false, sum.item, 0, matrix + (size_t)row * width, x + offset, stride, me, width, items));
 }
 
-#ifndef STEP
 // out (width, stride) of each chunk = a (its rows)^T x, of the first + b y + c x; x is multiplied from row `first` on.
 kernel void dense_rmatvec(
     int rows, int first, int stride, int offset, real a, real b, real c, global const real *x,
@@ -54,4 +52,3 @@ kernel void dense_rmatvec(
         for (int k = 0; k < K; ++k)
             finish((column + lane) * stride + offset + k, sum[k][lane], a, b, c, x, y, out);
 }
-#endif

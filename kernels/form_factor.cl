@@ -1,25 +1,22 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Light between flat patches: a matrix of form factors that is never stored, every entry computed where it is used,
+// Light between flat patches, past opaque boxes along the axes: form factors that are computed where they are used,
 //
 //     A = diag(left) G diag(right),    G_ij = mean of  cos(t_i) cos(t_j) / (pi r^2)  over pairs of points on i and j
 //
-// and what opaque boxes along the axes hide. With left = albedo and right = area A is one bounce, and with the two
-// swapped its transpose.
+// With left = albedo and right = area A is one bounce, and with the two swapped its transpose.
 //
 //   form_factor_weigh    z = diag(right) x, each right-hand side as a row of `pitch` reals; one work-item a patch
 //   form_factor_matvec   out = a (A x) + b y + c x, as in common/product.h; one work-item a row
-//   form_factor_pairs    G_ij of listed pairs; one work-item a pair
+//   form_factor_pairs    G_ij of listed pairs, to the bit as in the product; one work-item a pair
 //   form_factor_visible  the share of the rays between two patches that no box stops; an item a row, LANES columns
 //
 // A pair at least OUTER sizes apart is taken at its centres; nearer, the curvature of cos cos / r^2 is added; within
-// INNER sizes, or where the plane of one patch cuts the other, it is taken at eight pairs of points, which is exact
-// for polynomials of degree 3. Pairs of points with a box between them add nothing.
+// INNER sizes, or where the plane of one patch cuts the other, the pair is taken at eight pairs of points.
 //
-// Required defines: K, see common/lanes.h; LANES, patches that an item takes together, 8 on CPUs
-// and 1 on GPUs; BLOCKS, the number of boxes. Optional: PACKED.
-// Layout: geometry is 13 rows of `pitch` reals, a multiple of LANES, one column a patch, the last without a normal:
-// centre, right edge, down edge, normal (three rows each), and squared size, (right^2 + down^2) / 4, of which a pair
-// has the sum. A box is its centre and its half sides, 6 reals. Lengths are parts of the scene's size.
+// Required defines: LANES and BLOCKS, and see common/lanes.h. Layout: geometry is 13 rows of `pitch` reals, a multiple
+// of LANES, one column a patch, the last without a normal: centre, right edge, down edge, normal (three rows each), and
+// squared size, (right^2 + down^2) / 4, of which a pair has the sum. A box is its centre and its half sides, 6 reals.
+// Lengths are parts of the scene's size.
 
 #include "common/product.h"
 
@@ -27,7 +24,7 @@
 #error "form_factor.cl needs -DLANES=<patches that an item takes: 8 on CPUs, 1 on GPUs>, -DBLOCKS=<number of boxes>"
 #endif
 
-// stretch: of patches side by side; flags: what comparing two gives. TOTAL: the sum of the lanes.
+// stretch: of patches side by side; flags: what comparing two gives
 typedef OF(real, LANES) stretch;
 #define LOAD_STRETCH(a) OF(LOAD, LANES)(a)
 #if LANES == 8
@@ -48,10 +45,9 @@ INLINE stretch magnitude(stretch v)
 
 #define GRAZING 1e-6f  // heights above a plane below this are rounding errors: such points do not see each other
 
-// Points or directions in space, one a lane.
 typedef struct {
     stretch x, y, z;
-} spots;
+} spots;  // points or directions in space, one a lane
 
 INLINE stretch dot3(spots a, spots b)
 {
@@ -98,10 +94,9 @@ INLINE stretch unless_blocked(stretch value, spots p, spots q, global const real
 typedef struct {
     spots centre, right, down, normal;
 } patch;
-
-#define LOAD_PATCH(item, spread) \
-    {load_spots(geometry, pitch, 0, item, spread), load_spots(geometry, pitch, 1, item, spread), \
-     load_spots(geometry, pitch, 2, item, spread), load_spots(geometry, pitch, 3, item, spread)}
+#define LOAD_ROWS(what, item, spread) load_spots(geometry, pitch, what, item, spread)
+#define LOAD_PATCH(i, spread) \
+    {LOAD_ROWS(0, i, spread), LOAD_ROWS(1, i, spread), LOAD_ROWS(2, i, spread), LOAD_ROWS(3, i, spread)}
 
 // The centre moved by a part of each edge.
 INLINE spots moved(patch p, real a, real b)
@@ -122,8 +117,8 @@ INLINE stretch exchange(spots p, spots p_normal, spots q, spots q_normal, global
     return unless_blocked(facing ? value : (stretch)(0), p, q, blocks);
 }
 
-// The mean over eight pairs of points (Stroud, Approximate Calculation of Multiple Integrals, 1971, C_n 3-1 for
-// n = 4). Point k of the rule is at angle k pi / 4 on an ellipse in each patch; it meets point 3 k of the other.
+// The mean over eight pairs of points, exact for cubics (Stroud, Approximate Calculation of Multiple Integrals, 1971,
+// C_n 3-1 for n = 4). Point k of the rule is at angle k pi / 4 on an ellipse in each patch; it meets point 3 k there.
 INLINE stretch at_eight_points(patch p, patch q, global const real *blocks)
 {
 #define MEET(a, b, u, v) exchange(moved(p, a, b), p.normal, moved(q, u, v), q.normal, blocks)
@@ -146,7 +141,7 @@ INLINE stretch nearby(patch p, patch q, stretch sizes, spots d, stretch r2, glob
     if (!ANY(facing))  // patches of one wall, which are the most
         return 0;
     // The value at the centres and the second derivative along each edge e, / 24: of h g / r^4, with s = d . e, it is
-    // (2 h' g' - 8 (h' g + h g') s / r^2 + h g (24 s^2 / r^2 - 4 e^2) / r^2) / r^4; h' is 0 along edges of i, g' of j.
+    // (2 h' g' - 8 (h' g + h g') s / r^2 + h g (24 s^2 / r^2 - 4 e^2) / r^2) / r^4; h' is 0 along edges of p, g' of q.
     const stretch a = dot3(d, p.right), b = dot3(d, p.down), u = dot3(d, q.right), v = dot3(d, q.down);
     const stretch turned = 8 * (h * (p_right * a + p_down * b) - g * (q_right * u + q_down * v));
     const stretch bent = h * g * (24 * (a * a + b * b + u * u + v * v) * inverse - 16 * sizes);
@@ -209,16 +204,15 @@ kernel void form_factor_pairs(
     const int n = get_global_id(0);
     if (n >= count)
         return;
-    // The stretch that the product computes, by the same code, and its lane.
     const int lane = to[n] % LANES;
     const stretch g = entries(from[n], to[n] - lane, geometry, pitch, blocks);
     out[n] = ((const real *)&g)[lane];
 }
 
-// out (columns, rows) = which part of patches from to[row] on, a multiple of LANES, patch from[row] sees: of the rays
-// between their fronts, the share that gets through; 1 where no ray leaves and meets a front. starts and ends hold
-// three rows of `pitch` reals for each ray, normals three. Ray k runs from point k of one patch to point partner(k)
-// of the other, and partner(partner(k)) = k: both directions have the same rays, and the same result to the bit.
+// out (columns, rows) = of the rays between the fronts of patch from[row] and of patches from to[row] on, a multiple of
+// LANES, the share that gets through; 1 where there are none. starts and ends hold three rows of `pitch` reals for each
+// ray, normals three. Ray k ends at point partner(k) of the other patch, and partner(partner(k)) = k: both directions
+// have the same rays, and the same result to the bit.
 kernel void form_factor_visible(
     int rows, int pitch, int rays, global const int *from, global const int *to, global const real *starts,
     global const real *ends, global const real *normals, global const real *blocks, global real *out)

@@ -2,8 +2,8 @@
 // Steps of Krylov methods between two products, whose coefficients stay on the device.
 //
 // Items, groups, partial sums, `slices` and `scratch`: common/columns.h. `state` holds numbers of k columns by rows;
-// from row STATE on the partial sums of squared residuals of SLOTS steps. The parity of `step` says which of two copies
-// a step reads; it writes the other one, since groups that start late still read.
+// from row STATE on the partial sums of squared residuals of SLOTS steps. A step reads one of two copies, by parity,
+// and writes the other: groups that start late still read.
 
 #include "common/columns.h"
 
@@ -19,18 +19,17 @@ static inline real divided(real a, real b)
     return a / (isfinite(b) ? b : NAN);
 }
 
-// out = w - sum_j h_j V_j, j < count, with h of the partial sums, of which there is one more: w * w. The h are added
-// to those of `before`, where again == 1, and left in `h`, and with them the length of what is left of w, by
-// Pythagoras, or 0 where that is rounding. finish == 1 brings out to length 1, which is the next V. `out` may be w.
-// scratch: count + 2 more a column.
+// out = w - sum_j h_j V_j, j < count, with h of the partial sums, the last of which are w * w. `h` gets those numbers,
+// added to `before` where again == 1, and the length of what is left of w, by Pythagoras, or 0 where that is rounding.
+// finish == 1 brings out to length 1, which is the next V. `out` may be w. scratch: count + 2 more a column.
 kernel void krylov_subtract(
     int rows, int k, int count, int slices, int again, int finish, global const real *partials,
     global const real *before, global real *h, global real *V, global const real *w, global real *out,
     local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *totals = scratch + get_local_size(0), *scale = totals + (count + 1) * s.width;
-    columns_totals(partials, slices, count + 1, 0, k, s, totals, scratch);
+    local real *totals = columns_totals(partials, slices, count + 1, 0, k, s, scratch, 0);
+    local real *scale = totals + (count + 1) * s.width;
     EACH_COLUMN(j) {
         real squares = 0, all = 0;
         for (int i = 0; i < count; ++i) {
@@ -71,10 +70,9 @@ kernel void krylov_cg(
     local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *totals = scratch + get_local_size(0), *alphas = totals, *betas = totals + s.width;
-    columns_totals(partials, slices, 2, 0, k, s, totals, scratch);
+    local real *alphas = columns_totals(partials, slices, 2, 0, k, s, scratch, 0), *betas = alphas + s.width;
     EACH_COLUMN(j) {
-        const real square = totals[j], product = totals[s.width + j];
+        const real square = alphas[j], product = betas[j];
         const real previous = state[OWN(step, 0)], last = state[OWN(step, 1)];
         real broken = state[OWN(step, 2)];
         bool moves = !rest[s.origin + j] && !(broken > 0);
@@ -131,8 +129,7 @@ kernel void krylov_half(
     global const real *v, global real *half_way, local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *totals = scratch + get_local_size(0);
-    columns_totals(partials, slices, 2, 0, k, s, totals, scratch);
+    local real *totals = columns_totals(partials, slices, 2, 0, k, s, scratch, 0);
     EACH_COLUMN(j) {
         const real sigma = totals[j], square = totals[s.width + j];
         const bool lost = fabs(sigma) <= ORTHOGONAL * sqrt(square) * sqrt(state[AGAINST]);
@@ -155,9 +152,8 @@ kernel void krylov_bicgstab(
     global const real *v, global real *p, global real *x, global real *r, local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *totals = scratch + get_local_size(0);
+    local real *totals = columns_totals(partials, slices, 5, 0, k, s, scratch, 0);
     local real *alphas = totals, *omegas = totals + s.width, *betas = totals + 2 * s.width;
-    columns_totals(partials, slices, 5, 0, k, s, totals, scratch);
     EACH_COLUMN(j) {
         const real ts = totals[j], tt = totals[s.width + j], ss = totals[4 * s.width + j];
         const real alpha = state[ALPHA], does = state[OWN(step, 1)];

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Pixels in another order, or some of them: out = a (P x) + b y, where row i of P x is row order[i] of x, or 0 where
-// that is negative. Work-items stride through pieces of K right-hand sides (dimension 0) and through pixels (1).
-// Required define: K, see common/lanes.h.
+// that is negative. Items stride through pieces of K right-hand sides, see common/lanes.h, and (dimension 1) pixels.
 
 #include "common/lanes.h"
 

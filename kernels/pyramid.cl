@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// A quad-tree over a picture: level 0 is its pixels, and a cell of each further level covers 2 x 2 of the one
-// before, fewer at the edges, until one cell is left. out = a (W x) + b y, where W is
+// A quad-tree over a picture: level 0 is its pixels, and a cell of each further level covers 2 x 2 of the one before,
+// fewer at the edges, until one cell is left. out = a (W x) + b y, where W is
 //
 //   pyramid_gather  sums of the pixels in each cell, a level from those of the level before
 //   pyramid_spread  the transpose: to each pixel, the sum of the cells that it lies in
@@ -8,9 +8,8 @@
 // Work-items stride through pieces of K right-hand sides (dimension 0), columns (1) and rows (2). A launch of
 // pyramid_gather of several levels, first .. last - 1, takes one group a piece, which waits for itself between them.
 //
-// Required define: K, see common/lanes.h. Layout: the cells of all levels one after another, the finest first, each
-// level row-major, right-hand sides side by side. sums is scratch for as many, of which level 0 is not used, with a
-// spare cell between levels: wide loads reach beyond the last of a level.
+// Required define: K, see common/lanes.h. Layout: cells level by level, the finest first, each row-major, right-hand
+// sides side by side. sums is scratch for as many and a spare cell between levels: wide loads reach there.
 
 #include "common/lanes.h"
 

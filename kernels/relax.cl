@@ -10,18 +10,15 @@
 //
 // A strip first sums what no other strip changes before its turn. The rest, a narrow window of columns, is added strip
 // by strip by the item that ends the sums of a strip or the strip before it, whichever is later: none waits. Assumed
-// beyond OpenCL 1.2, true of CPU drivers: mem_fence and atomics order what work-groups of one launch hand on.
+// beyond OpenCL 1.2, true of CPU drivers: mem_fence and atomics order writes across the work-groups of a launch.
 //
 // A row is split at column i where its correction is omega s_i / S_ii at once (`inverses` 0), else at the first column
-// of its block. Sums below and above are apart, so that a sweep also tells the residual r of the x it began with: what
-// it takes from x above, the one before took below, and left in carry = b - that.
+// of its block. The sum below, of the x before, stays in carry = b - sum: with the sum above it gives r of that x.
 //
-// Optional defines: see common/lanes.h, and DENSE: M has rows of `width` numbers, without pointers, columns and
-// windows. windows[2 row] is the first entry of the window, windows[2 row + 1] that from the split on. A slab has rows
-// of M from `first` on; weights are rows of P_BB^-1, `block` numbers each, or 1 / S_ii. Vectors have `stride` reals a
-// row, of which a launch takes offset .. offset + K - 1, in rows begin .. end of the panel or block from row `start`
-// on. scratch: 2 K reals a work-item. arrivals[0] counts the strips begun, arrivals[i] what strip i waited for; all are
-// 0 between launches.
+// Optional define: DENSE: M has rows of `width` numbers, without pointers, columns and windows. windows[2 row] is the
+// first entry of the window, windows[2 row + 1] that from the split on; weights are rows of P_BB^-1, `block` numbers
+// each, or 1 / S_ii. A launch takes rows begin .. end of the panel or block from row `start` on. scratch: 2 K reals a
+// work-item. arrivals[0] counts the strips begun, arrivals[i] what strip i waited for; all are 0 between launches.
 
 #include "common/product.h"
 #include "common/row_sums.h"
@@ -31,8 +28,6 @@
     global const int *pointers, global const int *columns, global const real *values, global const int *windows, \
     global real *x, global const real *b, global real *s, global real *r, global real *carry
 #define OFFSET (stride = STRIDE(stride), x += offset, b += offset, s += offset, r += offset, carry += offset)
-
-// The entries from .. to of a row, by one work-item in wide loads.
 #define ROW_SUM(row, from, to) ((sums){row_sum(SPARSE, columns, VALUES(row), x, stride, from, to)})
 #ifdef DENSE
 #define SPARSE false

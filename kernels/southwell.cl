@@ -3,9 +3,9 @@
 //
 //     r -= scale M[:, i] delta for the rows i picked before;   i = argmax |r_i|, delta_i = r_i / S_ii, x_i += delta_i
 //
-// A work-group has a range of rows, in which it brings r up to date with the `pending` picks before, and then, unless
-// `picks` is 0, picks a row in each of its parts. Optional define: DENSE; else the slab is one of M^T in sparse rows,
-// and items look up where their stretch of r begins in each: no two write one value. `places`: a number an item.
+// In its range of rows a work-group applies the `pending` picks before to r, and then, unless `picks` is 0, picks a row
+// in each of its parts. Optional define: DENSE; else the slab is one of M^T in sparse rows, in each of which an item
+// looks up where its own rows begin. `places`: a number an item.
 
 #include "common/real.h"
 
@@ -38,12 +38,10 @@ kernel void southwell_step(
             continue;
         const real step = scale * delta[part * k + c];
         int j = pointers[row];
-        for (int stop = pointers[row + 1], middle; j < stop;) {  // a binary search
-            middle = j + (stop - j) / 2;
-            if (columns[middle] < from)
-                j = middle + 1;
-            else
-                stop = middle;
+        for (int stop = pointers[row + 1]; j < stop;) {  // a binary search
+            const int middle = j + (stop - j) / 2, below = columns[middle] < from;
+            j = below ? middle + 1 : j;
+            stop = below ? stop : middle;
         }
         for (; j < pointers[row + 1] && columns[j] < to; ++j)
             r[columns[j] * k + c] -= values[j] * step;

@@ -3,21 +3,15 @@
 // common/product.h for the two kernels, their arguments and defines. A tile is WIDTH neighbouring columns of one
 // row: one column index for WIDTH numbers, and x is read in wide loads.
 //
-// Required defines besides K: WIDTH: 1 or 8; VALUES, the type of the numbers: 0 float32, 1 float16, 2 int8.
-// Optional: LONG: column indices have 32 bits, not 16.
+// Required defines besides K: WIDTH; PLACE, ushort or int; VALUES, of the numbers: 0 float32, 1 float16, 2 int8.
 // Layout: pointers[rows + 1] counts tiles from 0 within the slab; columns (one a tile, the first of it) and values
 // (WIDTH a tile) follow it, and so do scales (one a tile) where values are int8: they are not read elsewhere.
 // Columns that no nonzero claims hold zeros, and no tile reaches beyond the end of its row.
 
 #include "common/product.h"
 
-#if WIDTH != 1 && WIDTH != 8
-#error "tile.cl needs -DWIDTH=<neighbouring columns of a tile: 1 or 8>"
-#endif
-#ifdef LONG
-typedef int place;
-#else
-typedef ushort place;
+#if WIDTH != 1 && WIDTH != 8 || !defined(PLACE)
+#error "tile.cl needs -DWIDTH=<neighbouring columns of a tile: 1 or 8>, -DPLACE=<type of column indices>"
 #endif
 #define X(j) (x + columns[j] * stride)
 
@@ -62,7 +56,7 @@ typedef char narrow;
 
 // Every `step`-th number from number `n` of the tiles on.
 static inline void tile_add(
-    real *sum, global const place *columns, global const narrow *values, global const uchar *scales,
+    real *sum, global const PLACE *columns, global const narrow *values, global const uchar *scales,
     global const real *x, int stride, int n, int end, int step)
 {
     for (; n < end; n += step) {
@@ -74,7 +68,7 @@ static inline void tile_add(
 }
 
 static inline lanes tile_sum(
-    global const place *columns, global const narrow *values, global const uchar *scales, global const real *x,
+    global const PLACE *columns, global const narrow *values, global const uchar *scales, global const real *x,
     int stride, int j, int end)
 {
     lanes s0 = 0, s1 = 0, s2 = 0, s3 = 0;  // four sums hide the latency of the addition
@@ -128,7 +122,7 @@ static inline lanes tile_sum(
 }
 
 #define SLAB_ARGUMENTS \
-    global const int *pointers, global const place *columns, global const narrow *values, global const uchar *scales
+    global const int *pointers, global const PLACE *columns, global const narrow *values, global const uchar *scales
 
 kernel void tile_matvec(PRODUCT_ARGUMENTS, SLAB_ARGUMENTS, local real *scratch)
 {

@@ -46,12 +46,12 @@ kernel void vector_dots(
     columns_sum(dot_share(x, y, weighted ? weights : 0, s), sums, 0, s, scratch);
 }
 
-#define STEP(number, LOAD, STORE, i)                                                                \
-    {                                                                                               \
-        const number direction = LOAD(d + i), residual = LOAD(r + i) - LOAD(p + i);                 \
-        STORE(LOAD(x + i) + direction, x + i);                                                      \
-        STORE(residual, r + i);                                                                     \
-        STORE(keep * direction + gain * residual, d + i);                                           \
+#define STEP(number, LOAD, STORE, i) \
+    { \
+        const number direction = LOAD(d + i), residual = LOAD(r + i) - LOAD(p + i); \
+        STORE(LOAD(x + i) + direction, x + i); \
+        STORE(residual, r + i); \
+        STORE(keep * direction + gain * residual, d + i); \
     }
 
 // One step with p = S d: x += d, r -= p, d = keep d + gain r, and the squares of r, summed by columns, to squares

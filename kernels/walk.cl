@@ -8,18 +8,18 @@
 //
 // A step goes from i to j with probability |R_ij| / |R_i| and multiplies the weight by sign(R_ij) |R_i|; a row without
 // entries ends the walk. After step k it goes on with probability steps[k].y / 2^22; steps[k].x is c_k over the
-// probability to score. LINKED walks draw from a table of other probabilities, whose entry t leads to links[t], a
-// column and the factors that the weights of channels take.
+// probability to score. LINKED walks draw from other probabilities: entry t leads to links[t], a column and the
+// factors of the weights of all channels.
 //
-// A work-item takes WALKS chunks of CHUNK samples of one pixel, one walk of each at a time, so that their loads do not
-// wait for each other. Random numbers are a function of pixel, sample, step, stream and seed, samples are summed in
-// order, and arithmetic is + and * without contraction: no bit depends on WALKS, launches or devices above 2^-126.
+// A work-item takes WALKS chunks of CHUNK samples of one pixel, one walk of each at a time: their loads overlap. Random
+// numbers depend on pixel, sample, step, stream and seed, samples are summed in order, and a * b + c is not contracted:
+// no bit depends on WALKS, launches or devices above 2^-126.
 //
 // Layout: a row has a record (x, y: place of its first entry, low word first; z: entries, 0 where there is nothing to
 // draw; w: its sum |R_i|, the bits of a real). An entry is one load of 64 bits:
 //   threshold 18 | own column 22, sign 1 | alias column 22, sign 1
-// Chunk c of a pixel holds samples first + c CHUNK up to `end`. b is row-major with `stride` columns, of which
-// offset .. offset + K - 1 are taken, of one channel after the other. Out: (units, K) sums, squares.
+// Chunk c of a pixel holds samples first + c CHUNK up to `end`. Of the `stride` columns of b those from `offset` on are
+// taken, of one channel after the other. Out: (units, K) sums, squares.
 
 #pragma OPENCL FP_CONTRACT OFF
 
@@ -35,25 +35,23 @@
 #define GO_ON_BITS 22
 #define SLOT_BITS 42  // the rest of 64
 
-// What a walk will load is asked for while others are at work: a third less time a step. The prefetch() of OpenCL
-// does nothing in PoCL.
+// Loads asked for ahead: a third less time a step. The prefetch() of OpenCL does nothing in PoCL.
 #if WALKS > 1 && defined(__clang__)
 #define FETCH(p) __builtin_prefetch((const void *)(size_t)(p))
 #else
 #define FETCH(p)
 #endif
 
-// The walks of a work-item, side by side; sample `next` comes next, up to `stop`.
+// The walks of a work-item, side by side.
 typedef struct {
-    uint pixel[WALKS], next[WALKS], stop[WALKS], row[WALKS], step[WALKS], target[WALKS];
+    uint pixel[WALKS], next[WALKS], stop[WALKS], row[WALKS], step[WALKS], target[WALKS];  // samples next .. stop - 1
     int alive[WALKS];
     real weight[CHANNELS][WALKS], factor[CHANNELS][WALKS];  // `factor`, `target`: what the step to come leads to
     ulong word[WALKS];  // its random number
     uint4 record[WALKS];
 } walks;
 
-// The first half of a block of Philox4x32-10 (Salmon, Moraes, Dror and Shaw, Parallel Random Numbers: As Easy as 1, 2,
-// 3, SC 2011) of the counter (x, y, z, w).
+// Half a block of Philox4x32-10 (Salmon et al., Parallel Random Numbers: As Easy as 1, 2, 3, SC 2011) at (x, y, z, w).
 static inline void philox(walks *walk, uint stream, ulong seed)
 {
     ulong x[WALKS], y[WALKS], z[WALKS], w[WALKS];
@@ -94,8 +92,7 @@ static inline void set_out(walks *walk, int units, int chunks, uint first, uint 
 }
 
 // Prepare one step of all walks: start the next samples where walks have ended, and draw. Returns whether any walk
-// is under way. Walks that have ended take the step too, from their start, and nobody looks. `links` are read
-// where LINKED only; `b` may be 0.
+// is under way; the others take a step that does not count. `links` are read where LINKED only; `b` may be 0.
 static inline int draw_steps(
     walks *walk, ulong seed, uint stream, global const uint4 *rows, global const ulong *entries,
     global const uint4 *links, global const real *b, int stride)
@@ -142,8 +139,7 @@ static inline int draw_steps(
     return busy;
 }
 
-// Move walk w. Returns whether it goes on after its score; `worth`, what a score of each channel is multiplied by,
-// is left as it is, 0, where the row is empty.
+// Move walk w. Returns whether it goes on after its score, which counts `worth` times: unchanged by an empty row.
 static inline int move(walks *walk, int w, global const uint2 *steps, real *worth)
 {
     int seen = 0;
@@ -211,10 +207,9 @@ kernel void walk_columns(
 }
 
 // Alias tables for drawing the entries of a row in proportion to |R_ij| (eq. 25): Walker's (1974), by one sweep over
-// light and heavy entries with the mass that the heavy one has left (L. Huebschle-Schneider and P. Sanders, Parallel
-// Weighted Random Sampling, ESA 2019), in integers. A row is scaled by the power of two that makes its sum C as large
-// as its length n allows; each of n bins has room for C, and entry t has the mass n |R_it|. Rounding moves less than
-// 2^-18 of a row's probability, in total variation, in rows of up to 2^20 entries.
+// light and heavy entries (Huebschle-Schneider and Sanders, Parallel Weighted Random Sampling, ESA 2019), in integers:
+// of n bins each has room for C, the sum of the row scaled by the largest power of two, and entry t has the mass
+// n |R_it|. Rounding moves less than 2^-18 of a row's probability, in total variation, of up to 2^20 entries.
 
 #define BIT_LENGTH(x) (64 - (int)clz((ulong)(x)))
 
@@ -252,27 +247,22 @@ static inline void fill_bins(
     NEXT(heavy, >);
     ulong left = heavy < n ? MASS(heavy) : 0;
     while (light < n || heavy < n) {
-        uint own, other;
-        ulong mass = capacity;
-        if (heavy < n && left > capacity) {  // the light one's bin is filled up by the heavy one
-            own = light, other = heavy;
+        uint own = heavy, other = heavy;
+        ulong mass = left;
+        if (heavy >= n || left > capacity) {  // the light one's bin, filled up by the heavy one, or full already
+            own = light;
             mass = MASS(light);
             left -= capacity - mass;
             NEXT(light, <=);
-        } else if (heavy < n) {  // what the heavy one has left is its own bin, filled up by the next
-            own = other = heavy;
-            mass = left;
+        } else {  // what the heavy one has left is its own bin, filled up by the next
             NEXT(heavy, >);
             if (heavy < n) {
                 left += MASS(heavy) - capacity;
                 other = heavy;
             }
-        } else {  // no mass is lost on the way: these are full
-            own = other = light;
-            NEXT(light, <=);
         }
         ulong threshold = ((mass << THRESHOLD_BITS) + capacity / 2) / capacity;
-        if (threshold >> THRESHOLD_BITS) {
+        if (threshold >> THRESHOLD_BITS) {  // a full bin, as all are once no heavy one is left: no mass is lost
             other = own;
             threshold = 0;
         }

@@ -7,14 +7,13 @@
 // several levels, first .. last - 1, takes one group a piece, which waits for itself between levels.
 //
 // Required defines: K, see common/lanes.h; TAPS and PAIRS. Layout: a picture is row-major, its k right-hand sides side
-// by side. Coefficients stand as PyWavelets' coeffs_to_array puts them: of each side the approximation first,
-// ceil(n / 2) of n. taps[2 * TAPS] is the low-pass filter, then the high-pass one, in the order of the samples. near
-// holds the approximations of the levels 1 .. levels - 1, that of level i + 1 from pixel starts[i] on.
+// by side. Coefficients stand as in PyWavelets' coeffs_to_array: of each side the approximation first, ceil(n / 2) of
+// n. taps[2 * TAPS]: low-pass filter, high-pass filter, in the order of the samples. near: the approximations of levels
+// 1 .. levels - 1, that of level i + 1 from pixel starts[i] on.
 //
-// A side that is `level` times halved has n = ceil(pixels / 2^level) samples, the last of which may stand for fewer
-// pixels than the others. It stays out of the filters; where an odd number of whole ones is left, the last two turn
-// into one of the approximation and a detail, by a rotation that takes a constant to the approximation alone.
-// Orthonormal, and a constant has one coefficient on any grid.
+// Of the ceil(pixels / 2^level) samples of a side the last may stand for fewer pixels. It stays out of the filters;
+// where an odd number of whole ones is left, a rotation turns the last two into one of the approximation and a detail,
+// which is 0 of a constant: orthonormal, and a constant has one coefficient on any grid.
 
 #include "common/lanes.h"
 
@@ -26,8 +25,8 @@
 #define WRAPPED(i, n) (((i) % (n) + (n)) % (n))
 #define FIRST ((HALF + 1) % 2)  // where the samples of pair 0 begin that need the same coefficients
 
-// PAIRS neighbours, of samples every second one. At the edges all lanes hold the same, and the first one counts.
-// SHUFFLE takes the first samples of pairs and the second ones to the order of pixels.
+// PAIRS neighbours, of samples every second one; at the edges all lanes are equal. SHUFFLE interleaves the first and
+// the second samples of pairs.
 #if PAIRS == 8
 typedef real8 wide;
 #define SAMPLES(p) ((real8)(LOAD8(p).even, LOAD8((p) + 8).even))
@@ -46,20 +45,16 @@ typedef lanes wide;
 #define SHUFFLE(u, v)
 #endif
 
-// n samples make `pairs` of the approximation, `regular` of them by the filters. c and s turn
-// the last two samples, where they are not a regular pair.
 typedef struct {
-    int n, pairs, regular;
-    real c, s;
+    int n, pairs, regular;  // samples; of the approximation; by the filters
+    real c, s;              // cosine and sine for the last two samples, where they are not a regular pair
 } side;
 
 static inline side side_at(int pixels, int level)
 {
-    const int size = 1 << level, whole = pixels >> level, rest = pixels & (size - 1);
-    const int n = whole + (rest > 0);
+    const int size = 1 << level, whole = pixels >> level, rest = pixels & (size - 1), n = whole + (rest > 0);
     const real total = size + rest;
-    side a = {n, (n + 1) / 2, whole / 2, sqrt(size / total), sqrt(rest / total)};
-    return a;
+    return (side){n, (n + 1) / 2, whole / 2, sqrt(size / total), sqrt(rest / total)};
 }
 
 // Term t of pair m. Of analysis: sample `low`, and its weights in approximation and detail. Of synthesis:
@@ -112,10 +107,9 @@ static inline int place(side a, int m, int which)
     return m < a.regular ? (i + FIRST) % (2 * a.regular) : i;
 }
 
-// Of a pair of rows and one of columns, or PAIRS of these; v01 is of the rows' first and the columns' second.
 typedef struct {
     wide v00, v01, v10, v11;
-} quad;
+} quad;  // of a pair of rows and PAIRS of columns: v01 is of the rows' first and the columns' second
 
 INLINE quad split(side a, int i, side b, int j, bool inside, global const real *x, int k, constant real *taps)
 {
@@ -169,14 +163,17 @@ INLINE quad join(
     return q;
 }
 
-INLINE void store(global real *out, int i, wide v, bool inside, int skip, real a, real b, global const real *y)
+// out = a v + b y at i .., where such samples exist.
+INLINE void store(
+    bool exist, global real *out, int i, wide v, bool inside, int skip, real a, real b, global const real *y)
 {
 #if PAIRS == 8
-    if (inside)
+    if (exist && inside)
         STORE8(b != 0 ? a * v + b * LOAD8(y + i) : a * v, out + i);
     else
 #endif
-        put(out, i, ONE(v), skip, a, b, y);
+        if (exist)
+            put(out, i, ONE(v), skip, a, b, y);
 }
 
 #define TRANSFORM \
@@ -201,14 +198,11 @@ kernel void wavelet_split(TRANSFORM)
                 const quad q = inside ? split(a, i, b, j, true, from, k, taps)
                                       : split(a, i, b, j, false, from, k, taps);
                 const int right = b.pairs * k, below = a.pairs * width * k, here = (i * width + j) * k + p.at;
-                const bool at_right = b.pairs + j < b.n, at_below = a.pairs + i < a.n;
-                store(to, (i * (deepest ? width : b.pairs) + j) * k, q.v00, inside, p.skip, u, v, add + p.at);
-                if (at_right)
-                    store(out, here + right, q.v01, inside, p.skip, scale, add_scale, add);
-                if (at_below)
-                    store(out, here + below, q.v10, inside, p.skip, scale, add_scale, add);
-                if (at_right && at_below)
-                    store(out, here + below + right, q.v11, inside, p.skip, scale, add_scale, add);
+                const bool at_right = b.pairs + j < b.n, at_below = a.pairs + i < a.n, both = at_right && at_below;
+                store(true, to, (i * (deepest ? width : b.pairs) + j) * k, q.v00, inside, p.skip, u, v, add + p.at);
+                store(at_right, out, here + right, q.v01, inside, p.skip, scale, add_scale, add);
+                store(at_below, out, here + below, q.v10, inside, p.skip, scale, add_scale, add);
+                store(both, out, here + below + right, q.v11, inside, p.skip, scale, add_scale, add);
                 done = inside ? PAIRS : 1;
             }
         barrier(CLK_GLOBAL_MEM_FENCE);
@@ -238,13 +232,11 @@ kernel void wavelet_join(TRANSFORM)
                                       : join(a, i, b, j, false, low, pitch, x, width, k, taps);
                 const int right = inside ? left + PAIRS : place(b, j, 1);
                 const int upper = place(a, i, 0) * b.n, lower = place(a, i, 1) * b.n;
-                store(to, (upper + left) * k, q.v00, inside, p.skip, u, v, add);
-                if (right < b.n)
-                    store(to, (upper + right) * k, q.v01, inside, p.skip, u, v, add);
-                if (lower < a.n * b.n)
-                    store(to, (lower + left) * k, q.v10, inside, p.skip, u, v, add);
-                if (right < b.n && lower < a.n * b.n)
-                    store(to, (lower + right) * k, q.v11, inside, p.skip, u, v, add);
+                const bool at_right = right < b.n, at_below = lower < a.n * b.n;
+                store(true, to, (upper + left) * k, q.v00, inside, p.skip, u, v, add);
+                store(at_right, to, (upper + right) * k, q.v01, inside, p.skip, u, v, add);
+                store(at_below, to, (lower + left) * k, q.v10, inside, p.skip, u, v, add);
+                store(at_right && at_below, to, (lower + right) * k, q.v11, inside, p.skip, u, v, add);
                 done = inside ? PAIRS : 1;
             }
         barrier(CLK_GLOBAL_MEM_FENCE);

@@ -70,8 +70,7 @@ __all__ = [
     "theory",
 ]
 
-# They bring OpenCV or matplotlib, which not everybody needs.
-_LAZY = ("acquisition", "batch", "images", "plots", "scenes")
+_LAZY = ("acquisition", "batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib
 
 
 def __getattr__(name: str) -> Any:

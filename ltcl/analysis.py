@@ -38,8 +38,7 @@ class ChannelAnalysis:
     certificates : dict
         What each forecast rests on; see `theory.Forecast`.
     series : tuple of theory.Terms
-        What 1, 2, 4, 8 and 16 terms of the series leave undone (eq. 13, 15, 16), with m from the upper bound
-        on rho(R), in the norm in which a reciprocal T makes A self-adjoint.
+        What 1, 2, 4, 8 and 16 terms of the series leave undone (eq. 13, 15, 16), m from the bound on rho(R).
     first_bounce : (smallest, median, largest)
     reciprocity_defect, negative_bounce : float
         Both 0 of a Lambertian scene without noise, the second above 0.005 of glossy ones: `ltcl.diagnostics`.
@@ -79,6 +78,17 @@ class Analysis:
         (h, w), radii = self.grid, ", ".join(f"{one.spectral_radius:.3g}" for one in self.channels)
         return f"<ltcl Analysis grid {h} x {w}, rho(R) {radii}>"
 
+    def _repr_html_(self) -> str:
+        from ltcl.images.thumbnails import figures  # brings OpenCV
+
+        bars = {}
+        for one in self.channels:
+            counts = {name: n for name, n in one.products.items() if math.isfinite(n)}
+            label = "products: " + ", ".join(f"{name} {n:.0f}" for name, n in counts.items())
+            lengths = np.array([*counts.values()])[:, None]
+            bars[label] = np.repeat(np.linspace(0, lengths.max(), 64) <= lengths, 4, axis=0)
+        return figures(self, bars)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON; what is infinite or unknown is None."""
         return report.plain(self)
@@ -87,8 +97,7 @@ class Analysis:
 def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     """Norms and spectral radius of R, the products each method would need, and checks of the measurement.
 
-    T is a square Transport; a rectangular one raises InputError. The forecast is for the tolerance `rtol`,
-    from what float32 products can confirm, 1.2e-7, to 1.
+    T is square, else InputError. The forecast is for the tolerance `rtol`, from 1.2e-7 to 1.
 
     Examples
     --------

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import decimal
 import math
 import operator
 import os
@@ -16,6 +17,14 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+
+_BOUNDS = {
+    "above": ("above", operator.gt),
+    "least": ("at least", operator.ge),
+    "most": ("at most", operator.le),
+    "below": ("below", operator.lt),
+}
+_UPWARDS = decimal.Context(prec=2, rounding=decimal.ROUND_CEILING)
 
 
 def finite(name: str, array: np.ndarray) -> np.ndarray:
@@ -34,20 +43,16 @@ def finite(name: str, array: np.ndarray) -> np.ndarray:
 def real(name: str, value: Any) -> np.ndarray:
     """Return `value` as an array of real numbers (no copy where it is one); refuse others."""
     if isinstance(value, (str, os.PathLike)):
-        raise InputTypeError(
-            f"{name} is the text {str(value)!r}; it must be an array of real numbers: read a picture with "
-            "ltcl.images.read, a transport with ltcl.load"
-        )
+        reading = "read a picture with ltcl.images.read, a transport with ltcl.load"
+        raise InputTypeError(f"{name} is the text {str(value)!r}; it must be an array: {reading}")
     unmasked(name, value)
     try:
         array = np.asarray(value)
     except ValueError as error:
         raise InputError(f"{name} is ragged; it must be a rectangular array of real numbers") from error
     if array.dtype.kind not in "fiub":
-        kind = {"c": "complex numbers", "O": "Python objects"}.get(array.dtype.kind, str(array.dtype))
-        raise InputTypeError(
-            f"{name} {'is None' if value is None else f'holds {kind}'}; it must hold real numbers"
-        )
+        wrong = "is None" if value is None else f"holds {array.dtype}"
+        raise InputTypeError(f"{name} {wrong}; it must hold real numbers")
     return array
 
 
@@ -73,34 +78,19 @@ def grid(name: str, value: Any, pixels: int | None = None) -> tuple[int, int]:
     if h < 1 or w < 1 or (h, w) != tuple(value):
         raise InputError(f"{name} is {shown(value)}; it must be two positive integers (h, w)")
     if pixels is not None and h * w != pixels:
-        raise InputError(
-            f"{name} is {h} x {w} = {h * w} pixels, but the matrix is for {pixels}; h * w must be {pixels}"
-        )
+        raise InputError(f"{name} is {h} x {w} = {h * w} pixels; h * w must be {pixels}")
     return h, w
 
 
-def number(
-    name: str,
-    value: Any,
-    *,
-    above: float | None = None,
-    least: float | None = None,
-    most: float | None = None,
-    below: float | None = None,
-) -> float:
-    """Return `value` as a finite float inside the bounds given."""
+def number(name: str, value: Any, **bounds: float) -> float:
+    """Return `value` as a finite float; bounds are above=, least=, most= and below=."""
     x = math.nan
     if not isinstance(value, (bool, str, bytes)) and not getattr(value, "ndim", 0):
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             x = float(value)
-    limits = (
-        ("above", above, operator.gt),
-        ("at least", least, operator.ge),
-        ("at most", most, operator.le),
-        ("below", below, operator.lt),
-    )
-    if not math.isfinite(x) or not all(bound is None or holds(x, bound) for _, bound, holds in limits):
-        allowed = " and ".join(f"{text} {bound:g}" for text, bound, _ in limits if bound is not None)
+    limits = [(*_BOUNDS[side], bound) for side, bound in bounds.items()]
+    if not math.isfinite(x) or not all(holds(x, bound) for _, holds, bound in limits):
+        allowed = " and ".join(f"{text} {bound:g}" for text, _, bound in limits)
         raise InputError(f"{name} is {shown(value)}; it must be a finite number {allowed}".rstrip())
     return x
 
@@ -142,10 +132,7 @@ def one_of(name: str, value: Any, allowed: Iterable[Any]) -> Any:
 
 
 def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
-    """Return `matrix` as a checked `csr_array` with sorted, unique indices.
-
-    Checked before SciPy converts it, which reads outside its arrays where column indices are beyond it.
-    """
+    """Return `matrix` as a checked `csr_array` with sorted, unique indices."""
     if not scipy.sparse.issparse(matrix):
         raise InputTypeError(f"{name} is a {type(matrix).__name__}; it must be a scipy.sparse array")
     if matrix.ndim != 2:
@@ -157,7 +144,7 @@ def csr(name: str, matrix: Any) -> scipy.sparse.csr_array:
     if matrix.format not in ("csr", "csc"):
         matrix = scipy.sparse.csr_array(matrix)
     shape = matrix.shape if matrix.format == "csr" else matrix.shape[::-1]
-    compressed(name, matrix.indptr, matrix.indices, matrix.data, shape)
+    compressed(name, matrix.indptr, matrix.indices, matrix.data, shape)  # SciPy may read outside of arrays
     result = scipy.sparse.csr_array(matrix)
     if not result.has_canonical_format:
         result = result.copy()
@@ -207,8 +194,7 @@ def host_memory() -> int:
 
 def fits_host(what: str, needed: int) -> None:
     """Refuse an allocation of `needed` bytes that the host does not have, before it is tried."""
-    available = host_memory()
-    if needed > available:
+    if needed > (available := host_memory()):
         raise MemoryLimitError(f"{what} needs {size(needed)}, but the host has {size(available)} free")
 
 
@@ -230,8 +216,4 @@ def size(nbytes: float) -> str:
 
 def upwards(error: float) -> str:
     """Two digits, rounded up: 0.00421 -> '0.0043'."""
-    if not 0.0 < error < math.inf:
-        return f"{error:g}"
-    unit = 10.0 ** (math.floor(math.log10(error)) - 1)
-    near = float(f"{error:.1e}")
-    return f"{near if near >= error else near + unit:.2g}"
+    return f"{float(_UPWARDS.create_decimal(repr(float(error)))):.2g}"

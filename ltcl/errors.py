@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Every problem ltcl raises, as one small family.
 
-A message is one line: the argument, what it was, what it must be. Each is also the builtin exception that a
-Python user expects, and what is beside the message has a default, so that `pickle` needs the message alone.
+A message is one line: the argument, what it was, what it must be. Each is a builtin exception, too.
 """
 
 from __future__ import annotations
@@ -52,11 +51,11 @@ class ScanRefused(AcquisitionError):
 
 
 class PhotographMissing(AcquisitionError):
-    """A photograph has yet to be taken by a person; `number` is its place in the shooting list."""
+    """A person has yet to take the photograph `shot` of the shooting list; `missing` are not there yet."""
 
-    def __init__(self, message: str, number: int = 0) -> None:
+    def __init__(self, message: str, number: int = 0, shot: Any = None, missing: int = 1) -> None:
         super().__init__(message)
-        self.number = number
+        self.number, self.shot, self.missing = number, shot, missing
 
 
 class ConvergenceError(LtclError, ArithmeticError):

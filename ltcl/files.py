@@ -1,58 +1,57 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Output that is there whole or not at all, and input files that are files.
 
-New content goes into a temporary on the same disk, is flushed and renamed into place, which is atomic:
-whatever ends a run early leaves the earlier file as it was. A killed process leaves a hidden temporary.
+A hidden temporary on the same disk is written, flushed and renamed, which is atomic. Its name tells host and
+process: the next writer in a folder removes those of processes that were killed (not on Windows).
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import platform
+import re
 import secrets
 import shutil
 import stat
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ltcl.errors import FileError, InputTypeError, LtclError
 
+_HOST = f"{zlib.crc32(platform.node().encode()):08x}"
+_TEMPORARY = re.compile(rf"\..*-{_HOST}-(\d{{1,9}})-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
+
 
 def input_file(path: Any) -> Path:
     """Return `path` as a Path if it is a regular file with something in it, else raise FileError."""
     path = as_path(path)
     try:
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):  # asked before opening: a named pipe would block
-            kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
-            raise FileError(f"{path}: is {kind}; it must be a file")
-        path.open("rb").close()
+        status = path.stat()
+        if stat.S_ISREG(status.st_mode):  # asked before opening: a named pipe would block
+            path.open("rb").close()
     except FileNotFoundError:
         raise FileError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:
-        raise error if isinstance(error, FileError) else _refusal(path, "cannot be read", error) from error
-    if not path.stat().st_size:
+        raise _refusal(path, "cannot be read", error) from error
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if path.is_dir() else "no regular file"
+        raise FileError(f"{path}: is {kind}; it must be a file")
+    if not status.st_size:
         raise FileError(f"{path}: the file is empty")
     return path
 
 
 def as_path(path: Any, name: str = "path") -> Path:
-    """Return `path` (str or os.PathLike) as a Path; refuse everything else."""
+    """Return `path` (str or os.PathLike) as a Path; refuse everything else, and an empty text."""
+    if path == "":
+        raise FileError(f"{name} is ''; it must name a file or a folder")
     try:
         return Path(path)
     except TypeError:
         raise InputTypeError(f"{name} is {path!r}; it must be a str or a path") from None
-
-
-def refuse_appended(path: Path, comment: bytes) -> None:
-    """Refuse a zip archive with bytes, which readers skip, behind its end record and its `comment`."""
-    size = 22 + len(comment)
-    with path.open("rb") as file:
-        file.seek(-size, os.SEEK_END)
-        record = file.read(size)
-    if not record.startswith(b"PK\x05\x06") or int.from_bytes(record[20:22], "little") != len(comment):
-        raise FileError("the archive does not end where it says: bytes were appended, or it is damaged")
 
 
 def unknown_extension(path: Path) -> str:
@@ -72,7 +71,7 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         if target.exists() and not target.is_file():
             kind = "a folder" if target.is_dir() else "no regular file"
             raise FileError(f"{path}: is {kind}; a file cannot be written there")
-        temporary = target.parent / f".{target.stem[:40]}-{secrets.token_hex(6)}{target.suffix}"
+        temporary = _temporary(target.parent, target.stem, target.suffix)
         try:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             yield temporary
@@ -86,29 +85,61 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def fill_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+def fill_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
     """Fill a temporary folder; put it at `path` only when the block ends well.
 
-    Renamed into place in one step; into an existing folder, which may be a disk of its own, files are moved
-    one by one, each replacing its namesake; others stay. Parents, links, errors: see `replace_file`.
+    Into an existing folder files are moved one by one, and others stay; with `replace` the new folder takes
+    its place (see `restore`). Parents, links, errors: see `replace_file`.
     """
     with _written(path) as target:
         if target.exists() and not target.is_dir():
             raise FileError(f"{path}: is a file; a folder cannot be written there")
-        temporary = (target if target.exists() else target.parent) / f".ltcl-{secrets.token_hex(6)}"
+        joins = target.exists() and not replace
+        temporary = _temporary(target, "ltcl") if joins else _temporary(target.parent, target.name)
         try:
             temporary.mkdir()
             yield temporary
-            files = [file for file in sorted(temporary.rglob("*")) if file.is_file()]
-            for file in files:
-                _flush(file)
-            if target.exists():
+            files = flush_tree(temporary)
+            if joins:
                 _move_into(target, temporary, files)
             else:
+                if target.exists():
+                    os.replace(target, _earlier(target))
                 os.replace(temporary, target)
             _flush_folder(target.parent)
         finally:
+            if replace:
+                restore(target)
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def restore(target: Path) -> None:
+    """Make one folder of the two that a run leaves which ended between two renames of `fill_folder`."""
+    earlier = _earlier(target)
+    if not os.path.lexists(target) and earlier.exists():
+        os.replace(earlier, target)
+    shutil.rmtree(earlier, ignore_errors=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove the temporaries of processes of this host that are no more."""
+    names = os.listdir(folder) if os.name != "nt" and os.access(folder, os.R_OK) else []
+    for owner in filter(None, map(_TEMPORARY.fullmatch, names)):
+        with contextlib.suppress(PermissionError):  # it lives, and is somebody else's
+            try:
+                os.kill(int(owner[1]), 0)  # asks, and does nothing
+            except ProcessLookupError:
+                place = folder / owner[0]
+                shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
+
+
+def _temporary(folder: Path, stem: str, suffix: str = "") -> Path:
+    sweep(folder)
+    return folder / f".{stem[:40]}-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{suffix}"
+
+
+def _earlier(target: Path) -> Path:
+    return target.with_name(f".{target.name[:80]}.ltcl-earlier")
 
 
 def _move_into(target: Path, temporary: Path, files: list[Path]) -> None:
@@ -153,6 +184,16 @@ def _written(path: str | os.PathLike[str]) -> Iterator[Path]:
 def _refusal(path: Path, what: str, error: Exception) -> FileError:
     reason = " ".join(str(getattr(error, "strerror", None) or error).split())
     return FileError(f"{path}: {what}: {reason}")
+
+
+def flush_tree(folder: Path) -> list[Path]:
+    """Flush all in a folder to the disk; its files."""
+    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    for file in files:
+        _flush(file)
+    for inner in {file.parent for file in files}:
+        _flush_folder(inner)
+    return files
 
 
 def _flush(path: Path) -> None:

@@ -3,8 +3,7 @@
 
 F_i = 1 / (T^-1)_ii, since T^-1 = F^-1 (I - A) and A has no diagonal. Where T is too large to invert,
 T^-1 = F0^-1 S0^-1 with F0 = diag(T), S0 = T F0^-1, and z_i (S0^-1 z)_i of random signs z has the mean
-(S0^-1)_ii and, averaged over K probes, the variance sum_{j != i} (S0^-1)_ij^2 / K (Bekas, Kokiopoulou, Saad,
-Applied Numerical Mathematics 57, 2007): one bounce spread over many pixels, so few probes are enough.
+(S0^-1)_ii and, of K probes, the variance sum_{j != i} (S0^-1)_ij^2 / K (Bekas, Kokiopoulou, Saad 2007).
 """
 
 from __future__ import annotations
@@ -66,10 +65,8 @@ def _diagonal(matrix: Any) -> np.ndarray:
 def _exact(matrix: Any) -> np.ndarray:
     """1 / diag(T^-1), by a dense inverse of the pixels that are lit."""
     if not isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)):
-        raise InputTypeError(
-            f"first_bounce is 'exact', but a {type(matrix).__name__} shows no entries to invert; give "
-            "'estimate' or an array (N,)"
-        )
+        kind = type(matrix).__name__
+        raise InputTypeError(f"first_bounce is 'exact', but a {kind} has no entries; give 'estimate' or F")
     dense = (matrix if isinstance(matrix, np.ndarray) else matrix.toarray()).astype(np.float64)
     lit = dense.any(axis=0) & dense.any(axis=1)  # a dark pixel would make T singular; its F is 0
     dense = dense[np.ix_(lit, lit)]
@@ -80,13 +77,11 @@ def _exact(matrix: Any) -> np.ndarray:
     except RuntimeError as error:  # SciPy's of work arrays that LAPACK did not get
         raise MemoryError(str(error)) from error
     except (np.linalg.LinAlgError, scipy.linalg.LinAlgWarning) as error:
-        text = "first_bounce is 'exact', but T is singular in float64; give 'diagonal' or an array (N,)"
-        raise InputError(text) from error
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        inverted = 1.0 / np.diagonal(inverse)
+        raise InputError("first_bounce is 'exact', but T is singular in float64; give 'diagonal'") from error
     F = np.zeros(lit.shape)
-    F[lit] = np.where(np.isfinite(inverted), inverted, 0.0)
-    return F
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        F[lit] = 1.0 / np.diagonal(inverse)
+    return np.nan_to_num(F, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _estimate(
@@ -113,27 +108,18 @@ def _estimate(
     return F, error
 
 
-def mask_dark(
-    F: np.ndarray, grid: tuple[int, int], on_dark: str, may_mask: bool
-) -> tuple[np.ndarray, np.ndarray]:
+def mask_dark(F: np.ndarray, grid: tuple[int, int], may_mask: bool) -> tuple[np.ndarray, np.ndarray]:
     """F with 0, and True (N,), where some channel's is not positive; refused unless it may be masked."""
     dark: np.ndarray = np.any(F <= 1e-300, axis=0)  # 0 as well, whose inverse is no number
     pixels = np.flatnonzero(dark)
     if len(pixels) == len(dark):
-        raise InputError(
-            "first_bounce is zero or negative at every pixel; it must be positive where light falls: "
-            "check the sign and the black level of T"
-        )
+        raise InputError("first_bounce is zero or negative at every pixel: check sign and black level of T")
     if not len(pixels) or may_mask:
         return np.where(dark, 0.0, F), dark
     first = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
-    advice = (
-        "give on_dark='mask' to leave these pixels unlit",
-        "make a Transport of an array with on_dark='mask', or mask this LinearOperator yourself",
-    )
     raise InputError(
-        f"first_bounce is zero or negative at {len(pixels)} of {len(dark)} pixels (row, column): {first}"
-        f"{', ...' if len(pixels) > 8 else ''}; it must be positive; {advice[on_dark == 'mask']}"
+        f"first_bounce is zero or negative at {len(pixels)} of {len(dark)} pixels (row, column): {first}; "
+        "it must be positive; give on_dark='mask' to leave them unlit, which a LinearOperator cannot"
     )
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pictures as right-hand sides of a linear system, matrices by colour channel.
 
-A picture is (h, w) or (h, w, 3), with frames in front where there are several, or flat (N,). A system of
-N pixels takes (N, k), a column a frame, and for a transport of one channel a column a colour, too.
+A picture is (h, w), (h, w, 3), frames of these, or flat (N,). A system of N pixels takes (N, k), a column a
+frame, and for a transport of one channel a column a colour, too.
 """
 
 from __future__ import annotations
@@ -20,10 +20,7 @@ from ltcl import checks
 from ltcl.errors import InputError
 
 logger = logging.getLogger(__name__)
-UNITS = (  # of a warning
-    "it is taken as linear light in the units of T; divide by %d if it is linear light; if it is an sRGB "
-    "picture, read the file with ltcl.images.read"
-)
+UNITS = "it is taken as linear light in the units of T; divide by %d, or read sRGB by ltcl.images.read"
 _BLOCK = 4096  # pixels that are transposed at once: caches hold them
 _LARGEST_CONDITION = 1e6  # of a mixing: beyond, float32 has hardly a digit left
 
@@ -55,10 +52,7 @@ class Layout:
 
 
 def unpack(name: str, picture: Any, grid: tuple[int, int], channels: int) -> tuple[list[np.ndarray], Layout]:
-    """Cut a picture (N,), (h, w), (h, w, 3), or frames, into the right-hand sides (N, k) of each channel.
-
-    Copies; a grey picture serves all three channels. A warning where it holds the codes of a picture file.
-    """
+    """Copies of a picture as right-hand sides (N, k) of each channel; warns of the codes of a file."""
     array = checks.finite(name, checks.real(name, picture))
     if array.dtype.kind in "iu" and array.size and array.max() > 1:
         white = np.iinfo(array.dtype).max if array.dtype in (np.uint8, np.uint16) else 255

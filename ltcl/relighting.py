@@ -13,17 +13,8 @@ from ltcl.transport import Transport, require
 def relight(T: Transport, pattern: Any) -> np.ndarray:
     """The picture the camera sees under `pattern`; the same as ``T @ pattern``.
 
-    Parameters
-    ----------
-    T : Transport, (M, N)
-    pattern : (h, w), (h, w, 3), frames of these, or (N,)
-        Linear projector light.
-
-    Returns
-    -------
-    array, float32
-        On the camera's grid; in colour where the transport or the pattern is. A pattern of another size, NaN
-        or infinite values raise InputError.
+    `pattern` is linear projector light, (h, w), (h, w, 3), frames of these, or (N,). The picture is float32,
+    on the camera's grid, in colour where T or the pattern is. Another size or NaN raise InputError.
 
     Examples
     --------

@@ -65,8 +65,8 @@ def _spread(error: np.ndarray | None) -> dict[str, float] | None:
 
 def device(opened: Device) -> dict[str, Any]:
     """Which device worked."""
-    facts = {name: getattr(opened, name) for name in ("name", "kind", "driver")}
-    return {"index": opened.description.index, **facts}
+    index = opened.description.index
+    return {"index": index, "name": opened.name, "kind": opened.kind, "driver": opened.driver}
 
 
 def versions() -> dict[str, str]:

@@ -6,11 +6,8 @@ light that bounced at least once, and of it b_1 = X l^(1) bounced exactly once, 
 
     b_k = X l^(k),    l^(k+1) = l^(k) - b_k
 
-Equal to the paper's chain b_k = b_(k-1) - X b_(k-1) in exact arithmetic; in this form the bounces and the
-rest add up to the picture whatever the tolerance of the solves. Nothing is clipped on the way.
-
-With one camera bounces are exact of Lambertian scenes only (section 8.4, eq. 28 and 29). A T whose I - S^-1
-takes light away, or that is far from reciprocal, is of another: the result carries a warning.
+Equal to the paper's b_k = b_(k-1) - X b_(k-1); in this form bounces and rest add up to the picture whatever
+the tolerance. With one camera they are exact of Lambertian scenes only (section 8.4, eq. 28 and 29).
 """
 
 from __future__ import annotations
@@ -73,6 +70,12 @@ class Separation:
         shape, error = " x ".join(map(str, self.direct.shape)), error_note(self.transport_error)
         return f"<ltcl Separation {shape}, direct and {len(self.bounces)} bounces{error}>"
 
+    def _repr_html_(self) -> str:
+        from ltcl.images.thumbnails import figures  # brings OpenCV
+
+        bounces = {f"bounce {k}": bounce for k, bounce in enumerate(self.bounces, 1)}
+        return figures(self, {"direct": self.direct, **bounces, "rest": self.rest})
+
 
 def separate(
     T: Transport,
@@ -92,7 +95,7 @@ def separate(
     T : Transport
         Square. The bounces are as good as its first bounce: see ``first_bounce="exact"``.
     image : (h, w), (h, w, 3), or frames of these
-        Any picture taken under the projector's light, in the units of T.
+        In the units of T.
     bounces : int
         How many indirect bounces to tell apart.
     method, rtol, **options
@@ -104,15 +107,11 @@ def separate(
     inverse : Inverse, optional
         Of T, as `ltcl.invert` makes it: each bounce is then one product, and `rtol` the error it may have.
 
-    Returns
-    -------
-    Separation
-
     Raises
     ------
     InputError
-        A rectangular T, shapes that do not fit, a negative number of bounces, an `rtol` below the error of
-        a compressed T without `exact`, or below that of `inverse`, or an inverse of another transport.
+        A rectangular T, other shapes, a negative number of bounces, an `rtol` below the error of a compressed
+        T without `exact` or of `inverse`, or an inverse of another transport.
     ConvergenceError
         A solve did not reach `rtol`.
 

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Transport`: a measured light transport T = S F of first bounce and interreflection (eq. 3).
 
-F is diagonal: projector pixel j lights the point that camera pixel j sees. S = T F^-1 = I + R is one operator
-per colour channel, on the device from its first use on.
+F is diagonal: projector pixel j lights what camera pixel j sees. S = T F^-1 = I + R is on the device.
 """
 
 from __future__ import annotations
 
+import logging
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,7 @@ from ltcl.operators import stored as stored_operators
 from ltcl.operators.interreflection import device_of, made_with, maskable, nbytes
 from ltcl.solvers import Inverse
 
+logger = logging.getLogger(__name__)
 _SAME = 1e-6  # relative difference of first bounces that float32 does not resolve
 _ROUNDING = 1e-5  # of float32, in the products that show whether an inverse belongs to a transport
 _CANCELLATION = 0.5  # of diag(S) = 1 + diag(R): from here on, I + R has all digits of T F^-1
@@ -37,46 +38,37 @@ class Transport:
     matrix : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3 for RGB, or 3 x 3 of them
         T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j, row-major.
         matrix[c][d] is what camera channel c sees of projector channel d; such a T has no S, it relights and
-        compensates. Of an operator S diag(F), as compressed ones are, S is used as it stands. Arrays are
-        kept, not copied: they must not be changed afterwards.
+        compensates. Arrays are kept, not copied: they must not be changed afterwards.
     grid : (h, w)
-        Of the projector; N = h * w.
+        Of the projector; N = h * w. A warning is logged where rows of T are much smoother on another grid.
     first_bounce : "diagonal", "exact", "estimate" or array (N,) or (3, N)
-        diag(T), which also holds light that came back; 1 / diag(T^-1), which does not, for Lambertian scenes
-        without self-illumination, by a dense inverse; a stochastic estimate of the same by products on the
-        device, opened at once, which "exact" becomes where the inverse does not fit the host; or F itself.
+        diag(T), which also holds light that came back; 1 / diag(T^-1), by a dense inverse, which does not, of
+        Lambertian scenes; an estimate of this by products, as "exact" is where the host lacks memory; or F.
     camera_grid : (h, w), optional
         Of the camera where T is rectangular, M = h * w; S then does not exist: T relights and compensates.
     device : Device or str, optional
-        As `open_device` takes it; opened at the first product only. Operators have one already.
+        As `open_device` takes it; opened at the first product. Operators have one already.
     on_dark : "raise" or "mask"
-        Where F is zero or negative: refuse, or never light these projector pixels in a compensation.
-        Relighting stays exact: what a pattern lights there is seen (not of an S diag(F)).
+        Where F is not positive: refuse, or leave these pixels dark in compensations. Relighting stays exact.
     mixing : (3, 3), optional
-        Of the projector's colours, for a T of 3 channels: the light that channel c of T answers to is
-        mixing[c] @ (red, green, blue) of the pattern.
+        Of the projector's colours: channel c of T answers to mixing[c] @ (red, green, blue) of the pattern.
     probes, seed : int
         Of the estimate, at least 2 probes of about 20 products each; its error falls as 1 / sqrt(probes).
-        Compare `first_bounce_error` with F - diag(T): with few, bounces may be worse than with the diagonal.
 
     Attributes
     ----------
     channels : 1 or 3
-        Grey or colour.
     matrices : tuple of 1 or 3
         T on the host, checked. Of 3 x 3 matrices those on the diagonal; all are in `blocks`, else None.
     is_compressed : bool
-        Whether some channel is an operator S F; see `error` and `compression`, a `ltcl.Compression` or None.
-    masked : (N,) bool
-        Projector pixels dropped by ``on_dark="mask"``, in any channel.
-    first_bounce_error : array like first_bounce, or None
-        Standard error of an estimated first bounce.
+        Whether some channel is an operator S F; see `error` and `compression`, `ltcl.Compression` or None.
+    masked : (N,) bool, projector pixels dropped by ``on_dark="mask"``, in any channel
+    first_bounce_error : array like first_bounce, or None, the standard error of an estimate
 
     Raises
     ------
     InputError
-        Wrong shapes, NaN or infinite values, malformed sparse structure, a first bounce that is not
-        positive, a mixing that cannot be undone.
+        Wrong shapes, NaN, a first bounce that is not positive, a singular mixing.
 
     Examples
     --------
@@ -124,7 +116,9 @@ class Transport:
         if self.is_square:
             F, error = _first_bounce.find(self.matrices, first_bounce, lambda: self.device, probes, seed)
             may_mask = on_dark == "mask" and all(map(maskable, self.matrices))
-            self._F, self.masked = _first_bounce.mask_dark(F, self.grid, on_dark, may_mask)
+            self._F, self.masked = _first_bounce.mask_dark(F, self.grid, may_mask)
+            if (other := diagnostics.other_grid(self.matrices[0], self.grid)) is not None:
+                logger.warning("grid is %s, but T is much smoother on a grid %s", self.grid, other)
             self.first_bounce_error = error[0] if error is not None and self.channels == 1 else error
         elif not isinstance(first_bounce, str) or first_bounce != "diagonal":
             kind = self.shape if self.blocks is None else "of 3 x 3 blocks"
@@ -136,6 +130,25 @@ class Transport:
         if self.is_compressed:
             text += f", compressed to {checks.size(self.nbytes)} with an error of {self.error:.2g}"
         return f"<ltcl Transport {text}>"
+
+    def _repr_html_(self) -> str:
+        from ltcl.images.thumbnails import figures  # brings OpenCV
+
+        if self._F is None:
+            return figures(self, {"picture under white": self @ np.ones(self.grid)})
+        return figures(self, {"first bounce": np.moveaxis(self._F.reshape(-1, *self.grid), 0, -1).squeeze()})
+
+    def to_numpy(self) -> np.ndarray:
+        """T on the host, dense: (M, N), (3, M, N) in colour, (3, 3, M, N) of blocks; `mixing` is left out."""
+        rows = self.blocks or (self.matrices,)
+        checks.fits_host("T as an array", 8 * len(rows) * len(rows[0]) * self.shape[0] * self.shape[1])
+
+        def dense(T: Any) -> np.ndarray:
+            T = T.tocsr().toarray() if hasattr(T, "tocsr") else T  # of memory, or of the rows of a store
+            return T if isinstance(T, np.ndarray) else as_operator(T, self.device).to_dense()
+
+        whole = np.array([[dense(T) for T in row] for row in rows])
+        return whole if self.blocks else whole[0] if self.channels == 3 else whole[0, 0]
 
     def __getstate__(self) -> dict[str, Any]:
         """For `pickle` and `copy.deepcopy`: without the device, which is opened again when it is needed."""
@@ -232,18 +245,11 @@ class Transport:
         pictures = [T.matmat(x) for T, x in zip(self.operators, columns, strict=True)]
         return shape.pack(pictures, self.camera_grid)
 
-    def to_light(self, columns: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Projector light F^-1 l_d from direct components (N, k) of each channel; 0 at masked pixels."""
-        return layout.to_light(columns, self._require_first_bounce(), self.mixing)
-
     def _require_first_bounce(self) -> np.ndarray:
         if self._F is None:
-            projector, camera = (f"{h} x {w}" for h, w in (self.grid, self.camera_grid))
-            maps = f"maps a projector of {projector} pixels to a camera of {camera}"
-            raise InputError(
-                f"T {maps if self.blocks is None else 'has blocks between colours'}; S = T F^-1 needs one "
-                "grid and no blocks, this T can only relight and compensate"
-            )
+            kind = f"a camera_grid {self.camera_grid}" if self.blocks is None else "blocks between colours"
+            needs = "S = T F^-1 needs one grid and no blocks: this T can only relight and compensate"
+            raise InputError(f"T has a grid {self.grid} and {kind}; {needs}")
         return self._F
 
 
@@ -299,17 +305,14 @@ def default_rtol(least: float, T: Transport, exact: Any = None, inverse: Inverse
 
 
 def to_arrays(T: Transport) -> dict[str, np.ndarray]:
-    """The arrays of a compressed T, whose every channel is S diag(d), by name: files and pickles hold these.
+    """The arrays of a compressed T, S diag(d) in each channel, for files and pickles.
 
-    Those of `ltcl.operators.stored`, grid (2,), first_bounce (channels, N), mixing (3, 3) if any, and
-    columns_0, ... (N,) of channels with another d than the first bounce.
+    Those of `ltcl.operators.stored`, grid, first_bounce, mixing if any, columns_0, ... where d is another F.
     """
     systems = [S for S in map(made_with, T.matrices) if S is not None]
     if not T.is_square or len(systems) < T.channels:
         kinds = ", ".join(sorted({type(matrix).__name__ for matrix in T.matrices}))
-        raise InputTypeError(
-            f"T is made of {kinds}; only arrays, sparse matrices and S diag(F) can be stored"
-        )
+        raise InputTypeError(f"T is made of {kinds}; only arrays, sparse matrices and S diag(F) are stored")
     F = np.atleast_2d(T.first_bounce)
     arrays = {"grid": np.array(T.grid), "first_bounce": F}
     if T.mixing is not None:
@@ -328,10 +331,7 @@ def from_arrays(
     on_dark: str = "raise",
     device: Device | str | None = None,
 ) -> Transport:
-    """The transport of such arrays as `to_arrays` names, on a device that is opened at once.
-
-    `grid`, if any, has to be that of the arrays, whose first bounce is the default.
-    """
+    """The transport of such arrays, on a device that is opened at once; `grid`, if any, must be theirs."""
     F, own = arrays["first_bounce"], checks.grid("grid", arrays["grid"].tolist())
     if grid is not None and checks.grid("grid", grid) != own:
         raise InputError(f"grid is {grid!r}; this transport is compressed on its own, {own}")
@@ -339,15 +339,12 @@ def from_arrays(
     if len(systems) != len(F):
         raise InputError(f"first_bounce has {len(F)} channels, but there are {len(systems)} operators")
     matrices = [ScaledColumns(S, arrays.get(f"columns_{c}", F[c])) for c, S in enumerate(systems)]
-    F = F if first_bounce is None else first_bounce
-    return Transport(matrices, own, F, on_dark=on_dark, mixing=arrays.get("mixing"))
+    first = F if first_bounce is None else first_bounce
+    return Transport(matrices, own, first, on_dark=on_dark, mixing=arrays.get("mixing"))
 
 
 def resolve_reference(T: Transport, exact: Any) -> tuple[Transport, tuple[IdentityPlus | None, ...]]:
-    """The transport that results are of, and the S that judges each channel: T and none without `exact`.
-
-    Refused where `exact` has other pixels, colours or another first bounce than T, or no S.
-    """
+    """The transport that results are of, and the S that judges each channel: T and none without `exact`."""
     if exact is None:
         return T, (None,) * T.channels
     require(T)

@@ -8,10 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-import ltcl
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import fill_folder, input_file, replace_file
 
@@ -122,15 +120,3 @@ def test_what_cannot_be_read_is_refused(tmp_path):
         refused(tmp_path / name, lambda name=name: input_file(tmp_path / name))
     with pytest.raises(InputTypeError, match=r"path .*3"):
         input_file(3)
-
-
-@pytest.mark.parametrize("name", ["T.npz", "T.npy"])
-@pytest.mark.parametrize("appended", [b"\0", b"half of another file"])
-def test_bytes_behind_an_array_file_are_refused(tmp_path, name, appended):
-    path = tmp_path / name
-    ltcl.save(path, ltcl.Transport(np.eye(4), (2, 2)))
-    assert ltcl.load(path, grid=(2, 2)).shape == (4, 4)
-    with path.open("ab") as file:
-        file.write(appended)
-    with pytest.raises(FileError, match=name):
-        ltcl.load(path, grid=(2, 2))

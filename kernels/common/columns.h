@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Sums over the rows of arrays (rows, k), column by column, and updates with coefficients of each column.
 //
-// An item has some rows of one column: neighbouring ones, as caches of CPUs like it, or with -DADJACENT=0 every so
-// many, so that loads of neighbouring items lie side by side. A group has up to its size of the columns, of which
-// get_group_id(2) says. It leaves partial sums at [slice][sum][column], which every group of the next kernel adds up,
-// in one order, with the same get_num_groups(0). `scratch` holds a real an item and those that a kernel names.
+// An item has neighbouring rows of one column, for caches of CPUs, or with -DADJACENT=0 every so many, so that loads of
+// neighbouring items lie side by side. A group has up to its size of the columns, from that of get_group_id(2) on. It
+// leaves partial sums at [slice][sum][column], which every group of the next kernel adds up, in one order, with the
+// same get_num_groups(0). `scratch` holds a real an item and those that a kernel names.
 
 #include "common/real.h"
 
@@ -64,19 +64,20 @@ static inline void columns_sum(real value, global real *sums, int largest, share
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// totals[sum * width + j] = partial sums of the group's columns, added up over the slices, or the largest.
-static inline void columns_totals(
-    global const real *partials, int slices, int sums, int largest, int k, share s, local real *totals,
-    local real *scratch)
+// The partial sums of the group's columns, added up over the slices, or the largest: that of `sum` at [(first + sum) *
+// width + j] behind the first real an item of `scratch`. Returns where those of `first` begin.
+static inline local real *columns_totals(
+    global const real *partials, int slices, int sums, int largest, int k, share s, local real *scratch, int first)
 {
     const int me = get_local_id(0), items = get_local_size(0);
+    local real *totals = scratch + items + first * s.width;
     for (int start = 0; start < sums * s.width; start += items) {
         const int width = min(items, sums * s.width - start), together = items / width;
         const int entry = start + me % width;
         real sum = 0;
         for (int slice = me / width; slice < slices && me < together * width; slice += together) {
-            const real part = partials[(slice * sums + entry / s.width) * k + s.origin + entry % s.width];
-            sum = largest ? fmax(sum, part) : sum + part;
+            const real partial = partials[(slice * sums + entry / s.width) * k + s.origin + entry % s.width];
+            sum = largest ? fmax(sum, partial) : sum + partial;
         }
         scratch[me] = sum;
         fold(scratch, items, width, largest);
@@ -84,4 +85,5 @@ static inline void columns_totals(
             totals[start + me] = scratch[me];
         barrier(CLK_LOCAL_MEM_FENCE);
     }
+    return totals;
 }

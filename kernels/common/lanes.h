@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// The K right-hand sides of one launch: 1, 2, 3, 4 or 8; more are cut into such pieces. They are columns
-// offset .. offset + K - 1 of row-major arrays with `stride` columns. Where these are all the columns there
-// are, -DPACKED tells the compiler so: addresses get cheaper, a fifth less time at random columns.
+// The K right-hand sides of one launch: 1, 2, 3, 4 or 8; more are cut into such pieces. They are columns offset ..
+// offset + K - 1 of row-major arrays with `stride` columns; -DPACKED where K = stride saves a fifth at random columns.
 
 #include "common/real.h"
 
@@ -15,8 +14,7 @@
 #define STRIDE(stride) (stride)
 #endif
 
-// The values of one pixel as one vector.
-#if K == 3
+#if K == 3  // the values of one pixel as one vector
 typedef real4 lanes;  // the fourth lane is never stored; every ltcl buffer ends in 16 spare bytes for it
 #define LOAD(x) LOAD4(x)
 #define STORE(v, x) (STORE2((v).lo, x), (x)[2] = (v).s2)
@@ -31,17 +29,15 @@ typedef union {
     real item[sizeof(lanes) / sizeof(real)];
 } sums;  // of a row, one for each right-hand side
 
-// Right-hand sides `at` .. at + K - 1, of which the first `skip` are those of the piece before.
 typedef struct {
-    int at, skip;
+    int at, skip;  // right-hand sides at .. at + K - 1, of which the first `skip` are those of the piece before
 } piece;
 
 // Piece p of at least K right-hand sides.
 static inline piece piece_of(int p, int k)
 {
     const int at = min(K * p, k - K);
-    piece q = {at, K * p - at};
-    return q;
+    return (piece){at, K * p - at};
 }
 
 // out = a v + b y at i .. i + K - 1, but for the first `skip` of them. Where b is 0, y is not read.

@@ -4,20 +4,20 @@
 //   without STEP   out = a (A x) + b y + c x
 //   with STEP      one step of a stationary iteration on S = a A + c I along the direction x:
 //                  iterate += x;  r -= S x;  next = keep x + gain r;  and the squares of the new r, summed over a
-//                  work-group, to partials[group_at + group]: the norm of a residual costs no launch of its own
+//                  work-group, to partials[group_at + group]
 //
-// <format>_matvec takes one work-item a row, in wide loads: for CPUs, and for short rows. <format>_matvec_group takes
-// one work-group a row, its items side by side along it: for GPUs. Each is BY_ITEM or BY_GROUP of a statement that adds
-// item `me` of `items`' share of row `row` to `sum`.
+// <format>_matvec takes one work-item a row, in wide loads: for CPUs, and for short rows; <format>_matvec_group one
+// work-group, its items side by side: for GPUs. Each is BY_ITEM or BY_GROUP of a statement that adds item `me` of
+// `items`' share of row `row` to `sum`.
 //
 // Required define: K, see common/lanes.h. Optional: STEP, and PACKED, see there.
-// Layout: a slab of `rows` rows, the first of which is row `first` of the matrix. x, y, out, iterate, r and next
-// are row-major with `stride` reals a row, and a launch works on their columns offset .. offset + K - 1. partials has
-// a row of `stride` reals for each group. y may be out. `scratch` holds K reals a work-item.
+// Layout: a slab of `rows` rows, the first of which is row `first` of the matrix. Vectors are row-major with `stride`
+// reals a row, of which a launch takes offset .. offset + K - 1, and so are partials, with a row for each group. y may
+// be out. `scratch` holds K reals a work-item.
 
 #include "common/lanes.h"
 
-// The sum over a work-group of each of K values, in one tree; valid in every item.
+// The sum of each of K values over a work-group, in every item.
 static inline void group_sums(real *value, local real *scratch)
 {
     for (int k = 0; k < K; ++k)

@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // The number type of every kernel, wide loads and stores at any address of a real, and the epilogue of products.
 //
-// Products are written a * b + c, never fma(), which PoCL compiles to a library call on vectors (1.7 times slower);
-// compilers contract a * b + c where the device has the instruction. PoCL 3.0 compiles vload8 to a call, too: twice
-// as slow as the load that Clang makes of a vector type whose alignment is lowered.
+// Products are written a * b + c, which compilers contract, never fma(): PoCL compiles that to a call on vectors (1.7
+// times slower), and vload8 too: twice as slow as a load of a vector type whose alignment is lowered.
 
 typedef float real, real1;
 typedef float2 real2;
@@ -13,7 +12,7 @@ typedef float8 real8;
 #define PASTE(name, n) name##n
 #define OF(name, n) PASTE(name, n)  // the one of n values: OF(real, 8) is real8
 
-// INLINE: for what works on several values at once; a call would pass each of them through memory.
+// INLINE: for functions of several values at once, which a call would pass through memory.
 #ifdef __clang__
 typedef real2 real2_packed __attribute__((aligned(4)));
 typedef real4 real4_packed __attribute__((aligned(4)));

@@ -20,20 +20,15 @@ static inline void row_add(
 
 // A run of 8 neighbouring columns times x, whose 8 K values lie side by side, needs K wide loads and products: each
 // number of the row is spread over the lanes of its column. Lane l of part p is of right-hand side (8 p + l) % K.
-#if defined(PACKED) && K < 8
-#define RUNS true
-#if K == 1
-#define SPREAD(v) v
-#elif K == 2
-#define SPREAD(v) v.s00112233, v.s44556677
-#elif K == 3
-#define SPREAD(v) v.s00011122, v.s23334445, v.s55666777
-#else
-#define SPREAD(v) v.s00001111, v.s22223333, v.s44445555, v.s66667777
-#endif
+#define SPREAD1(v) v
+#define SPREAD2(v) v.s00112233, v.s44556677
+#define SPREAD3(v) v.s00011122, v.s23334445, v.s55666777
+#define SPREAD4(v) v.s00001111, v.s22223333, v.s44445555, v.s66667777
+#define SPREAD8(v) v  // not in use: the 8 values of a pixel are one wide load
+#ifdef PACKED
+#define RUNS (K < 8)
 #else
 #define RUNS false
-#define SPREAD(v) v
 #endif
 
 typedef union {
@@ -43,7 +38,7 @@ typedef union {
 
 INLINE void add_run(run_sums *sum, real8 v, global const real *x)
 {
-    const real8 spread[K] = {SPREAD(v)};
+    const real8 spread[K] = {OF(SPREAD, K)(v)};
     for (int p = 0; p < K; ++p)
         sum->part[p] = spread[p] * LOAD8(x + 8 * p) + sum->part[p];
 }

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import scipy.sparse
 
+from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.geometry import Resampling
 from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiometry import NoiseModel, ProjectorResponse, Radiance, Response
@@ -23,15 +24,13 @@ _SENSOR = ("electrons", "read", "black", "saturation", "levels")
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Calibration:
-    """Found by `measuring.measure`.
+    """Result of `calibrate.measure`.
 
     Attributes
     ----------
     exposures : tuple of float
         Seconds of the photographs of each pattern, ascending.
-    response : Response
-        Of the camera.
-    noise : NoiseModel
+    response, noise : Response, NoiseModel
         Of the camera.
     offset : (channels,)
         Linear value without light.
@@ -44,6 +43,8 @@ class Calibration:
         From the camera's pixels to the projector's.
     sharpness : Sharpness, optional
         Of the camera on these; None of one that is aligned.
+    anchor : Anchor, optional
+        What the pattern of blocks showed; None of older stores, whose batches are not compared with it.
     """
 
     exposures: tuple[float, ...]
@@ -56,6 +57,7 @@ class Calibration:
     mixing: np.ndarray | None
     resampling: Resampling
     sharpness: Sharpness | None = None
+    anchor: Anchor | None = None
 
     @property
     def light(self) -> np.ndarray:
@@ -82,6 +84,8 @@ class Calibration:
             found["sharpness"] = np.array([*self.sharpness.leak, self.sharpness.width])
         if self.mixing is not None:
             found["mixing"] = self.mixing
+        if self.anchor is not None:
+            found |= {f"anchor.{name}": part for name, part in vars(self.anchor).items()}
         for name, picture in (("ambient", self.ambient), ("white", self.white)):
             found[f"{name}.value"], found[f"{name}.valid"] = picture.value, picture.valid
             found[f"{name}.variance"] = np.where(picture.valid, picture.variance, np.float32(0.0))
@@ -132,7 +136,12 @@ class Calibration:
             np.array(arrays["mixing"]) if "mixing" in arrays else None,
             Resampling(weights, coverage, (grid[0], grid[1]), (camera[0], camera[1]), doubtful),
             Sharpness((leak[0], leak[1]), width) if "sharpness" in arrays else None,
+            _anchor(arrays) if "anchor.value" in arrays else None,
         )
+
+
+def _anchor(arrays: Mapping[str, np.ndarray]) -> Anchor:
+    return Anchor(**{field.name: np.array(arrays[f"anchor.{field.name}"]) for field in fields(Anchor)})
 
 
 def _radiance(arrays: Mapping[str, np.ndarray], name: str) -> Radiance:

@@ -8,18 +8,26 @@
     [acquire]
     strategy = "auto"
 
-Keys are the arguments of `VirtualRig` and the other rigs (`project_rigs` makes them), and of `ltcl.acquire`;
-"none" stands for None. The transport comes to transport.zarr beside it, and a folder rig keeps its patterns
-and photographs there, too. Nothing is opened before it is asked for, least of all a camera.
+Keys of [rig] are the arguments of the class, with these in place of objects; those of [acquire] are the
+arguments of `ltcl.acquire`; "none" stands for None.
+
+    virtual    transport: a file; camera_map: a file, what each camera pixel sees (see `VirtualRig`)
+    mitsuba    scene: dihedral, trihedral or box, which have albedo, baseline and depth; or a file
+    folder     patterns and photographs lie in the folder of the acquisition
+    live       [rig.camera] with kind "opencv" or "gphoto2", [rig.display]
+
+The transport comes to transport.zarr in the folder. Nothing is opened before it is needed, least of all a
+camera.
 """
 
 from __future__ import annotations
 
 import contextlib
 import inspect
+import logging
 import os
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
@@ -28,22 +36,45 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition import exposing, kept, project_rigs
-from ltcl.acquisition.project_rigs import Tables
+from ltcl.acquisition import exposure, kept
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.rigs import curves
+from ltcl.acquisition.rigs import (
+    Display,
+    FolderRig,
+    GPhoto2Camera,
+    LiveRig,
+    MitsubaRig,
+    OpenCVCamera,
+    VirtualRig,
+    mitsuba_scene,
+)
+from ltcl.acquisition.rigs.mitsuba import SCENES
+from ltcl.acquisition.rigs.sensor import CURVES, SimulatedRig
 from ltcl.acquisition.scanning.plan import Light
 from ltcl.acquisition.settings import Settings
 from ltcl.acquisition.task import acquire
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
-from ltcl.store import BlockStore
+from ltcl.store import BlockStore, Parts, formats, load
 
+logger = logging.getLogger(__name__)
 FILE, STORE = "acquisition.toml", "transport.zarr"
-_CAMERA = ("camera_map", "camera_grid")
 _LARGEST = 1 << 20  # bytes of a file that somebody wrote by hand
 _OURS = ("rig", "store", "resume", "progress", "device")  # of `acquire`, not for the file
+_RETIRED = ("in_order", "scaling")  # keys of earlier versions
+_NOISELESS = 1e9  # electrons
+
+
+# What a table makes, its arguments that are not for a file, and keys that are no arguments.
+_Kinds = dict[str, tuple[Callable[..., Any], tuple[str, ...], tuple[str, ...]]]
+_RIGS: _Kinds = {
+    "virtual": (VirtualRig, ("T", "grid"), ("transport", "grid")),
+    "mitsuba": (MitsubaRig, (), ("albedo", "baseline", "depth")),
+    "folder": (FolderRig, ("folder",), ()),
+    "live": (LiveRig, ("camera", "display"), ()),
+}
+_CAMERAS: _Kinds = {"opencv": (OpenCVCamera, (), ()), "gphoto2": (GPhoto2Camera, (), ())}
 
 
 @dataclass(frozen=True)
@@ -64,8 +95,8 @@ class Project:
     Attributes
     ----------
     folder : Path
-    tables : Tables
-        Of the rig, checked by name.
+    table : dict
+        Of the rig, its keys checked.
     settings : dict
         Keyword arguments of `ltcl.acquire`.
 
@@ -84,42 +115,40 @@ class Project:
     """
 
     folder: Path
-    tables: Tables
+    table: dict[str, Any]
     settings: dict[str, Any]
 
     @classmethod
     def open(cls, folder: str | os.PathLike[str]) -> Project:
         """Read and check the file of a folder; no rig is made.
 
-        Raises
-        ------
-        FileError
-            There is none, or it is no TOML.
-        InputError
-            A table or a key that is unknown, or one that is missing.
+        FileError where there is none, or no TOML; InputError for unknown or missing tables and keys.
         """
         folder = as_path(folder)
         if folder.exists() and not folder.is_dir():
             raise FileError(f"{folder}: is a file; an acquisition is a folder with an {FILE}")
         path = folder / FILE
-        found = _parsed(path)
-        for name, value in found.items():
+        content = _parse(path)
+        for name, value in content.items():
             if name not in ("rig", "acquire") or not isinstance(value, dict):
                 raise InputError(f"{path}: has {name!r}; it must have the tables [rig] and [acquire] only")
-        if "rig" not in found:
+        if "rig" not in content:
             raise InputError(f"{path}: has no table [rig]; it must say with what to photograph")
-        tables = project_rigs.check(path, found["rig"])
-        given = project_rigs.without_none(found.get("acquire", {}))
-        project_rigs.check_keys(path, "acquire", given, acquire, _OURS)
-        if "response" in given:
-            given["response"] = _response(path, given["response"])
-        if not isinstance(given.get("exposures", []), (list, NoneType)):
-            raise InputTypeError(f"{path}: [acquire] exposures is {given['exposures']!r}; it must be a list")
-        return cls(folder, tables, given)
+        table = _check_rig(path, content["rig"])
+        settings = _check_keys(path, "acquire", content.get("acquire", {}), acquire, _OURS)
+        if (name := settings.get("response")) is not None:
+            if not isinstance(name, str) or name not in CURVES:
+                known = ", ".join(CURVES)
+                raise InputError(f"{path}: [acquire] response is {name!r}; it must be {known}, or left out")
+            settings["response"] = Response(CURVES[name].decode(np.linspace(0.0, 1.0, 1025)))
+        if not isinstance(settings.get("exposures", []), (list, NoneType)):
+            value = settings["exposures"]
+            raise InputTypeError(f"{path}: [acquire] exposures is {value!r}; it must be a list")
+        return cls(folder, table, settings)
 
     @property
     def path(self) -> Path:
-        """The file that says it all."""
+        """The acquisition.toml."""
         return self.folder / FILE
 
     @property
@@ -130,63 +159,53 @@ class Project:
     @property
     def kind(self) -> str:
         """Of the rig."""
-        return self.tables.kind
+        return self.table["kind"]
 
     @property
     def state(self) -> str:
         """Of the store: "new" until a whole calibration is in it, then "begun", at last "final"."""
         if not self.store.exists():
             return "new"
-        found = BlockStore.open(self.store)
-        return "final" if found.final else "begun" if "strategy" in found.attributes else "new"
+        store = BlockStore.open(self.store)
+        return "final" if store.final else "begun" if "strategy" in store.attributes else "new"
 
     @property
     def kept(self) -> int:
         """Photographs that a calibration which has not ended can go on with; those of a folder rig apart."""
         return kept.count(self.store)
 
-    @property
-    def next(self) -> str:
-        """The command that photographs what is missing."""
-        how = "run" if self.state == "new" and not self.kept else "resume"
-        return f"'ltcl acquire {how} {self.folder}'"
-
     @contextlib.contextmanager
     def rig(self) -> Iterator[Any]:
         """The rig, which is closed at the end.
 
-        Raises
-        ------
-        InputError, InputTypeError
-            A value in the file that the rig refuses.
-        FileError, AcquisitionError
-            A file that the rig needs; a camera, a display or a package that is not there.
+        InputError and InputTypeError name the table and the value; FileError a file that the rig needs;
+        AcquisitionError a camera, a display or a package that is not there.
         """
         with self.naming("rig"):
             try:
-                made = project_rigs.make(self.folder, self.tables)
+                rig = _make(self.folder, dict(self.table))
             except LtclError:
                 raise
-            except (TypeError, ValueError) as error:  # where a class takes what it is given for a list
+            except (TypeError, ValueError) as error:  # a number where a class expects a list
                 raise InputTypeError(f"holds a value of an unusable type: {error}") from error
-        with Shots(made):
-            yield made
+        with Shots(rig):
+            yield rig
 
     @contextlib.contextmanager
     def described(self) -> Iterator[Any]:
         """A rig for what is photographed already: that of `rig`, but no camera or display is opened."""
         if self.kind != "live":
-            with self.rig() as made:
-                yield made
+            with self.rig() as rig:
+                yield rig
             return
         with self.naming("rig"):
-            grid, channels = project_rigs.pixels(self.folder, self.tables)
-        yield _Unseen(grid, channels, None)
+            grid = checks.grid("display.grid", self.table["display"]["grid"])
+        yield _Unopened(grid, self.table["camera"].get("channels", 3))
 
     def aligned(self) -> Project:
         """The same, but what a virtual rig photographs is seen on the pixels that its transport has."""
-        kept = {key: value for key, value in self.tables.rig.items() if key not in _CAMERA}
-        return replace(self, tables=replace(self.tables, rig=kept))
+        table = {k: v for k, v in self.table.items() if k not in ("camera_map", "camera_grid")}
+        return replace(self, table=table)
 
     @contextlib.contextmanager
     def naming(self, table: str) -> Iterator[None]:
@@ -199,65 +218,45 @@ class Project:
             raise type(error)(f"{self.path}: [{table}] {error}") from None
 
     def check(self) -> Settings:
-        """What `acquire` would refuse before the first photograph; no camera is opened.
-
-        Raises
-        ------
-        InputError, InputTypeError, FileError, AcquisitionError
-            As `rig` and `ltcl.acquire`.
-        """
-        given = {name: p.default for name, p in inspect.signature(acquire).parameters.items()}
-        given = {name: value for name, value in given.items() if name not in _OURS} | self.settings
+        """What `acquire` would refuse before the first photograph; errors as there. No camera is opened."""
+        defaults = {n: p.default for n, p in inspect.signature(acquire).parameters.items() if n not in _OURS}
         with self.described() as rig, self.naming("acquire"):
-            return Settings.of(Shots(rig), **given)
+            return Settings.of(Shots(rig), **(defaults | self.settings))
 
     def outlook(self) -> Outlook:
         """Pixels, channels and guesses of the rest, for a plan before the first photograph.
 
-        The scene is taken to be as `Light` is; exposures are chosen for it as those of a scan are.
-
-        Raises
-        ------
-        InputError, FileError
-            As `rig`, as far as they are needed for it.
+        The scene is assumed to be as `Light` is; exposures are chosen for it as those of a scan are.
         """
-        with self.naming("rig"):
-            grid, channels = project_rigs.pixels(self.folder, self.tables)
-            noise, ambient = project_rigs.guessed(self.tables)
-        light = Light() if ambient is None else Light(ambient=ambient)
-        with self.naming("acquire"):
-            exposures = self._exposures(grid, channels, noise, light)
-        return Outlook(grid, channels, exposures, noise, light)
-
-    def _exposures(
-        self, grid: tuple[int, int], channels: int, noise: NoiseModel, light: Light
-    ) -> tuple[float, ...]:
-        given = self.settings.get("exposures")
-        if given is not None:
-            return tuple(sorted(float(t) for t in given))
-        unseen: Any = _Unseen(grid, channels, self.tables.rig.get("exposures"))
-        white, deep = exposing.guess(light.direct + light.indirect, light.ambient)
-        return exposing.for_scan(Shots(unseen), white, deep, noise)
+        with self.described() as rig, self.naming("acquire"):
+            shots, facts, light = Shots(rig), getattr(rig, "describe", dict)(), Light()
+            bits = facts.get("camera_bits", facts.get("bits"))
+            noise = NoiseModel(levels=1 << bits if isinstance(bits, int) else 0)
+            if "gain" in facts:
+                noise = replace(noise, electrons=facts["gain"] or _NOISELESS, read=facts["read"])
+            if "ambient" in facts:
+                light = Light(ambient=float(np.mean(facts["ambient"])))
+            exposures = self.settings.get("exposures")
+            if exposures is None:
+                exposures = exposure.expected(shots, light.direct + light.indirect, light.ambient)
+            return Outlook(shots.grid, shots.channels, tuple(sorted(map(float, exposures))), noise, light)
 
 
 @dataclass(frozen=True)
-class _Unseen:
-    """A rig that offers exposures and takes no photographs."""
+class _Unopened:
+    """A live rig that takes no photographs."""
 
     projector_grid: tuple[int, int]
     channels: int
-    exposures: Any
 
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
-        raise AcquisitionError("no photographs are taken by a rig that was not opened")
+        raise AcquisitionError("a rig that was not opened takes no photographs")
 
 
-def _parsed(path: Path) -> dict[str, Any]:
+def _parse(path: Path) -> dict[str, Any]:
     if not path.exists():
-        raise FileError(
-            f"{path}: no such file; 'ltcl simulate' makes one, or write one with [rig] and its kind: "
-            "virtual, mitsuba, folder or live"
-        )
+        kinds = ", ".join(_RIGS)
+        raise FileError(f"{path}: no such file; 'ltcl simulate' makes one; or write [rig], kind = {kinds}")
     if input_file(path).stat().st_size > _LARGEST:
         raise FileError(f"{path}: has {checks.size(path.stat().st_size)}; it must be a short text")
     try:
@@ -266,11 +265,99 @@ def _parsed(path: Path) -> dict[str, Any]:
         raise FileError(f"{path}: is no TOML: {error}") from None
 
 
-def _response(path: Path, name: Any) -> Response | None:
-    """The camera's, where it is known by name."""
-    if name is None:
-        return None
-    if not isinstance(name, str) or name not in curves.NAMED:
-        known = ", ".join(curves.NAMED)
-        raise InputError(f"{path}: [acquire] response is {name!r}; it must be {known}, or left out")
-    return Response(curves.NAMED[name].decode(np.linspace(0.0, 1.0, 1025)))
+def _check_rig(path: Path, table: dict[str, Any]) -> dict[str, Any]:
+    parts = ("camera", "display") if table.get("kind") == "live" else ()
+    rig = _check_kind(path, "rig", {k: v for k, v in table.items() if k not in parts}, _RIGS)
+    if rig["kind"] == "virtual" and "transport" not in rig:
+        raise InputError(f"{path}: [rig] has no 'transport'; it must be the file of one")
+    for name in parts:
+        if not isinstance(part := table.get(name), dict):
+            raise InputError(f"{path}: has no table [rig.{name}]; a live rig has a camera and a display")
+        if name == "camera":
+            rig[name] = _check_kind(path, "rig.camera", part, _CAMERAS)
+        else:
+            rig[name] = _check_keys(path, "rig.display", part, Display)
+    return rig
+
+
+def _check_kind(path: Path, table: str, values: dict[str, Any], kinds: _Kinds) -> dict[str, Any]:
+    kind = values.get("kind")
+    if not isinstance(kind, str) or kind not in kinds:
+        raise InputError(f"{path}: [{table}] kind is {kind!r}; it must be one of {', '.join(kinds)}")
+    options = {key: value for key, value in values.items() if key != "kind"}
+    return {"kind": kind, **_check_keys(path, table, options, *kinds[kind])}
+
+
+def _check_keys(
+    path: Path,
+    table: str,
+    values: dict[str, Any],
+    make: Callable[..., Any],
+    hidden: tuple[str, ...] = (),
+    others: tuple[str, ...] = (),
+) -> dict[str, Any]:
+    """Refuse unknown keys and miss those that are needed; the values, with None for "none"."""
+    parameters = dict(inspect.signature(make).parameters)
+    if parameters.pop("sensor", None) is not None:
+        sensor = inspect.signature(SimulatedRig).parameters
+        parameters |= {name: p for name, p in sensor.items() if p.kind is p.KEYWORD_ONLY}
+    parameters = {name: p for name, p in parameters.items() if name not in hidden}
+    known = [*others, *parameters]
+    for key in values:
+        if key in _RETIRED:
+            logger.warning("%s: [%s] %s has no effect any more", path, table, key)
+        elif key not in known:
+            raise InputError(f"{path}: [{table}] has {key!r}; it may have {', '.join(known)}")
+    for key, parameter in parameters.items():
+        if parameter.default is parameter.empty and key not in values:
+            raise InputError(f"{path}: [{table}] has no {key!r}; it must be there")
+    return {k: None if v == "none" else v for k, v in values.items() if k not in _RETIRED}
+
+
+def _make(folder: Path, table: dict[str, Any]) -> Any:
+    kind = table.pop("kind")
+    if kind == "virtual":
+        return _virtual(folder, table)
+    if kind == "mitsuba":
+        scene = table.pop("scene")
+        walls = {name: table.pop(name) for name in ("albedo", "baseline", "depth") if name in table}
+        if scene not in SCENES:
+            if walls:
+                raise InputError(f"{next(iter(walls))} is of {', '.join(SCENES)}; {scene!r} has its own")
+            scene = folder / str(scene)
+        elif walls:
+            walls["camera_grid"] = table.pop("camera_grid", None)
+            scene = mitsuba_scene(scene, table["projector_grid"], **walls)
+        return MitsubaRig(scene, **table)
+    if kind == "folder":
+        return FolderRig(folder, **table)
+    camera, display = dict(table.pop("camera")), table.pop("display")
+    source = camera.get("source")
+    if isinstance(source, str) and (folder / source).exists():  # else a stream
+        camera["source"] = folder / source
+    with contextlib.ExitStack() as opened:
+        eye = opened.enter_context(_CAMERAS[camera.pop("kind")][0](**camera))
+        rig = LiveRig(eye, opened.enter_context(Display(**display)), **table)
+        opened.pop_all()
+    return rig
+
+
+def _virtual(folder: Path, table: dict[str, Any]) -> VirtualRig:
+    path = folder / str(table.pop("transport"))
+    record, camera_map = formats.read(path), table.pop("camera_map", None)
+    grid = table.pop("grid", record.grid)
+    if grid is None:
+        raise InputError(f"{path} has no grid; add grid = [h, w]")
+    if camera_map is not None:
+        C = formats.read(folder / str(camera_map))
+        if isinstance(C, Parts):
+            raise InputError("camera_map is a compressed transport; it must be a matrix")
+        (table["camera_map"],) = C.in_memory().matrices
+    if isinstance(record, Parts):
+        return VirtualRig(load(path, on_dark="mask"), grid, **table)
+    if record.camera_grid is not None and camera_map is None:
+        table.setdefault("camera_grid", record.camera_grid)
+    if record.mixing is not None:
+        table.setdefault("mixing", record.mixing)
+    T = record.in_memory().matrices
+    return VirtualRig(T if len(T) == 3 else T[0], grid, **table)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`Setup`: what the calibration in a store means for pictures on the pixels of its transport.
+"""`Setup`: the calibration of a store, for pictures on the pixels of its transport.
 
-With p the light of a pattern, in [0, 1], x the codes that the projector is fed and a the ambient light,
+With p the light of a pattern in [0, 1], x the codes that the projector is fed and a the ambient light,
 
-    x = g^-1(p)                 of each channel, on the projector's own pixels
-    picture = T p + a           in linear sensor value a second
+    x = g^-1(p)                 for each channel, on the projector's own pixels
+    picture = T p + a           in linear sensor values a second
 
-where T is for light relative to white less black: a holds what a black projector sends as well.
+T is for light relative to white less black: a includes what a black projector sends.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ import numpy as np
 from ltcl import checks
 from ltcl.acquisition.calibration import PREFIX, Calibration
 from ltcl.acquisition.radiometry import Radiance
-from ltcl.acquisition.scanning.block import Blocks
+from ltcl.acquisition.scanning.cells import Blocks
 from ltcl.errors import InputError
 from ltcl.store import BlockStore
+from ltcl.transport import Transport
 
-_SEEN = 0.5  # of what a pixel is seen by: less of it valid tells nothing
+_VALID = 0.5  # of the camera pixels that see a projector pixel: with less its value is unknown
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A set-up that was measured, as the user of its transport needs it.
+    """A measured set-up of projector, scene and camera.
 
     Attributes
     ----------
     calibration : Calibration
     blocks : Blocks
-        Of projector pixels, that the transport's pixels are.
+        Of projector pixels: the pixels of the transport.
 
     Examples
     --------
@@ -48,6 +49,8 @@ class Setup:
     np.float32(0.5)
     >>> setup.ambient.shape
     (8, 8)
+    >>> setup.relative_error(rig, T)[0] < 0.02
+    True
     """
 
     calibration: Calibration
@@ -55,17 +58,11 @@ class Setup:
 
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Setup:
-        """That of a store which `ltcl.acquire` made, or of the folder of one.
-
-        Raises
-        ------
-        FileError
-            It holds no calibration, or is damaged.
-        """
-        found = store if isinstance(store, BlockStore) else BlockStore.open(store)
-        told, facts = Calibration.of(found), found.attributes
+        """That of a store made by `ltcl.acquire`; FileError where it has no calibration, or is damaged."""
+        scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        calibration, facts = Calibration.of(scan), scan.attributes
         side = facts["settings"]["block"] if facts.get("strategy") == "block" else 1
-        return cls(told, Blocks(told.resampling.grid, side))
+        return cls(calibration, Blocks(calibration.resampling.grid, side))
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -79,72 +76,83 @@ class Setup:
 
     @property
     def ambient(self) -> np.ndarray:
-        """What the camera sees under a black projector, (h, w[, 3]) in the units of T.
-
-        That is the background that no pattern takes away; 0 where it is not told.
-        """
-        return self._on_grid(self.calibration.ambient)
+        """Light under a black projector, (h, w[, 3]) in the units of T; 0 where it is unknown."""
+        return self._resample(self.calibration.ambient)
 
     @property
     def white(self) -> np.ndarray:
         """What a white pattern adds to that, (h, w[, 3]): as bright as the scene can be."""
-        return self._on_grid(self.calibration.white)
+        return self._resample(self.calibration.white)
 
     def codes(self, pattern: Any) -> np.ndarray:
-        """What the projector is fed for a pattern of light: float32 in [0, 1], on the projector's pixels.
+        """Codes of the projector for a pattern of light: float32 in [0, 1], on the projector's pixels.
 
         Parameters
         ----------
         pattern : (h, w) or (h, w, 3)
-            Of linear light, 1 for white; what is beyond [0, 1] is clipped.
+            Linear light, 1 for white; clipped to [0, 1].
 
         Raises
         ------
         InputError
             Another shape.
         """
-        light = checks.finite("pattern", checks.real("pattern", pattern)).astype(np.float32)
-        checks.shape("pattern", light, self.grid, (*self.grid, 3))
-        fed = self.calibration.projector.codes(np.clip(self._of_each_channel(light), 0.0, 1.0))
-        return self.blocks.enlarged(fed)
+        light = np.clip(self._colours("pattern", pattern), 0.0, 1.0)
+        return self.blocks.enlarged(self.calibration.projector.codes(light))
 
     def light(self, codes: Any) -> np.ndarray:
-        """The light of codes (h, w) or (h, w, 3) in [0, 1] that the projector is fed, relative to its white.
+        """Light of codes (h, w) or (h, w, 3) in [0, 1], relative to white; InputError for another shape."""
+        return self.calibration.projector.linear(self._colours("codes", codes))
 
-        Raises
-        ------
-        InputError
-            Another shape.
+    def relative_error(self, rig: Any, T: Transport, patterns: int = 4) -> tuple[float, ...]:
+        """||s T p - c|| / ||c|| of each channel, against what a known scene shows under new patterns.
+
+        Patterns p of 0 and 1 are the same in codes and in light. c is the scene without noise under p less
+        that under black. The unit of light of a camera is unknown: s = <T p, c> / ||T p||^2 is free.
+
+        Parameters
+        ----------
+        rig : VirtualRig
+            The scene, best without its camera_map; else its pictures are resampled from the camera's pixels.
+        T : Transport
+            As measured.
+        patterns : int
+            Each with about half of the pixels on.
         """
-        fed = checks.finite("codes", checks.real("codes", codes)).astype(np.float32)
-        checks.shape("codes", fed, self.grid, (*self.grid, 3))
-        return self.calibration.projector.linear(self._of_each_channel(fed))
+        rng, aligned, seen = np.random.default_rng(0), rig.camera_grid == rig.projector_grid, ~T.masked
+        dark, ours, theirs = rig.radiance(np.zeros(self.blocks.pixels)), [], []
+        for _ in range(patterns):
+            p = (rng.random(T.grid) < 0.5).astype(np.float32)
+            c = rig.radiance(self.blocks.enlarged(p)) - dark
+            c = self._mean(c if aligned else self.calibration.resampling.apply(c))
+            light = p if T.channels == 1 else np.repeat(p[..., None], 3, axis=-1)
+            ours.append(np.asarray(T @ light, np.float64).reshape(-1, T.channels)[seen])
+            theirs.append(c.astype(np.float64).reshape(-1, T.channels)[seen])
+        x, y = np.concatenate(ours), np.concatenate(theirs)
+        scale = (x * y).sum(axis=0) / np.maximum((x * x).sum(axis=0), np.finfo(float).tiny)
+        return tuple((np.linalg.norm(scale * x - y, axis=0) / np.linalg.norm(y, axis=0)).tolist())
 
-    def _of_each_channel(self, picture: np.ndarray) -> np.ndarray:
-        if picture.ndim == 2 and self.calibration.projector.channels == 3:
-            return np.repeat(picture[..., None], 3, axis=-1)
-        return picture
+    def _colours(self, name: str, picture: Any) -> np.ndarray:
+        """A checked picture of as many channels as the projector has."""
+        values = checks.finite(name, checks.real(name, picture)).astype(np.float32)
+        checks.shape(name, values, self.grid, (*self.grid, 3))
+        if values.ndim == 2 and self.calibration.projector.channels == 3:
+            return np.repeat(values[..., None], 3, axis=-1)
+        return values
 
-    def resampled(self, picture: Any) -> np.ndarray:
-        """A picture on the camera's pixels, (H, W[, 3]), as it is on those of the transport, (h, w[, 3])."""
-        return self.mean(self.calibration.resampling.apply(picture))
-
-    def _on_grid(self, light: Radiance) -> np.ndarray:
+    def _resample(self, light: Radiance) -> np.ndarray:
         R = self.calibration.resampling
         weight = R.apply(light.valid.astype(np.float32))
         value = R.apply(np.where(light.valid, light.value, 0.0))
-        return self.mean(np.where(weight >= _SEEN, value / np.maximum(weight, _SEEN), 0.0))
+        return self._mean(np.where(weight >= _VALID, value / np.maximum(weight, _VALID), 0.0))
 
-    def mean(self, picture: np.ndarray) -> np.ndarray:
-        """A picture on the projector's pixels, (h, w[, 3]), as its means over those of the transport."""
-        if self.blocks.side == 1:
-            return picture.astype(np.float32)
-        count = self.blocks.sum(np.ones_like(picture))
-        return (self.blocks.sum(picture) / count).astype(np.float32)
+    def _mean(self, picture: np.ndarray) -> np.ndarray:
+        """Means of a picture on the projector's pixels over the pixels of the transport."""
+        return (self.blocks.sum(picture) / self.blocks.sum(np.ones_like(picture))).astype(np.float32)
 
 
 def has_calibration(store: str | os.PathLike[str]) -> bool:
-    """Whether there is a store which `ltcl.acquire` made.
+    """Whether there is a store that `ltcl.acquire` made.
 
     >>> has_calibration("nowhere.zarr")
     False
@@ -152,7 +160,7 @@ def has_calibration(store: str | os.PathLike[str]) -> bool:
     if not os.path.isdir(store):
         return False
     try:
-        found = BlockStore.open(store)
+        scan = BlockStore.open(store)
     except InputError:  # whoever loads it says what is wrong
         return False
-    return any(name.startswith(PREFIX) for name in found.extras) and "strategy" in found.attributes
+    return any(name.startswith(PREFIX) for name in scan.extras) and "strategy" in scan.attributes

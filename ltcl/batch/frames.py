@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`compensate_frames`: patterns for a folder or a video of frames, a batch of right-hand sides at a time.
 
-Every frame gets the same gain, as one that followed the frames would make the scene flicker; gain="auto" is
-found once, on a sample of frames from all over the source. Batches begin at the same frames in every run and
-share nothing but T, so that a resumed run gives what an uninterrupted one does: to the last bit with a named
-method; "auto" may know more of S the second time.
+Every frame gets the same gain: one that followed the frames would make the scene flicker. Batches begin at
+the same frames in every run and share nothing but T: a resumed run gives what an uninterrupted one does, to
+the last bit with a named method; "auto" may know more of S the second time.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks, images, layout
-from ltcl.batch.manifest import NAME, Manifest, OtherRun, Record, curve, fingerprint, locked, setting
+from ltcl.batch.manifest import NAME, Manifest, OtherRun, Record, curve, identity, locked, setting
 from ltcl.compensation import compensate, problem
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.files import as_path
@@ -39,8 +38,7 @@ _WRITERS = 4  # threads: files are compressed and flushed side by side
 class CompensatedFrames:
     """Result of `compensate_frames`: a record a frame, in order, those of earlier runs, too.
 
-    The `folder` holds the patterns and frames.json. `solved` frames of this run took `seconds`, reading and
-    writing included. `transport_error` is as in `ltcl.Compensation`: not in the errors of the records.
+    `solved` frames of this run took `seconds`. `transport_error` is not in the errors of the records.
     """
 
     folder: Path
@@ -68,8 +66,8 @@ class CompensatedFrames:
 
     def __repr__(self) -> str:
         worst = self.worst
-        off = f"at worst off by {worst.error:.2%}{error_note(self.transport_error)}, frame {worst.number}"
-        return f"<ltcl CompensatedFrames {len(self.records)} in {self.folder}, {off}>"
+        error = f"largest error {worst.error:.2%}{error_note(self.transport_error)} in frame {worst.number}"
+        return f"<ltcl CompensatedFrames {len(self.records)} in {self.folder}, {error}>"
 
 
 def compensate_frames(
@@ -96,52 +94,39 @@ def compensate_frames(
 
     Parameters
     ----------
-    T : Transport
-        As in `ltcl.compensate`.
-    source
-        A folder of pictures, or a video file, as `ltcl.images.frames.open_frames` takes it.
+    T, source : Transport; folder of pictures or video file, as of `ltcl.images.frames.open_frames`
     out
-        A folder: pattern_000001.png and so on, and frames.json, which tells settings and frames done. Other
-        files in it stay; a second run in it at the same time is refused.
+        A folder: pattern_000001.png and so on, and frames.json with settings and frames. Other files in it
+        stay; a second run in it at the same time is refused.
     batch : int
-        Frames solved at once; more need more memory and, up to a point, less time for each. What a solve
-        leaves within `rtol`, and the sample for a gain, depend on it: resuming needs the same.
+        Frames solved at once; more need more memory and, up to a point, less time each.
     resume : bool
-        Go on where an earlier run with the same T, settings and frames ended; from the beginning where there
-        was none. Without it, a folder with frames of an earlier run is refused.
-    frames : int, optional
-        Only so many, from the first on.
+        Go on where an earlier run with the same T, settings and frames ended, if there was one. Without it, a
+        folder with frames of an earlier run is refused.
+    frames : int, optional, only so many, from the first on
     format : str
         "png", 16 bits in sRGB with white at the upper bound of the light; or "exr", the light as it is.
     appearance : bool
         Write T pattern + background, too, into a folder appearance within `out`.
     video, fps : optional
-        Also a video of the patterns, made when all are done: .mkv or .avi (lossless), .mp4; its frames a
-        second are those of the source, or 25.
-    encoding, resize
-        What the frames hold; whether to scale them to the camera's grid.
+        Also a video of the patterns: .mkv or .avi (lossless), .mp4; by default at the source's rate, or 25.
+    encoding, resize : what the frames hold; whether to scale them to the camera's grid
     gain : float or "auto"
-        Of all frames; "auto" finds the largest for a sample of `batch` frames, evenly spread, with `loss` as
-        in `ltcl.compensate`. A frame that needs more light is clipped, and its record tells how much.
+        Of all frames; "auto" finds the largest for a sample of `batch` frames, evenly spread. A frame that
+        needs more light is clipped, and its record tells how much.
     progress : callable("frames", done, total), optional
-        Called before every batch and at the end; done counts frames of earlier runs, too, and total is None
-        where the source does not tell.
+        Called before every batch and at the end; done counts frames of earlier runs, too; total may be None.
     codes : callable(pattern), optional
-        What the projector is fed for a pattern of light, (h, w) or (h, w, 3), such as
-        `ltcl.acquisition.Setup.codes`: .png and video then hold these codes, and not sRGB.
+        Codes of the projector for a pattern of light, such as `ltcl.acquisition.Setup.codes`: .png and video
+        then hold these, and not sRGB.
     **options
         Of `ltcl.compensate`: bounds, method, rtol, exact, and so on; background and weights are one picture.
-
-    Returns
-    -------
-    CompensatedFrames
 
     Raises
     ------
     FileError, InputError, ConvergenceError
-        As `ltcl.compensate`, `open_frames` and `write_video`; a frame that cannot be read or has another
-        size; a folder with frames of another run. The frames of all batches before stay done, as after
-        Ctrl-C.
+        As `ltcl.compensate`, `open_frames` and `write_video`; a frame of another size; frames of another run.
+        The frames of all batches before stay done, as after Ctrl-C.
 
     Examples
     --------
@@ -173,7 +158,7 @@ def compensate_frames(
     settings |= {"appearance": appearance, "encoding": encoding, "resize": resize, **options}
     described = {name: setting(value) for name, value in settings.items() if name != "callback"}
     described["codes"] = codes and curve(codes, T.grid)
-    manifest, white = Manifest(folder / NAME, described, fingerprint(T)), bounds[1] if bounds[1] > 0 else 1.0
+    manifest, white = Manifest(folder / NAME, described, identity(T)), bounds[1] if bounds[1] > 0 else 1.0
     run = _Run(T, opened, limit, resize, manifest, batch, format, white, appearance, codes, options)
     with locked(folder):
         manifest.begin(resume)
@@ -193,7 +178,7 @@ def compensate_frames(
 
 
 def _validate(T: Transport, gain: Any, loss: Any, codes: Any, options: dict[str, Any]) -> tuple[float, float]:
-    """The bounds, (low, high); refuses what `compensate` would, and pictures that are not for all frames."""
+    """The bounds; refuses what `compensate` would, and pictures that are not for all frames."""
     require(T, square=False)
     resolve_reference(T, options.get("exact"))
     problem.gain(gain, loss)
@@ -257,10 +242,9 @@ class _Run:
         """As they were written, white at 1; codes as the light of which sRGB makes them."""
         for number in self.done:
             pattern = images.read(self._files(number)[0])
-            if self.format == "exr" and self.codes is not None:
-                pattern = images.from_srgb(self.codes(pattern))
-            elif self.format == "exr":
-                pattern = pattern / np.float32(self.white)
+            if self.format == "exr":
+                codes = self.codes
+                pattern = images.from_srgb(codes(pattern)) if codes else pattern / np.float32(self.white)
             yield pattern
 
     def _files(self, number: int) -> list[Path]:
@@ -287,14 +271,13 @@ class _Run:
 
     def _picture(self, frame: Frame) -> np.ndarray:
         """The frame on the camera's grid."""
-        picture, grid = frame.picture(), self.T.camera_grid
-        if picture.shape[:2] != grid and self.resize:
-            return images.resize(picture, grid)
-        if picture.shape[:2] != grid:
-            has, wants = ("{} x {}".format(*size) for size in (picture.shape[:2], grid))
-            advice = "give resize=True to scale all frames"
-            raise InputError(f"{self._place(frame)} is {has} pixels, but the camera has {wants}; {advice}")
-        return picture
+        picture, (h, w) = frame.picture(), self.T.camera_grid
+        if picture.shape[:2] == (h, w):
+            return picture
+        if self.resize:
+            return images.resize(picture, (h, w))
+        size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
+        raise InputError(f"{self._place(frame)} is {size}; give resize=True to scale all frames")
 
     def _gain(self, gain: float | str, loss: float | None) -> float:
         """The one of all frames, found once, of a sample: the first frames where their number is unknown."""

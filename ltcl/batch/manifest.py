@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a folder of patterns says of itself: from which T, with which settings, which frames are done.
 
-The file is replaced whole after every batch, when its patterns are safe on the disk. So it never lists a
-frame that is not there, and whatever ends a run early costs the batch it was at.
+Replaced whole after every batch, when its patterns are on the disk: what ends a run early costs one batch.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -18,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 
 from ltcl import report
+from ltcl.acquisition.fingerprint import fingerprint
 from ltcl.errors import FileError, InputError
 from ltcl.files import input_file, replace_file
 from ltcl.transport import Transport
@@ -42,10 +40,7 @@ class OtherRun(InputError):
 
 @dataclass(frozen=True)
 class Record:
-    """One frame that is done: its number, from 1, its name and the SHA-256 of what was read.
-
-    `error` and `clipped` are as in `ltcl.Compensation`: with T, or with `exact` where that is a setting.
-    """
+    """A frame: number, from 1, name, SHA-256 of what was read; error and clipped as of a Compensation."""
 
     number: int
     name: str
@@ -75,10 +70,7 @@ class Manifest:
             temporary.write_text(f'{head[:-2]},\n  "frames": [\n{lines}\n  ]\n}}\n', encoding="utf-8")
 
     def begin(self, resume: bool) -> None:
-        """Go on with the run whose file is there, if one is; without `resume`, refuse that.
-
-        OtherRun where that run had other settings, or another T; FileError where the file is damaged.
-        """
+        """Go on with the run whose file is there, if any; refuse other settings, another T, no `resume`."""
         if not self.path.exists():
             return
         try:
@@ -102,10 +94,7 @@ class Manifest:
             before, now = settings.get(name), self.settings.get(name)
             if before != now:
                 raise OtherRun(f"{self.path}: that run had {name}={before!r}, this one has {now!r}; {advice}")
-        if transport != {
-            **self.transport,
-            "error": None,
-        }:  # which depends on the first bounce: patterns do not
+        if transport != {**self.transport, "error": None}:  # depends on the first bounce, patterns do not
             raise OtherRun(f"{self.path}: that run was with another T; {advice}")
         self.gain, self.records = gain, records
 
@@ -136,54 +125,31 @@ def locked(folder: Path) -> Iterator[None]:
             os.close(handle)
 
 
-def fingerprint(T: Transport) -> dict[str, Any]:
-    """Sizes, error and a SHA-256 of all entries; of operators without entries, of some numbers u.(T v).
-
-    Not of the first bounce: compensation does not depend on it.
-    """
-    arrays = [T.masked] if T.mixing is None else [T.masked, T.mixing]
-    for matrix in T.matrices if T.blocks is None else (block for row in T.blocks for block in row):
-        if isinstance(matrix, scipy.sparse.csr_array):
-            arrays += [matrix.data, matrix.indices.astype(np.int64), matrix.indptr.astype(np.int64)]
-        elif isinstance(matrix, np.ndarray):
-            arrays.append(matrix)
-        else:
-            random = np.random.default_rng(0)
-            sums = random.random((4, matrix.shape[0])) @ (matrix @ random.random(matrix.shape[1]))
-            arrays.append(np.array([f"{number:.4g}" for number in sums], "S16"))  # float32 products
+def identity(T: Transport) -> dict[str, Any]:
+    """Sizes, error and fingerprint of T; not the first bounce, on which compensation does not depend."""
+    matrices = T.matrices if T.blocks is None else [block for row in T.blocks for block in row]
+    mixing = [] if T.mixing is None else [T.mixing]
     sizes = {"grid": list(T.grid), "camera_grid": list(T.camera_grid), "channels": T.channels}
-    return {**sizes, "error": T.error, "digest": _digest(*arrays)}
+    return {**sizes, "error": T.error, "digest": fingerprint(T.masked, *mixing, *matrices)}
 
 
 def setting(value: Any) -> Any:
-    """A setting in the types of JSON: pictures and transports by a digest, other objects by their repr.
-
-    >>> setting((0.0, 1.0)), setting("auto"), setting(np.zeros((4, 5)))[:13]
-    ([0.0, 1.0], 'auto', '4 x 5, sha256')
-    """
+    """A setting in the types of JSON: pictures and transports by a digest, other objects by their repr."""
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
     if isinstance(value, Transport):
-        return f"Transport, sha256 {fingerprint(value)['digest']}"
+        return f"Transport, sha256 {identity(value)['digest']}"
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         text = repr(value)
         return type(value).__name__ if " at 0x" in text else text  # an address is of one run
     if array.size <= _FEW:
         return array.tolist()
-    return f"{' x '.join(map(str, array.shape))}, sha256 {_digest(array.astype(np.float64))}"
+    return f"{' x '.join(map(str, array.shape))}, sha256 {fingerprint(array.astype(np.float64))}"
 
 
 def curve(codes: Callable[[np.ndarray], np.ndarray], grid: tuple[int, int]) -> str:
     """By what a projector's curve is known again: its codes for some levels of light, and for a ramp."""
     ramp = np.linspace(0.0, 1.0, grid[0] * grid[1], dtype=np.float32).reshape(grid)
     levels = [np.full(grid, level, np.float32) for level in np.linspace(0.0, 1.0, _LEVELS)]
-    return f"sha256 {_digest(*(np.rint(65535 * np.asarray(codes(light))) for light in (*levels, ramp)))}"
-
-
-def _digest(*arrays: np.ndarray) -> str:
-    digest: Any = hashlib.sha256()
-    for array in arrays:
-        digest.update(f"{array.dtype} {array.shape};".encode())
-        digest.update(np.ascontiguousarray(array))
-    return digest.hexdigest()
+    return f"sha256 {fingerprint(*(np.rint(65535 * np.asarray(codes(light))) for light in (*levels, ramp)))}"

@@ -3,14 +3,23 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 
-from ltcl import checks
-from ltcl.cli import compensate_frames, compensate_pictures, console, options, pictures, transports
+from ltcl import report
+from ltcl.cli import compensate_frames, console, options, pictures, results, transports
+from ltcl.cli.command import Answer, Context
+from ltcl.cli.options import argument, file, option, writable_file
+from ltcl.compensation import Compensation
 from ltcl.errors import InputError
+from ltcl.transport import Transport
+
+_MANY = 0.01  # part of a picture out of reach from which advice is given
+_SHEET = 12  # pictures on a contact sheet, at most
 
 
 def _gain(text: str) -> float | str:
@@ -20,117 +29,40 @@ def _gain(text: str) -> float | str:
         raise typer.BadParameter(f"{text!r} is no gain; write a number, or auto") from None
 
 
-_GAIN = Annotated[
-    str | None,
-    typer.Option(
-        parser=_gain,
-        metavar="FACTOR",
-        help="Match FACTOR times the picture; auto: the largest that the projector reaches. Default: 1, but "
-        "auto with a TRANSPORT of 'ltcl acquire', whose light has the camera's own unit.",
-        show_default=False,
-    ),
+_film = partial(option, rich_help_panel="Options of frames: a folder or a video")
+_Pictures = Annotated[list[Path], argument("PICTURE...", "Pictures; or one folder or one video of frames.")]
+_gain_help = (
+    "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
+)
+_Gain = Annotated[str | None, option(_gain_help, parser=_gain, metavar="FACTOR")]
+_Loss = Annotated[float | None, option("Error that --gain auto may cost. Default: as little as possible.")]
+_Calibration = Annotated[Path | None, file("The store of 'ltcl acquire' that TRANSPORT was made of.")]
+_Weights = Annotated[Path | None, file("Picture of how much the error at each pixel counts.")]
+_Low = Annotated[float, option("Darkest light of the projector.")]
+_High = Annotated[float, option("Brightest light of the projector.")]
+_Clamp = Annotated[bool, option("Clamp what exceeds that light, without making up for it.", "--clamp")]
+_Background = Annotated[
+    Path | None, file("Picture of the light that stays. Default: as measured, else none.")
 ]
-_LOSS = Annotated[
-    float | None,
-    typer.Option(
-        metavar="FRACTION",
-        help="Error that --gain auto may cost. Default: none if possible, else RTOL or 1.1 times the least.",
-        show_default=False,
-    ),
+_Batch = Annotated[int | None, _film("Frames solved at once; --resume needs the same. Default: 8.", min=1)]
+_Resume = Annotated[bool, _film("Go on where the last run into DIR ended.", "--resume")]
+_Frames = Annotated[int | None, _film("Only the first N frames.", min=1, metavar="N")]
+_Video = Annotated[
+    Path | None, file("Also a video of the patterns: .mkv, .avi or .mp4.", callback=writable_file)
 ]
-_CALIBRATION = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="STORE",
-        help="Of 'ltcl acquire': the transport.zarr that TRANSPORT was made of, where that does not keep how "
-        "projector and ambient light were measured.",
-        show_default=False,
-    ),
-]
-_WEIGHTS = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE", help="Picture of how much the error at each pixel counts.", show_default=False
-    ),
-]
-_LOW = Annotated[float, typer.Option(metavar="LIGHT", help="Darkest light of the projector.")]
-_HIGH = Annotated[float, typer.Option(metavar="LIGHT", help="Brightest light of the projector.")]
-_CLAMP = Annotated[
-    bool,
-    typer.Option(
-        "--clamp",
-        help="Clamp what exceeds the projector's light, and do not make up for it elsewhere: quick.",
-    ),
-]
-_BACKGROUND = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Picture of the scene under the light that the projector cannot take away. Default: what "
-        "'ltcl acquire' measured of it, else none.",
-        show_default=False,
-    ),
-]
-_PANEL = "Options of frames: a folder or a video"
-_BATCH = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="Frames solved at once. Patterns depend on it, within RTOL, so --resume needs the same. "
-        "Default: 8.",
-        show_default=False,
-        rich_help_panel=_PANEL,
-    ),
-]
-_RESUME = Annotated[
-    bool,
-    typer.Option("--resume", help="Go on where the last run into DIR ended.", rich_help_panel=_PANEL),
-]
-_FRAMES = Annotated[
-    int | None,
-    typer.Option(
-        min=1, metavar="N", help="Only the first N frames.", show_default=False, rich_help_panel=_PANEL
-    ),
-]
-_VIDEO = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Also a video of the patterns: .mkv or .avi (lossless), or .mp4.",
-        show_default=False,
-        rich_help_panel=_PANEL,
-    ),
-]
-_FPS = Annotated[
-    float | None,
-    typer.Option(
-        metavar="RATE",
-        help="Frames a second of that video. Default: those of the video that was read, else 25.",
-        show_default=False,
-        rich_help_panel=_PANEL,
-    ),
-]
-_FORMAT = Annotated[
-    Literal["png", "exr"] | None,
-    typer.Option(
-        help="Of the patterns: png, 16 bits in sRGB, or exr, the light as it is. Default: png.",
-        show_default=False,
-        rich_help_panel=_PANEL,
-    ),
-]
-_APPEARANCE = Annotated[
-    bool,
-    typer.Option("--appearance", help="Write how the scene will look, too.", rich_help_panel=_PANEL),
-]
+_Fps = Annotated[float | None, _film("Frames a second of that video. Default: as the source, else 25.")]
+_Format = Annotated[Literal["png", "exr"] | None, _film("png: 16 bits (default); exr: the light as it is.")]
+_Appearance = Annotated[bool, _film("Write how the scene will look, too.", "--appearance")]
 
 
-def run(
+def compensate(
+    context: Context,
     transport: options.Matrix,
-    picture: options.PicturesOrFrames,
+    picture: _Pictures,
     out: options.Out,
     grid: options.Grid = None,
     camera_grid: options.CameraGrid = None,
+    variable: options.Variable = None,
     method: options.Method = "auto",
     rtol: options.TaskRtol = None,
     inverse: options.Inverse = None,
@@ -139,138 +71,181 @@ def run(
     seed: options.Seed = None,
     first_bounce: options.FirstBounce = None,
     on_dark: options.OnDark = "auto",
-    gain: _GAIN = None,
-    loss: _LOSS = None,
-    low: _LOW = 0.0,
-    high: _HIGH = 1.0,
-    clamp: _CLAMP = False,
-    background: _BACKGROUND = None,
-    calibration: _CALIBRATION = None,
-    weights: _WEIGHTS = None,
+    gain: _Gain = None,
+    loss: _Loss = None,
+    low: _Low = 0.0,
+    high: _High = 1.0,
+    clamp: _Clamp = False,
+    background: _Background = None,
+    calibration: _Calibration = None,
+    weights: _Weights = None,
     resize: options.Resize = False,
     encoding: options.Encoding = "auto",
     device: options.Device = None,
-    json: options.Json = False,
-    batch: _BATCH = None,
-    resume: _RESUME = False,
-    frames: _FRAMES = None,
-    video: _VIDEO = None,
-    fps: _FPS = None,
-    format: _FORMAT = None,
-    appearance: _APPEARANCE = False,
-) -> None:
+    batch: _Batch = None,
+    resume: _Resume = False,
+    frames: _Frames = None,
+    video: _Video = None,
+    fps: _Fps = None,
+    format: _Format = None,
+    appearance: _Appearance = False,
+) -> Answer:
     """Find the projector patterns that make a scene look like PICTURE.
 
     Writes for each picture the pattern, how the scene will look under it and what is out of the projector's
-    reach, exactly as .exr and for the eye as .png, and compensate.json. What is out of reach is grey where
-    nothing is, orange where the scene stays too dark and blue where it stays too bright.
+    reach, exactly as .exr and as .png; all in compensate.png, and compensate.json. The .png of a pattern has
+    the codes for the projector, pixel for pixel: those of the measured response with a TRANSPORT of 'ltcl
+    acquire', else sRGB. The others are for the eye, at one exposure, which compensate.json names.
 
-    With a TRANSPORT of 'ltcl acquire' pattern .png and video hold the codes that its projector is fed, by the
-    measured response; else they are sRGB. Its ambient light is the background, and the gain is auto.
+    The ambient light of a TRANSPORT of 'ltcl acquire' is the background, and the gain is auto.
 
     Of a folder or a video of frames, writes the numbered patterns and frames.json batch by batch, with one
     gain for all; Ctrl-C keeps what is done, for --resume.
     """
+    from ltcl.acquisition import Setup
+
+    sampled = options.sampling(context.options)
+    source = compensate_frames.source(picture, context.options)
+    setup = Setup.of(calibration) if calibration else transports.setup_of(transport)
+    T = transports.load(context, transport, "light")
+    if setup is not None:
+        _check_setup(setup, calibration, T, {"--low": low, "--high": high})
+    settings = _settings(context, T, setup) | sampled
+    measured = {"background": "measured"} if background is None and setup is not None else {}
+    resolved = {name: settings[name] for name in ("rtol", "gain", *sampled)}
+    text = transports.heading(context, transport, T, **resolved, **measured)
+    text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
+    notes = [transports.caveat("errors are", T, exact)]
+    notes += ["pattern .png holds the codes of the measured projector: show it pixel for pixel"] * bool(setup)
+    notes += ["the background is the ambient light that was measured"] * bool(measured)
+    note = "\n".join(filter(None, notes))
+    if source is not None:
+        return compensate_frames.run(
+            context, T, source, text, settings | {"codes": setup and setup.codes}, note
+        )
+    desired = pictures.Reader(T.camera_grid, "the camera", encoding, resize).read_all(picture)
+    with results.fill(out, text) as folder:
+        _write_all(
+            context, T, folder, dict(zip(desired, picture, strict=True)), desired, text, settings, setup
+        )
+    return Answer({"folder": out, **text}, partial(_show, out, text["pictures"], note))
+
+
+def _check_setup(setup: Any, calibration: Path | None, T: Transport, bounds: dict[str, float]) -> None:
+    """Refuse the calibration of other pixels than those of T, and light beyond its black and white."""
+    if (setup.grid, setup.channels) != (T.grid, T.channels):
+        raise InputError(
+            f"{calibration}: is of {setup.grid} pixels and {setup.channels} channel(s); TRANSPORT has "
+            f"{T.grid} and {T.channels}"
+        )
+    for name, bound in bounds.items():
+        if not 0.0 <= bound <= 1.0:
+            limits = "from 0 to 1, the black and the white of the projector that 'ltcl acquire' measured"
+            raise InputError(f"{name} is {bound:g}; it must be {limits}")
+
+
+def _settings(context: Context, T: Transport, setup: Any) -> dict[str, Any]:
+    """Arguments of `ltcl.compensate`, pictures and transports read from their files."""
     from ltcl.compensation import RTOL
     from ltcl.transport import default_rtol
 
-    setup = transports.setup_of(transport, calibration)
-    sought: Any = ("auto" if setup else 1.0) if gain is None else gain
-    _check(sought, loss)
-    _check_measured(setup, low, high)
-    drawn = options.sampling(method, samples, seed)
-    film = {"batch": batch, "resume": resume, "frames": frames, "video": video, "fps": fps}
-    film |= {"format": format, "appearance": appearance}
-    source = compensate_frames.source(picture, film)
-    T = transports.load(
-        transport,
-        device,
-        needs="light",
-        grid=grid,
-        camera_grid=camera_grid,
-        first_bounce=first_bounce,
-        on_dark=on_dark,
-    )
-    transports.refuse_other(setup, calibration, T)
-    known = transports.load_inverse(inverse, T)
-    judge = transports.load_exact(exact, T, grid=grid, on_dark=on_dark)
-    rtol = default_rtol(RTOL, T, judge, known) if rtol is None else rtol
-    reader = pictures.Reader(T.camera_grid, "the camera", encoding, resize)
-    desired = {} if source else reader.read_all(picture)
-    photographs = pictures.Reader(T.camera_grid, "the camera", encoding, resize, upright=False)
-    dark, counts = (None if file is None else photographs.read(file) for file in (background, weights))
-    if dark is None and setup is not None:
-        dark = setup.ambient
-    text = transports.heading(
-        "compensate",
-        transport,
-        T,
-        grid=grid,
-        camera_grid=camera_grid,
-        method=method,
-        rtol=rtol,
-        inverse=inverse,
-        exact=exact,
-        **drawn,
-        first_bounce=first_bounce,
-        on_dark=on_dark,
-        gain=sought,
-        loss=loss,
-        low=low,
-        high=high,
-        clamp=clamp,
-        background="measured" if background is None and setup is not None else background,
-        calibration=calibration,
-        weights=weights,
-        resize=resize,
-        encoding=encoding,
-        device=device,
-    )
-    text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
-    settings: dict[str, Any] = {"bounds": (low, high), "gain": sought, "loss": loss, "method": method}
-    settings |= {"rtol": rtol, **drawn, "background": dark, "weights": counts}
-    settings |= {"inverse": known, "exact": judge, "clamp": clamp}
-    told = [transports.caveat("errors are", T, exact), *_measured(setup, background)]
-    told = "\n".join(filter(None, told))
-    if source:
-        settings |= {"resize": resize, "encoding": encoding, "codes": setup and setup.codes}
-        done = compensate_frames.run(T, source, out, {**film, **settings})
-        if json:
-            console.answer({"folder": out, **text, **compensate_frames.entry(source, done)})
-        else:
-            compensate_frames.show(done, told, gain == "auto")
-        return
-    names = {"background": background, "weights": weights}
-    entries = compensate_pictures.run(T, picture, desired, out, text, names, settings, setup)
-    if json:
-        console.answer({"folder": out, **text})
-    else:
-        compensate_pictures.show(out, entries, told, advise=sought != "auto")
+    asked, judges = context.options, transports.load_judges(context, T)
+    rtol, gain = asked["rtol"], asked["gain"]
+    reader = pictures.Reader(T.camera_grid, "the camera", asked["encoding"], asked["resize"], upright=False)
+    seen = {name: asked[name] and reader.read(asked[name]) for name in ("background", "weights")}
+    if seen["background"] is None and setup is not None:
+        seen["background"] = setup.ambient
+    return {
+        "rtol": default_rtol(RTOL, T, judges["exact"], judges["inverse"]) if rtol is None else rtol,
+        "gain": gain if gain is not None else 1.0 if setup is None else "auto",
+        "bounds": (asked["low"], asked["high"]),
+        **{name: asked[name] for name in ("method", "loss", "clamp")},
+        **seen,
+        **judges,
+    }
 
 
-def _check_measured(setup: Any, low: float, high: float) -> None:
-    """The light of a projector that was measured is relative to its black and its white."""
-    for name, bound in (("--low", low), ("--high", high)):
-        if setup is not None and not 0.0 <= bound <= 1.0:
-            raise InputError(
-                f"{name} is {bound:g}; it must be from 0 to 1, the black and the white of the projector that "
-                "'ltcl acquire' measured"
+def _write_all(
+    context: Context,
+    T: Transport,
+    folder: Path,
+    files: dict[str, Path],
+    desired: dict[str, np.ndarray],
+    text: dict[str, Any],
+    settings: dict[str, Any],
+    setup: Any,
+) -> None:
+    """Compensate all pictures into `folder`; the report gets its entries."""
+    from ltcl.compensation import compensate
+
+    text["exposure"] = factor = pictures.exposure(*desired.values())
+    text["pictures"], rows = [], []
+    named = {name: context.options[name] for name in ("background", "weights")}
+    for name in context.progress.each(list(files)):
+        with pictures.naming({"desired": files[name], "gain": files[name], **named}):
+            solves = options.solves(settings["method"], T.channels)
+            callback = context.progress.solve(settings["rtol"], solves)
+            found = compensate(T, desired[name], callback=callback, **settings)
+        entry = {
+            "file": str(files[name]),
+            **{key: getattr(found, key) for key in ("gain", "clipped", "error", "transport_error", "gap")},
+            "too_dark": float(np.mean(found.out_of_reach > 0)),
+            "too_bright": float(np.mean(found.out_of_reach < 0)),
+            "channels": report.solution(found.solution),
+            "limited": report.solution(found.limited),
+        }
+        white = max(settings["bounds"][1], 0.0) or 1.0
+        written, panels = _write(folder, name, desired[name], found, factor, white, setup)
+        text["pictures"].append(entry | written)
+        rows += [panels] if len(rows) < _SHEET else []
+    pictures.contact_sheet(rows).save(folder / "compensate.png")
+
+
+def _write(
+    folder: Path, name: str, desired: np.ndarray, found: Compensation, factor: float, white: float, setup: Any
+) -> tuple[dict[str, Any], list[Any]]:
+    """Files of one picture, and its row of the contact sheet.
+
+    Appearance / gain compares with the picture that was asked for, whatever the units of T.
+    """
+    scale, error = factor / found.gain, f"{100 * found.error:.2g} % relative error"
+    seen, missing = pictures.shades(found.appearance, scale), found.out_of_reach
+    shown = {
+        "desired": (f"{name}, desired", pictures.shades(desired, factor)),
+        "pattern": (f"{name}, pattern", pictures.shades(found.pattern, 1 / white)),
+        "appearance": (f"{name}, as seen, {error}", seen),
+        "out_of_reach": (
+            "out of reach: orange too dark, blue too bright",
+            pictures.mark(seen, missing * scale),
+        ),
+    }
+    panels = {key: pictures.panel(codes, label) for key, (label, codes) in shown.items()}
+    written = {"pattern": pictures.write_pattern(folder, f"{name}_pattern", found.pattern, white, setup)}
+    for key in ("appearance", "out_of_reach"):
+        written[key] = pictures.write(folder, f"{name}_{key}", getattr(found, key), panels[key])
+    return written, list(panels.values())
+
+
+def _show(out: Path, entries: list[dict[str, Any]], note: str) -> None:
+    """Print what came out, and on stderr what would help."""
+    rows = []
+    for entry in entries:
+        solves = entry["channels"] + [each for each in entry["limited"] if each not in entry["channels"]]
+        methods = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
+        products = sum(solve["products"] for solve in solves)
+        clipped, error = f"{100 * entry['clipped']:.1f} %", f"{100 * entry['error']:.2f} %"
+        name, pattern = Path(entry["file"]).name, entry["pattern"]["png"]
+        rows.append((name, methods, products, entry["gain"], clipped, error, pattern))
+    console.table(("picture", "method", "products", "gain", "clipped", "error", "pattern"), rows)
+    typer.echo(f"\npatterns, appearances and what is out of reach as .exr and .png in {out}")
+    typer.echo(f"look at {out / 'compensate.png'}" + (f"\n{note}" if note else ""))
+    for entry in entries:
+        dark, bright = (
+            f"{entry['file']}: {100 * entry[name]:.0f} % of it stays" for name in ("too_dark", "too_bright")
+        )
+        if entry["too_dark"] > _MANY:
+            console.note(
+                f"{dark} too dark for the projector's light; --gain auto finds the largest gain for it"
             )
-
-
-def _measured(setup: Any, background: Path | None) -> list[str]:
-    """What the calibration in the transport was used for, in words."""
-    if setup is None:
-        return []
-    used = "; the background is the ambient light that was measured" if background is None else ""
-    return [f"pattern .png holds the codes to feed to the measured projector as they are{used}"]
-
-
-def _check(gain: float | str, loss: float | None) -> None:
-    """What the library refuses of a gain and a loss, in the words of the command line."""
-    if gain != "auto":
-        checks.number("--gain", gain, above=0.0)
-        if loss is not None:
-            raise InputError(f"--loss is {loss:g}, but --gain is {gain:g}; --loss is for --gain auto only")
-    elif loss is not None:
-        checks.number("--loss", loss, least=1e-6, below=1.0)
+        if entry["too_bright"] > _MANY:
+            console.note(f"{bright} too bright, by bounces or the background; brighten its dark parts")

@@ -6,46 +6,29 @@ from __future__ import annotations
 import os
 
 from ltcl import checks
-from ltcl.cli import console, options
+from ltcl.cli import console
+from ltcl.cli.command import Answer, Context
 from ltcl.device import discovery
 from ltcl.errors import DeviceError
 
+_FACTS = ("index", "name", "kind", "driver", "compute_units", "memory", "max_allocation")
 
-def run(json: options.Json = False) -> None:
+
+def devices(context: Context) -> Answer:
     """List the OpenCL devices, the best first; the arrow marks the one that would be chosen."""
-    devices = discovery.list_devices()
-    chosen = _chosen(devices)
-    if json:
-        console.answer([_facts(device) | {"chosen": device is chosen} for device in devices])
-        return
-    rows = [
-        (
-            "->" if device is chosen else "",
-            device.index,
-            device.name,
-            device.kind,
-            device.driver,
-            device.compute_units,
-            checks.size(device.memory),
-            checks.size(device.max_allocation),
-        )
-        for device in devices
-    ]
-    console.table(("", "index", "name", "kind", "driver", "units", "memory", "largest buffer"), rows)
-
-
-def _chosen(devices: list[discovery.Description]) -> discovery.Description | None:
-    """What a command would take; None, with a note, where it would refuse all there is."""
-    wanted = os.environ.get("LTCL_DEVICE") or None
+    found, chosen, name = discovery.list_devices(), None, os.environ.get("LTCL_DEVICE") or None
     try:
-        return discovery.choose(devices, wanted)
+        chosen = discovery.choose(found, name)
     except DeviceError as error:
-        if not devices:
+        if not found:
             raise
-        console.note(str(error) if wanted is None else f"LTCL_DEVICE={wanted} matches none of these")
-        return None
-
-
-def _facts(device: discovery.Description) -> dict:
-    names = ("index", "name", "kind", "driver", "compute_units", "memory", "max_allocation")
-    return {name: getattr(device, name) for name in names}
+        console.note(str(error) if name is None else f"LTCL_DEVICE={name} matches none of these")
+    data = [{fact: getattr(device, fact) for fact in _FACTS} for device in found]
+    rows = [
+        ("->" if device is chosen else "", *facts[:-2], *map(checks.size, facts[-2:]))
+        for device, facts in zip(found, (list(each.values()) for each in data), strict=True)
+    ]
+    for device, facts in zip(found, data, strict=True):
+        facts["chosen"] = device is chosen
+    columns = ("", "index", "name", "kind", "driver", "units", "memory", "largest buffer")
+    return Answer(data, lambda: console.table(columns, rows))

@@ -9,55 +9,37 @@ from typing import Annotated
 import typer
 
 from ltcl import checks
-from ltcl.cli import console, options, transports
-
-_Out = Annotated[
-    Path,
-    typer.Option("--out", "-o", metavar="FILE", help="The inverse: .npz.", show_default=False),
-]
-_Basis = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME",
-        help="pixels, or a wavelet (haar, db2, db4, ...); may be given more than once. Default: the best of "
-        "db2, haar, db4 and pixels.",
-        show_default=False,
-    ),
-]
+from ltcl.cli import options, transports
+from ltcl.cli.command import Answer, Context
 
 
-def run(
+def invert(
+    context: Context,
     file: options.Matrix,
-    out: _Out,
+    out: Annotated[Path, options.out("The inverse: .npz.")],
     rtol: options.SolutionRtol = 1e-2,
-    basis: _Basis = None,
+    basis: options.Basis = None,
     grid: options.Grid = None,
+    variable: options.Variable = None,
     first_bounce: options.FirstBounce = None,
     on_dark: options.OnDark = "auto",
     device: options.Device = None,
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Find A = I - S^-1, one physical bounce, so that each further picture costs one product."""
     from ltcl.compression import INVERSE_NAMES, invert
     from ltcl.store import inverses
 
     inverses.check_name(out)  # refused before a long computation
     transports.refuse_same(out, file)
-    T = transports.load(file, device, grid=grid, first_bounce=first_bounce, on_dark=on_dark)
-    with console.Steps(1) as steps:
-        steps.item(str(file))
-        inverse = invert(T, rtol, basis=basis or INVERSE_NAMES, progress=steps.at)
+    T = transports.load(context, file)
+    inverse = invert(T, rtol, basis=basis or INVERSE_NAMES, progress=context.progress.share)
     inverses.save_inverse(out, inverse)
-    text = {
-        **transports.heading("invert", file, T, rtol=rtol, basis=basis),
-        "out": out,
-        "bytes": inverse.nbytes,
-        "bytes_on_disk": out.stat().st_size,
-        "errors": inverse.errors,
-        "confidence": inverse.confidence,
-    }
-    if json:
-        console.answer(text)
-    else:
-        size, disk = checks.size(inverse.nbytes), checks.size(out.stat().st_size)
-        typer.echo(f"{out}: solutions within {checks.upwards(inverse.error)}, {size}, {disk} on disk")
+    data = transports.heading(context, file, T)
+    data |= {"out": out, "bytes": inverse.nbytes, "bytes_on_disk": out.stat().st_size}
+    data |= {"errors": inverse.errors, "confidence": inverse.confidence}
+    error, sizes = (
+        checks.upwards(inverse.error),
+        (checks.size(data[key]) for key in ("bytes", "bytes_on_disk")),
+    )
+    text = "{}: solutions within {}, {}, {} on disk".format(out, error, *sizes)
+    return Answer(data, lambda: typer.echo(text))

@@ -1,33 +1,27 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The folder that a command fills: its pictures, and a report of its own that lists them.
 
-The report is called after its command, so that several commands may share a folder. The next run of a command
-takes away what its last one left and it does not write itself; files of nobody's report stay.
+The report is named after its command, so that several commands may share a folder. A later run of a command
+removes what its earlier run listed and it does not write itself; all other files stay.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from ltcl import report
-from ltcl.cli import console
 from ltcl.files import fill_folder
 
 
 @contextmanager
 def fill(out: Path, text: dict[str, Any]) -> Iterator[Path]:
-    """Fill `out` as `fill_folder` does, and add the report `text` with the list of its files.
+    """Fill `out` as `fill_folder` does, and write the report `text` with the list of its files.
 
-    Another run that writes there is refused at once.
-
-    Only when all is in place, the files go that the earlier report of this command listed and this one
-    does not.
+    A second run that writes there is refused at once.
     """
     from ltcl.batch.manifest import locked
 
@@ -36,52 +30,29 @@ def fill(out: Path, text: dict[str, Any]) -> Iterator[Path]:
         earlier = _listed(out / name)
         with fill_folder(out) as folder:
             yield folder
-            found = sorted(
-                file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()
-            )
-            text["files"] = [*found, name]
+            files = [file for file in folder.rglob("*") if file.is_file()]
+            text["files"] = [*sorted(file.relative_to(folder).as_posix() for file in files), name]
             report.write(folder / name, text)
-        _remove(out, earlier, text["files"])
+        now = {file.lower() for file in text["files"]}  # some file systems ignore case
+        for file in earlier:
+            if file.lower() not in now:
+                _remove(out, file)
 
 
 def _listed(path: Path) -> list[str]:
-    """The files that an earlier report lists; none where it is broken or missing."""
+    """The files that an earlier report lists; none where it is damaged or missing."""
     try:
-        files = json.loads(path.read_text(encoding="utf-8"))["files"]
+        return [str(file) for file in json.loads(path.read_text(encoding="utf-8"))["files"]]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
-    return [file for file in files if isinstance(file, str)] if isinstance(files, list) else []
 
 
-def _remove(out: Path, earlier: Iterable[str], now: Iterable[str]) -> None:
-    # Compared by identity: where a file system ignores case, Sky.png and sky.png are one file.
-    keep = {_identity(out / name) for name in now}
-    for name in earlier:
-        path = _inside(out, name)
-        if path is None or _identity(path) in keep:
-            continue
-        try:
+def _remove(out: Path, name: str) -> None:
+    """Remove a plain file that lies in the folder itself, links resolved, and its folder if that is empty."""
+    with suppress(OSError, ValueError):
+        folder = (out / name).parent.resolve()
+        path = folder / Path(name).name
+        if folder.is_relative_to(out.resolve()) and path.is_file() and not path.is_symlink():
             path.unlink()
-        except OSError as error:
-            console.note(f"{path}: is of an earlier run and cannot be removed: {error.strerror}")
-            continue
-        if path.parent != Path(os.path.realpath(out)):
-            with suppress(OSError):  # not empty: not only ours
-                path.parent.rmdir()
-
-
-def _identity(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_dev, status.st_ino
-
-
-def _inside(out: Path, name: str) -> Path | None:
-    """The regular file `name` in the folder `out`; None for whatever lies elsewhere or is something else."""
-    try:
-        root = Path(os.path.realpath(out))
-        path = Path(os.path.realpath(root / Path(name).parent)) / Path(name).name
-        regular = stat.S_ISREG(path.lstat().st_mode)
-    except (OSError, ValueError):
-        return None
-    strange = Path(name).is_absolute() or ".." in Path(name).parts
-    return path if regular and not strange and path.is_relative_to(root) else None
+            if folder != out.resolve():
+                folder.rmdir()

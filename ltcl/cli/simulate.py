@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager
+import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,87 +13,52 @@ import numpy as np
 import typer
 
 from ltcl import checks, report
-from ltcl.cli import acquisition_file, console, options, results
-from ltcl.errors import InputError, InputTypeError
+from ltcl.cli import options, results
+from ltcl.cli.command import Answer, Context
+from ltcl.cli.options import option
+from ltcl.errors import InputError
+from ltcl.store import Record, formats
 
 _MITSUBA = "mitsuba:"
 _SCENES = ("dihedral", "trihedral", "box")
-_SIZE, _GRID = 16, (24, 32)
+_SIZE, _GRID, _ALBEDO = 16, (24, 32), (0.7,)
 
 
 def _albedo(text: str) -> tuple[float, ...]:
     try:
-        found = tuple(float(part) for part in text.split(","))
+        albedo = tuple(float(part) for part in text.split(","))
     except ValueError:
-        found = ()
-    if len(found) not in (1, 3):
+        albedo = ()
+    if len(albedo) not in (1, 3):
         raise typer.BadParameter(f"{text!r} is no albedo; write one number, or red,green,blue")
-    return found
+    return albedo
 
 
-_SCENE = Annotated[
-    str,
-    typer.Argument(
-        metavar="SCENE",
-        help="dihedral, trihedral or box; a transport file; or mitsuba: and dihedral, trihedral, box or an "
-        "XML file of Mitsuba (extra rig), which is rendered.",
-    ),
-]
-_Size = Annotated[
-    int | None,
-    typer.Option(
-        min=2, metavar="N", help="Patches along a wall of a scene. Default: 16.", show_default=False
-    ),
-]
-_Grid = Annotated[
-    tuple | None,
-    typer.Option(
-        parser=options.grid,
-        metavar="HxW",
-        help="Projector pixels: of mitsuba (default 24x32), or where the file does not tell.",
-        show_default=False,
-    ),
-]
-_CameraGrid = Annotated[
-    tuple | None,
-    typer.Option(
-        parser=options.grid,
-        metavar="HxW",
-        help="Camera pixels, if not those of the projector: Gray code then finds which is which.",
-        show_default=False,
-    ),
-]
-_Albedo = Annotated[
-    Any,
-    typer.Option(
-        parser=_albedo,
-        metavar="A|R,G,B",
-        help="Of the walls; three numbers make it a scene in colour. Default: 0.7.",
-        show_default=False,
-    ),
-]
+_SCENE = (
+    "dihedral, trihedral or box; a transport file; or mitsuba: and one of these or an XML file of Mitsuba."
+)
+_AMBIENT = "Light of the room, where a lit white wall has 1. Default: 0.01; mitsuba has its own."
+_STRATEGIES = Literal["auto", "adaptive", "pixel", "block", "hadamard"]
 _Curve = Literal["linear", "srgb", "gamma2.2", "film"]
-_Response = Annotated[_Curve, typer.Option(help="Of the camera, light to code.")]
-_Projector = Annotated[_Curve, typer.Option(help="Of the projector, code to light.")]
-_Bits = Annotated[int, typer.Option(min=8, max=16, metavar="8|12|16", help="Of the photographs.")]
-_Ambient = Annotated[
-    float | None,
-    typer.Option(
-        min=0.0,
-        metavar="LIGHT",
-        help="In the room, where a white wall under the projector has 1. Default: 0.01; mitsuba has its own.",
-        show_default=False,
-    ),
+_grid = partial(option, parser=options.grid, metavar="HxW")
+_Scene = Annotated[str, options.argument("SCENE", _SCENE, parser=None)]
+_Size = Annotated[int | None, option("Patches along a wall of a scene. Default: 16.", min=2)]
+_Grid = Annotated[tuple | None, _grid("Projector pixels: of mitsuba (24x32), or where a file lacks them.")]
+_CameraGrid = Annotated[
+    tuple | None, _grid("Camera pixels, if other ones: Gray code then finds which is which.")
 ]
-_Strategy = Annotated[
-    Literal["auto", "adaptive", "pixel", "block", "hadamard"],
-    typer.Option(help="How 'ltcl acquire' is to scan."),
-]
-_Seed = Annotated[int, typer.Option(min=0, metavar="N", help="Of the noise.")]
+_Albedo = Annotated[Any, option("Of the walls: A or R,G,B. Default: 0.7.", parser=_albedo, metavar="ALBEDO")]
+_Response = Annotated[_Curve, option("Of the camera, light to code.")]
+_Projector = Annotated[_Curve, option("Of the projector, code to light.")]
+_Bits = Annotated[int, option("Of the photographs.", min=8, max=16)]
+_Ambient = Annotated[float | None, option(_AMBIENT, min=0.0)]
+_Strategy = Annotated[_STRATEGIES, option("How 'ltcl acquire' is to scan.")]
+_Seed = Annotated[int, option("Of the noise.", min=0)]
 
 
-def run(
-    scene: _SCENE,
+def simulate(
+    context: Context,
+    scene: _Scene,
     out: options.Out,
     size: _Size = None,
     grid: _Grid = None,
@@ -105,152 +70,141 @@ def run(
     ambient: _Ambient = None,
     strategy: _Strategy = "auto",
     seed: _Seed = 0,
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Make a folder in which 'ltcl acquire' photographs SCENE, without a camera.
 
-    Writes acquisition.toml, which says how, with what else it could say; truth.npz, the transport that is to
-    be found again (not of mitsuba); and white.png and black.png, what the camera photographs under these.
+    Writes acquisition.toml, with what else it could say in comments, and truth.npz, the transport that is to
+    be found again (not of mitsuba).
     """
-    _refuse_taken(out)
-    sensor = {"response": response, "projector_response": projector_response, "bits": bits, "seed": seed}
-    given = {"size": size, "grid": grid, "camera_grid": camera_grid, "albedo": albedo, "ambient": ambient}
-    text = {"command": "simulate", "versions": report.versions(), "scene": scene}
-    text["options"] = {**given, **sensor, "strategy": strategy}
-    with console.Steps(2) as steps, results.fill(out, text) as folder:
-        steps.item("scene")
-        if scene.startswith(_MITSUBA):
-            rig = _rendered(scene.removeprefix(_MITSUBA), given)
-        else:
-            rig = _known(folder, scene, given)
-        aligned = camera_grid is None and not scene.endswith(".xml")
-        settings = {"geometry": "aligned" if aligned else "graycode", "strategy": strategy}
-        (folder / "acquisition.toml").write_text(acquisition_file.text(rig | sensor, settings), "utf-8")
-        steps.item("photographs")
-        with _named(folder, out):
-            facts = _photograph(folder)
-        text |= facts
-    if json:
-        console.answer({"folder": out, **text})
-        return
-    h, w = facts["projector_grid"]
-    typer.echo(f"{out}: {scene}, {h} x {w} projector pixels, {facts['channels']} channel(s)")
-    typer.echo(f"what it takes: ltcl acquire plan {out}\nto do it:      ltcl acquire run {out}")
-
-
-def _refuse_taken(out: Path) -> None:
-    """Nobody's acquisition, and no acquisition.toml written by hand, is replaced."""
     if (out / "transport.zarr").exists():
         raise InputError(f"{out}: holds a transport.zarr that was acquired; choose another folder")
     if (out / "acquisition.toml").exists() and not (out / "simulate.json").exists():
-        raise InputError(
-            f"{out}: holds an acquisition.toml that 'ltcl simulate' did not make; choose another folder"
-        )
+        raise InputError(f"{out}: holds an acquisition.toml of somebody else; choose another folder")
+    from ltcl.acquisition import Project
+
+    asked = {name: value for name, value in context.options.items() if name != "out"}
+    sensor = {name: asked[name] for name in ("response", "projector_response", "bits", "seed")}
+    geometry = "aligned" if camera_grid is None and not scene.endswith(".xml") else "graycode"
+    text: dict[str, Any] = {
+        "command": "simulate",
+        "versions": report.versions(),
+        "scene": scene,
+        "options": asked,
+    }
+    with results.fill(out, text) as folder:
+        context.progress("scene")
+        rig = _rendered(scene, asked) if scene.startswith(_MITSUBA) else _known(folder, scene, asked)
+        settings = {"geometry": geometry, "strategy": strategy}
+        (folder / "acquisition.toml").write_text(_toml(rig | sensor, settings), "utf-8")
+        with Project.open(folder).rig() as made:  # refuses what cannot be photographed
+            text |= {"projector_grid": made.projector_grid, "channels": made.channels}
+
+    def show() -> None:
+        h, w = text["projector_grid"]
+        typer.echo(f"{out}: {scene}, {h} x {w} projector pixels, {text['channels']} channel(s)")
+        typer.echo(f"what it takes: ltcl acquire plan {out}\nto do it:      ltcl acquire run {out}")
+
+    return Answer({"folder": out, **text}, show)
 
 
-@contextmanager
-def _named(folder: Path, out: Path) -> Iterator[None]:
-    """Refusals name the folder that is to be, not the one that is filled."""
-    try:
-        yield
-    except (InputError, InputTypeError) as error:
-        raise type(error)(str(error).replace(str(folder), str(out))) from None
-
-
-def _photograph(folder: Path) -> dict[str, Any]:
-    """Pictures under white and black as the camera gives them; sizes for the report."""
-    from ltcl import images
-    from ltcl.acquisition import Project, Shots
-    from ltcl.acquisition.geometry.measure import exposure
-
-    with Project.open(folder).rig() as rig:
-        shots = Shots(rig)
-        seconds = exposure(shots, shots.grid)
-        for name, code in (("white", 1.0), ("black", 0.0)):
-            codes = shots.photograph(np.full(shots.grid, code, np.float32), seconds)
-            images.write(folder / f"{name}.png", codes, encoding="linear")
-        grids = {"projector_grid": shots.grid, "camera_grid": shots.camera_grid}
-        return {**grids, "channels": shots.channels, "seconds": seconds}
-
-
-def _rendered(scene: str, given: dict[str, Any]) -> dict[str, Any]:
+def _rendered(scene: str, asked: dict[str, Any]) -> dict[str, Any]:
     """The table of a rig that Mitsuba renders."""
-    _refuse(given, "size", "ambient", why="is not for mitsuba")
-    rig: dict[str, Any] = {"kind": "mitsuba", "scene": scene, "projector_grid": given["grid"] or _GRID}
-    if scene not in _SCENES:
-        _refuse(given, "albedo", why=f"is for {', '.join(_SCENES)}; {scene} has its own")
-        rig["scene"] = str(Path(scene).resolve())
-    albedo = given["albedo"] or (0.7,)
+    _refuse(asked, "size", "ambient", why="is not for mitsuba")
+    scene = scene.removeprefix(_MITSUBA)
+    rig: dict[str, Any] = {"kind": "mitsuba", "scene": scene, "projector_grid": asked["grid"] or _GRID}
     if scene in _SCENES:
+        albedo = asked["albedo"] or _ALBEDO
         rig |= {"channels": len(albedo), "albedo": albedo if len(albedo) == 3 else albedo[0]}
-    if given["camera_grid"]:
-        rig["camera_grid"] = given["camera_grid"]
-    return rig
+    else:
+        _refuse(asked, "albedo", why=f"is for {', '.join(_SCENES)}; {scene} has its own")
+        rig["scene"] = str(Path(scene).resolve())
+    return rig | ({"camera_grid": asked["camera_grid"]} if asked["camera_grid"] else {})
 
 
-def _known(folder: Path, scene: str, given: dict[str, Any]) -> dict[str, Any]:
+def _known(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
     """The table of a rig around a transport, which goes into the folder."""
-    from ltcl.store import Record, formats
+    from ltcl import scenes
 
     if scene in _SCENES:
-        _refuse(given, "grid", why="is for mitsuba and files; give --size")
-        record = _built(scene, given["size"] or _SIZE, given["albedo"] or (0.7,))
+        _refuse(asked, "grid", why="is for mitsuba and files; give --size")
+        albedo = asked["albedo"] or _ALBEDO
+        walls = np.array([albedo]) if len(albedo) == 3 else albedo[0]
+        sides = {"sides": 5} if scene == "box" else {}
+        built = getattr(scenes, scene)(asked["size"] or _SIZE, albedo=walls, **sides)
+        record = Record(built.matrices(), grid=built.grid)
     else:
-        _refuse(given, "size", "albedo", why=f"is for {', '.join(_SCENES)}; a file has its own")
-        record = formats.read(_file(scene))
-    if isinstance(record, Record) and (given["grid"] or record.grid is None):
-        if given["grid"] is None:
-            raise InputError(f"{scene}: does not tell its grid; give --grid HxW")
-        record = dataclasses.replace(record, grid=checks.grid("--grid", given["grid"], record.shape[1]))
+        _refuse(asked, "size", "albedo", why=f"is for {', '.join(_SCENES)}; a file has its own")
+        if not Path(scene).suffix and not Path(scene).exists():
+            known = ", ".join(_SCENES)
+            raise InputError(f"SCENE is {scene!r}; it must be {known}, mitsuba:NAME or a transport file")
+        record = formats.read(Path(scene))
+    if isinstance(record, Record) and (asked["grid"] or record.grid is None):
+        if asked["grid"] is None:
+            raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
+        record = dataclasses.replace(record, grid=checks.grid("--grid", asked["grid"], record.shape[1]))
     formats.write(folder / "truth.npz", record)
     rig: dict[str, Any] = {"kind": "virtual", "transport": "truth.npz"}
-    if given["camera_grid"]:
-        rig |= {"camera_grid": given["camera_grid"], "camera_map": "camera.npz"}
-        formats.write(folder / "camera.npz", _camera(record.camera_grid or record.grid, given["camera_grid"]))
-    return rig | {"ambient": 0.01 if given["ambient"] is None else given["ambient"]}
+    if asked["camera_grid"]:
+        rig |= {"camera_grid": asked["camera_grid"], "camera_map": "camera.npz"}
+        pixels: Any = record.camera_grid or record.grid
+        formats.write(folder / "camera.npz", _camera(pixels, asked["camera_grid"]))
+    return rig | {"ambient": 0.01 if asked["ambient"] is None else asked["ambient"]}
 
 
-def _refuse(given: dict[str, Any], *names: str, why: str) -> None:
+def _refuse(asked: dict[str, Any], *names: str, why: str) -> None:
     for name in names:
-        if given[name] is not None:
+        if asked[name] is not None:
             raise InputError(f"--{name} is given, but it {why}")
 
 
-def _file(scene: str) -> Path:
-    path = Path(scene)
-    if not path.suffix and not path.exists():
-        raise InputError(
-            f"SCENE is {scene!r}; it must be {', '.join(_SCENES)}, mitsuba:NAME or a transport file"
-        )
-    return path
+def _camera(pixels: tuple[int, int], camera: tuple[int, int]) -> Record:
+    """What each pixel of a camera in the projector's place sees."""
+    from ltcl.acquisition import camera_map
+
+    (h, w), (H, W) = pixels, camera
+
+    def place(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (u + 0.5) * w / W - 0.5, (v + 0.5) * h / H - 0.5
+
+    return Record((camera_map(place, camera, pixels),), grid=pixels, camera_grid=camera)
 
 
-def _built(scene: str, size: int, albedo: tuple[float, ...]) -> Any:
-    from ltcl import scenes
-    from ltcl.store import Record
+_TOML = """\
+# What 'ltcl acquire' photographs in this folder, and how. The keys of [rig] are the arguments of
+# ltcl.acquisition.VirtualRig, MitsubaRig, FolderRig or LiveRig, those of [acquire] the arguments of
+# ltcl.acquire; "none" stands for None. Once photographs are taken, [acquire] must stay as it is.
 
-    walls = np.array([albedo]) if len(albedo) == 3 else albedo[0]
-    sides = {"sides": 5} if scene == "box" else {}
-    made = getattr(scenes, scene)(size, albedo=walls, **sides)
-    return Record(made.matrices(), grid=made.grid)
+[rig]
+{rig}# gain = 10000.0           # electrons at full scale; "none": no photon noise
+# exposures = [0.1, 0.2]   # seconds that the camera offers; left out: any
+
+[acquire]
+{acquire}# geometry: "graycode" measures which projector pixel a camera pixel sees, "aligned": the same one
+# strategy: "auto", "adaptive", "pixel", "block" or "hadamard"; 'ltcl acquire plan' compares them
+# exposures = [0.5, 8.0]   # seconds of the photographs of each pattern; left out: chosen
+# response = "linear"      # of the camera where it is known; left out: measured
+
+# Other rigs: a projector and a camera worked by hand, with patterns and photographs in this folder,
+#   [rig]
+#   kind = "folder"
+#   projector_grid = [48, 64]   # height, width
+# or a camera on a cable before a display of this computer (extras camera and projector):
+#   [rig]
+#   kind = "live"
+#   [rig.camera]
+#   kind = "opencv"             # or "gphoto2"
+#   source = 0
+#   [rig.display]
+#   grid = [48, 64]
+#   index = 1
+"""
 
 
-def _camera(pixels: Any, camera: tuple[int, int]) -> Any:
-    """What each pixel of a camera in the projector's place sees: the mean of the area that it covers."""
-    from scipy.sparse import csr_array, kron
-
-    from ltcl.store import Record
-
-    down, across = (csr_array(_covered(*sides)) for sides in zip(pixels, camera, strict=True))
-    return Record((csr_array(kron(down, across)),), grid=pixels, camera_grid=camera)
-
-
-def _covered(pixels: int, camera: int) -> np.ndarray:
-    """Of each of the camera's pixels along a side, its parts on the others, (camera, pixels).
-
-    >>> _covered(4, 2).tolist()
-    [[0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.5]]
-    """
-    edges, start = np.arange(camera + 1) * pixels / camera, np.arange(pixels)
-    shared = np.minimum(edges[1:, None], start + 1) - np.maximum(edges[:-1, None], start)
-    return np.maximum(shared, 0.0) * camera / pixels
+def _toml(rig: dict[str, Any], acquire: dict[str, Any]) -> str:
+    """The file, with what else it could say in comments."""
+    tables = {"rig": rig, "acquire": acquire}
+    lines = {
+        name: "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in table.items())
+        for name, table in tables.items()
+    }
+    return _TOML.format(**lines)

@@ -114,8 +114,14 @@ class Compensation:
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.pattern.shape))
-        off = f"off by {self.error:.2%}{error_note(self.transport_error)}"
-        return f"<ltcl Compensation {shape}, {off}, {self.clipped:.2%} clipped>"
+        error = f"relative error {self.error:.2%}{error_note(self.transport_error)}"
+        return f"<ltcl Compensation {shape}, {error}, {self.clipped:.2%} clipped>"
+
+    def _repr_html_(self) -> str:
+        from ltcl.images.thumbnails import figures  # brings OpenCV
+
+        names = ("pattern", "appearance", "target", "out_of_reach")
+        return figures(self, {name: getattr(self, name) for name in names})
 
 
 def compensate(
@@ -171,17 +177,14 @@ def compensate(
         Clamp the light to the bounds, and leave it at that: quick, for videos. Other pixels do not make up
         for it; `error` tells how far off that is, and `gap` is the whole error, since nothing is proved.
 
-    Returns
-    -------
-    Compensation
-        Never worse than the light without bounds, clamped, at a given gain; within the loss of gain="auto".
+    The result is never worse than the light without bounds, clamped, at a given gain.
 
     Raises
     ------
     InputError
-        Shapes that do not fit, bounds in the wrong order, a gain that is not positive, weights below 0, no
-        gain that keeps the picture within `loss`, or an `rtol` below the error of a compressed T without
-        `exact`, or below that of `inverse`, or an inverse of another transport.
+        Other shapes, bounds in the wrong order, a gain that is not positive, weights below 0, no gain within
+        `loss`, an `rtol` below the error of a compressed T without `exact` or of `inverse`, or an inverse of
+        another transport.
     ConvergenceError
         A solve did not reach `rtol` in `maxiter` steps, or not at all. Within the bounds, where float32 is
         too coarse to prove it, the best that was found comes back, and `gap` tells what is proved.

@@ -34,7 +34,7 @@ _COARSE = 0.1  # of what the error is above the loss: how exact solves on the wa
 _FINE = 0.2  # of what the tolerance of the gain is worth, to which the last ones are
 _FLOOR = 1e-6  # relative error that float32 resolves
 _STEPS, _MAXITER = 60, 200  # of the search; of each solve in it
-_ON_HOST = 1 << 12  # entries of a system: an active set changes in less time than a product is launched
+_ON_HOST = 1 << 14  # entries of a system: an active set changes in about the time of a step on the device
 _MORE = 1.1  # times the least error of all gains, that the largest may have where none is in reach
 
 

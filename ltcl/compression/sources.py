@@ -175,7 +175,7 @@ def validate_inputs(
     if isinstance(first_bounce, str):
         raise InputError(f"first_bounce is {first_bounce!r}, but T is rows; give an array (N,), or None")
     F, _ = _first_bounce.find(rows, "diagonal" if first_bounce is None else first_bounce, lambda: device)
-    F, _ = _first_bounce.mask_dark(F, grid, "mask", may_mask=False)
+    F, _ = _first_bounce.mask_dark(F, grid, may_mask=False)
     R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
     return Inputs([Problem(one, Host(device, one), grid) for one in R], F, grid, _dense_nbytes(F))
 

@@ -141,5 +141,5 @@ def _reachable(scene: Scene, T: Transport) -> tuple[np.ndarray, float, float]:
         lost = [np.asarray(S @ np.minimum(x @ (1.0, b), 0.0)) for S, x in zip(T.systems, light, strict=True)]
         enough = np.linalg.norm(np.stack(lost)) < _LOST * np.linalg.norm(columns @ (1.0, b))
         low, high = (low, b) if enough else (b, high)
-    pattern = T.to_light([(x @ (1.0, high))[:, None] for x in light])
+    pattern = [x @ (1.0, high) / F for x, F in zip(light, T.first_bounce, strict=True)]
     return sides[0] + np.float32(high) * sides[1], high, max(float(part.max()) for part in pattern)

@@ -61,10 +61,9 @@ class Frame:
 
 
 class Source:
-    """The frames of a folder or a video, in order, the same at every iteration.
+    """The frames of a folder or a video, in order: `count` of them, or None; of a video an estimate.
 
-    `count` is their number as the folder or the video says, in some formats an estimate, and `fps` a video's
-    frames a second; both are None where they are not known.
+    `fps` are a video's frames a second, None where they are not known.
     """
 
     def __init__(self, path: Path, encoding: Encoding) -> None:
@@ -89,7 +88,11 @@ class Source:
             return
         number = 0
         with _opened(self.path) as capture:
-            while (stored := _next(capture)) is not None:
+            while True:
+                with quiet():
+                    success, stored = capture.read()
+                if not success:
+                    break
                 number += 1
                 yield Frame(number, f"{self.path.name}:{number}", stored, self.encoding)
         if number < (self.count or 1):
@@ -132,13 +135,6 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
         capture.release()
 
 
-def _next(capture: cv2.VideoCapture) -> np.ndarray | None:
-    """BGR uint8, (h, w, 3); None after the last frame that can be read."""
-    with quiet():
-        success, stored = capture.read()
-    return stored if success else None
-
-
 def is_frames(path: str | os.PathLike[str]) -> bool:
     """Whether `path` is a folder, or is called like a video."""
     return Path(path).is_dir() or Path(path).suffix.lower() in EXTENSIONS
@@ -147,18 +143,9 @@ def is_frames(path: str | os.PathLike[str]) -> bool:
 def open_frames(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> Source:
     """Open a folder of pictures or a video file as an iterable of `Frame`.
 
-    Parameters
-    ----------
-    path
-        A folder, whose pictures (as of `ltcl.images.read`) are taken in natural order, frame2 before frame10,
-        hidden files and other files left out; or a video file, upright as a player shows it.
-    encoding
-        What the frames hold, as in `ltcl.images.read`; those of a video have 8 bits.
-
-    Raises
-    ------
-    FileError
-        No picture in the folder, two files of one name in it; an unknown extension, no readable video.
+    Pictures of a folder are taken in natural order, frame2 before frame10, hidden and other files left out; a
+    video is upright, as a player shows it. `encoding` is that of `ltcl.images.read`. FileError for no picture
+    in the folder, two files of one name in it, an unknown extension, no readable video.
 
     Examples
     --------
@@ -190,19 +177,9 @@ def check_video(path: str | os.PathLike[str], grid: tuple[int, int]) -> None:
 def write_video(path: str | os.PathLike[str], pictures: Iterable[np.ndarray], fps: float = 25.0) -> int:
     """Write linear pictures as a video; an earlier file is replaced whole or not at all.
 
-    Parameters
-    ----------
-    path
-        .mkv or .avi, lossless, or .mp4; 8 bits in sRGB.
-    pictures : iterable of (h, w) or (h, w, 3)
-        Linear, clipped to [0, 1]; h and w even, the same for all. Their number is returned.
-    fps : float
-        Frames a second.
-
-    Raises
-    ------
-    InputError, FileError
-        An odd size, frames of different sizes, none, NaN; an extension; the file cannot be written.
+    `path` ends in .mkv or .avi (lossless) or .mp4; 8 bits in sRGB. `pictures`, (h, w) or (h, w, 3), are cut
+    to [0, 1]; h and w are even and the same for all. Their number is returned. InputError for other sizes, no
+    frames or NaN; FileError for another extension or a file that cannot be written.
 
     Examples
     --------

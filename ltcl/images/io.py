@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pictures on disk: PNG, JPEG, TIFF, BMP and EXR in, linear float32 out, and back.
 
-A picture in ltcl is linear radiance, float32, (h, w) or (h, w, 3) RGB. Integer formats hold sRGB codes unless
-said otherwise, float ones linear light; values are clipped to [0, 1] only where a format can hold no others.
-
 Headers are read by Pillow and OpenEXR, and sizes checked before a decoder allocates. Pillow decodes 8 bits,
 OpenCV 16-bit PNG and TIFF: the silent one of both. Known limits: where a format has no checksum (JPEG, BMP,
 TIFF), some damage is a wrong picture; about damaged pixels of an EXR, OpenEXR itself writes to stderr, too.
@@ -56,22 +53,14 @@ def read(path: str | os.PathLike[str], *, encoding: Encoding = "auto", upright: 
     Parameters
     ----------
     path
-        A .png, .jpg, .jpeg, .tif, .tiff, .bmp (8 or 16 bits, float TIFF) or .exr file. An alpha channel that
-        is opaque everywhere is dropped.
+        A .png, .jpg, .jpeg, .tif, .tiff, .bmp (8 or 16 bits, float TIFF) or .exr file, opaque everywhere.
     encoding
         What the file holds: "srgb" or "linear"; "auto" takes integers as sRGB and floats as linear.
     upright
         Apply the orientation in the header (EXIF, TIFF). False keeps a photograph on the camera's pixels.
 
-    Returns
-    -------
-    np.ndarray
-        float32, (h, w) or (h, w, 3) RGB; white of an integer format is 1.
-
-    Raises
-    ------
-    FileError, MemoryLimitError
-        Missing, no picture, truncated, transparent, NaN inside; larger than such a file or the host can hold.
+    The result is float32, (h, w) or (h, w, 3) RGB; white of an integer format is 1. FileError for no picture,
+    a damaged or transparent one, NaN; MemoryLimitError for one larger than the host can hold.
 
     Examples
     --------
@@ -89,11 +78,7 @@ def read(path: str | os.PathLike[str], *, encoding: Encoding = "auto", upright: 
 
 
 def read_codes(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read what a picture file holds, as it stands: no transfer curve, no scale, no orientation.
-
-    (h, w) or (h, w, 3) RGB; uint8, uint16, float16, float32 or float64, as the file holds it. Floats may be
-    NaN. Errors are those of `read`.
-    """
+    """Codes of a picture file, (h, w) or (h, w, 3) RGB, in its dtype: no curve, scale or orientation."""
     return np.ascontiguousarray(_stored(as_path(path))[0])
 
 
@@ -112,12 +97,7 @@ def write(
         What the file shall hold: "srgb" or "linear"; "auto" gives sRGB to 8 and 16 bits in integer formats.
     bits
         Per channel: 8 or 16 for .png (default 8); 8, 16 or 32 (float) for .tif (default 32); 16 (half) or 32
-        for .exr (default 32); 8 for .jpg and .bmp.
-
-    Raises
-    ------
-    InputError, FileError
-        An unusable shape, NaN, an unknown encoding, number of bits or extension; it cannot be written.
+        for .exr (default 32); 8 for .jpg and .bmp. InputError for others, another shape or NaN.
     """
     checks.one_of("encoding", encoding, ENCODINGS)
     path = as_path(path)
@@ -167,10 +147,9 @@ def quiet() -> Iterator[None]:
 
 
 def _bits(path: Path) -> tuple[int, ...]:
-    try:
-        return BITS[path.suffix.lower()]
-    except KeyError:
-        raise FileError(f"{path}: {unknown_extension(path)}; pictures are {', '.join(BITS)}") from None
+    if path.suffix.lower() not in BITS:
+        raise FileError(f"{path}: {unknown_extension(path)}; pictures are {', '.join(BITS)}")
+    return BITS[path.suffix.lower()]
 
 
 @contextlib.contextmanager

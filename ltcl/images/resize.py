@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pictures on another pixel grid: area average where they shrink, linear interpolation where they grow.
 
-Neither filter has negative weights, so no result leaves the range of the input, and no dark pixel turns
-negative, as under a cubic filter. Shrinking by area also keeps the mean radiance.
+Neither filter has negative weights: no result leaves the range of the input.
 """
 
 from __future__ import annotations

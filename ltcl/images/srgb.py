@@ -1,12 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The sRGB transfer curve, exact and both ways (IEC 61966-2-1).
-
-    linear = encoded / 12.92                        for encoded <= 0.04045
-    linear = ((encoded + 0.055) / 1.055) ** 2.4     above
-
-Both directions continue past [0, 1] as odd functions (as scRGB does): nothing is clipped, and one undoes the
-other for every value.
-"""
+"""The sRGB transfer curve (IEC 61966-2-1), both ways; past [0, 1] odd functions, as of scRGB."""
 
 from __future__ import annotations
 
@@ -23,10 +16,9 @@ ENCODINGS = ("auto", "srgb", "linear")
 
 
 def from_srgb(encoded: ArrayLike) -> np.ndarray:
-    """Linear light of sRGB-encoded values; 0 and 1 stay where they are.
+    """Linear light of sRGB-encoded values of any shape, 1 for white: divide codes by 255 or 65535 first.
 
-    `encoded` is of real numbers (else InputTypeError) in any shape, 1 for white: integer codes are to be
-    divided by 255 or 65535 first. The result is float32, or float64 where `encoded` is.
+    The result is float32, or float64 where `encoded` is. InputTypeError for other than real numbers.
 
     >>> float(from_srgb(np.float64(0.5)).round(4))
     0.214

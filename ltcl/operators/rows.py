@@ -56,7 +56,7 @@ class RowOperator(Operator):
     """An operator stored as slabs of rows. Subclasses set `file`, `defines`, `slabs`, and give `blocks`."""
 
     file: str  # stem of the kernel file
-    defines: dict[str, int]
+    defines: dict[str, Any]
     unit = 1.0  # of the numbers in the slabs
     slabs: list[Slab]
 

@@ -131,9 +131,8 @@ class Tiles(RowOperator):
         self.quantisation, self.error = packed.difference
         self.frobenius = float(np.linalg.norm(packed.decoded()))
         self.width, self.precision, self.unit = packed.width, packed.precision, packed.unit
-        self.defines = {"WIDTH": self.width, "VALUES": list(PRECISIONS).index(self.precision)}
-        if packed.columns.itemsize == 4:
-            self.defines["LONG"] = 1
+        place = "ushort" if packed.columns.itemsize == 2 else "int"
+        self.defines = {"WIDTH": self.width, "VALUES": list(PRECISIONS).index(self.precision), "PLACE": place}
         size = packed.codes.itemsize
         tile_bytes = max(packed.width * size, packed.columns.itemsize)
         row_bytes = np.maximum(tile_bytes * np.diff(packed.pointers), 4)

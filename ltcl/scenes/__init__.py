@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Synthetic scenes with their light transport, and a picture to show on them.
 
-`builders` puts `walls` and blocks, cut into `patches`, together to a `scene`. Form factors: exact on the host
-in `exchange`, past blocks by the rays of `visibility`, computed in each product in `form_factor`. What rays
-meet: `rays`. Who looks: `viewer`. Gloss: `ltcl.scenes.gloss`. A target picture: `landscape`.
+`builders` makes a `scene` of `walls` and blocks, cut into `patches`. Form factors: exact in `exchange`,
+past blocks by `visibility` (`rays`), computed in each product in `form_factor`. Gloss: `ltcl.scenes.gloss`.
 """
 
 from __future__ import annotations

@@ -179,14 +179,8 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
 
     Raises
     ------
-    InputError
-        If n, albedo or angle is out of range, or albedo has another shape.
-    MemoryLimitError
-        If form factors and transport would not fit in the memory of the host; nothing is allocated then.
-
-    Notes
-    -----
-    Exact form factors, see `ltcl.scenes.exchange`.
+    InputError, MemoryLimitError
+        As of `dihedral`.
 
     Examples
     --------

@@ -9,7 +9,7 @@ shows 1. So the transport is T = (I - A)^-1 diag(albedo), (N, N), one per colour
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +30,7 @@ _BLOCK = 512  # rows and columns touched at a time where a matrix meets its tran
 _TOLERANCE = 1e-6  # form factors found by quadrature or sampling are a little off
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Patches that light each other; made by `dihedral`, `trihedral`, `box`, or from own form factors.
 
@@ -69,9 +69,9 @@ class Scene:
 
     name: str
     grid: tuple[int, int]
-    form_factors: np.ndarray = field(repr=False)
-    albedo: np.ndarray = field(repr=False)
-    area: np.ndarray = field(repr=False)
+    form_factors: np.ndarray
+    albedo: np.ndarray
+    area: np.ndarray
     walls: tuple[Wall, ...]
     viewer: Viewer
     blocks: tuple[Block, ...] = ()
@@ -94,6 +94,9 @@ class Scene:
         _check_exchange(self.form_factors, self.area)
         refuse_crossing((*self.walls, *self._screens))
         viewing.frame(self.viewer, self.walls)
+
+    def __repr__(self) -> str:
+        return f"<ltcl Scene {self.name}, grid {self.grid[0]} x {self.grid[1]}, {self.channels} channel(s)>"
 
     @property
     def channels(self) -> int:

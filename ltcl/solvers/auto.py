@@ -1,31 +1,34 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`auto`: choosing a method before the first step, and saying why.
 
-Row sums tell whether the plain iteration is best. Else a survey is made once in the life of S, three steps of
-GMRES from a random picture: Ritz values estimate the spectrum, residuals how fast Krylov methods converge,
-directions whether S is self-adjoint. The method with the least estimated time is taken: bytes over bandwidth,
-launches and waits of its products, as measured once per device.
+Row sums show whether the plain iteration is best. Else the first solve with S tries GMRES, for no more steps
+than a survey and Chebyshev within free bounds: a survey pays where that fails, or S is solved again. Made
+once in the life of S, it is three steps of GMRES from a random picture: Ritz values estimate the spectrum,
+residuals how fast Krylov methods converge, directions whether S is self-adjoint. The least estimated time
+decides: bytes over bandwidth, launches, waits. Speeds that matter are measured, once per device.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import os
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ltcl import theory
-from ltcl.device import Device, tuning, vectors
+from ltcl.device import Array, Device, tuning, vectors
 from ltcl.operators import IdentityPlus, Operator
 from ltcl.operators.rows import RowOperator
-from ltcl.solvers import precision
 from ltcl.solvers.krylov import CG, GMRES, KrylovSpace
-from ltcl.solvers.precision import Direct
+from ltcl.solvers.precision import Direct, factors
 from ltcl.solvers.stationary import Chebyshev, Jacobi, drawn_in
+from ltcl.solvers.stopping import Monitor, System
 
 SMALL = 512  # pixels: below, a dense factorization takes less time than launching kernels
 LARGEST_DIRECT = 8192  # pixels: above, a dense factorization takes gigabytes and minutes
@@ -34,8 +37,12 @@ STEPS = 3  # of a survey
 _AT_ONCE = 8  # right-hand sides in one product
 _SELF_ADJOINT = 0.02  # defect of R up to which inner products are nearly those of a self-adjoint one
 _SLENDER = 0.25  # of the smallest real part: imaginary parts that an interval may leave out
+# Bytes a second: less than of any memory, more than of a core of a CPU or of another device; operations a
+# second: more than of a core, 64 a cycle at 6 GHz. They decide only whether the true speed is measured.
+_SLOWEST, _FASTEST, _FLOPS = 1e8, {True: 1e11, False: 1e14}, 4e11
+_LAUNCHES = 16  # timed together
 # Vectors read or written, launches and waits for each product.
-_STEPS = {"jacobi": (4, 1, 0.5), "chebyshev": (4, 1, 0.5), "cg": (9, 3, 0.5), "gmres": (12, 5, 1.0)}
+_STEPS = {"chebyshev": (4, 1, 0.5), "cg": (9, 3, 0.5), "gmres": (12, 5, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -79,6 +86,7 @@ class Survey:
 
 
 _surveys: weakref.WeakKeyDictionary[Operator, Survey] = weakref.WeakKeyDictionary()
+_tried: weakref.WeakSet[Operator] = weakref.WeakSet()
 
 
 def survey(S: Operator) -> Survey:
@@ -112,22 +120,31 @@ def _defect(S: Operator, space: KrylovSpace) -> float:
 
 
 class _Candidate(NamedTuple):
-    """A method, and what it needs, roughly."""
+    """A method, and what it needs, roughly: bytes to move, seconds of launches and waits, operations."""
 
     method: Any
     products: float
-    seconds: float
+    nbytes: float = 0.0
+    overhead: float = 0.0
+    operations: float = 0.0
+
+    def seconds(self, bandwidth: float, flops: float) -> float:
+        return self.nbytes / bandwidth + self.overhead + self.operations / flops
 
     def __str__(self) -> str:
-        products = f"{self.products:g} product{'s' * (self.products != 1)} and " if self.products else ""
-        return f"{self.method.name}: {products}{1e3 * self.seconds:.2g} ms estimated"
+        return f"{self.method.name}: {self.products:g} product{'s' * (self.products != 1)}"
 
 
-def plan(S: Operator, rtol: float, columns: int = 1) -> Iterator[tuple[Any, str, int]]:
-    """Methods to try for S x = b to `rtol`, `columns` right-hand sides at once, each where those before fail.
+class _Trial(GMRES):
+    """One cycle, however many steps the caller allows."""
 
-    With each comes why, in words, and the products that it took to know.
-    """
+    def iterate(self, system: System, x: Array, r: Array, monitor: Monitor) -> None:
+        monitor.rule = dataclasses.replace(monitor.rule, maxiter=min(self.restart, monitor.rule.maxiter))
+        super().iterate(system, x, r, monitor)
+
+
+def plan(S: Operator, rtol: float, columns: int, refines: bool = False) -> Iterator[tuple[Any, str, int]]:
+    """Methods to try for S x = b to `rtol`, one where those before fail; why; products it took to know."""
     n = S.shape[0]
     if n <= SMALL:
         yield Direct(), f"direct: {n} pixels are few enough for a dense factorization", 0
@@ -140,10 +157,14 @@ def plan(S: Operator, rtol: float, columns: int = 1) -> Iterator[tuple[Any, str,
     if not math.isfinite(rho):
         yield GMRES(), "gmres: it needs no bounds, and row sums of S leave float32", 0
         return
-    plain = _candidate(S, columns, Jacobi(), theory.series_products(rho, rtol))
-    free = _candidate(S, columns, Chebyshev(), theory.chebyshev_products(*theory.free_bounds(S), rtol))
+    plain = _Candidate(Jacobi(), theory.series_products(rho, rtol))
+    free = _Candidate(Chebyshev(), theory.chebyshev_products(*theory.free_bounds(S), rtol))
     if plain.products <= free.products:
         yield plain.method, f"{plain}, {free}; row sums of R are at most {rho:.2g}", 0
+    elif not (refines or columns > _AT_ONCE or any(S in known for known in (_tried, _surveys, factors))):
+        _tried.add(S)
+        most = min(STEPS + int(free.products), GMRES.restart)
+        yield _Trial(most), f"gmres: at most {most} products, without a survey at the first solve", 0
     made_before = S in _surveys
     surveyed = survey(S)
     products = surveyed.krylov_products(rtol)
@@ -155,9 +176,8 @@ def plan(S: Operator, rtol: float, columns: int = 1) -> Iterator[tuple[Any, str,
         candidates.append(_candidate(S, columns, Chebyshev(surveyed.spectrum), products))
     if n <= LARGEST_DIRECT and isinstance(S.R if isinstance(S, IdentityPlus) else S, RowOperator):
         candidates.append(_candidate(S, columns, Direct()))
-    candidates.sort(key=lambda candidate: candidate.seconds)
-    first = candidates[0].method
-    reasons = f"{', '.join(map(str, candidates))}; {surveyed}{' made before' if made_before else ''}"
+    first, ranking = _rank(S.device, candidates)
+    reasons = f"{ranking}; {surveyed}{' made before' if made_before else ''}"
     yield first, reasons, 0 if made_before else len(surveyed.residuals) - 1
     if not isinstance(first, GMRES):
         yield GMRES(), "gmres: next, as it needs no bounds", 0
@@ -165,28 +185,46 @@ def plan(S: Operator, rtol: float, columns: int = 1) -> Iterator[tuple[Any, str,
         yield Direct(), "direct: last, as products did not do", 0
 
 
-_speeds: weakref.WeakKeyDictionary[Device, tuple[float, float, float, float]] = weakref.WeakKeyDictionary()
+_bandwidth = functools.cache(tuning.bandwidth)
+_flops = functools.cache(tuning.factorization_flops)
 
 
-def _measured(device: Device) -> tuple[float, float, float, float]:
-    """Bytes a second, seconds a launch and a wait, and operations a second of LAPACK; measured once."""
-    if device not in _speeds:
-        x = device.upload(np.ones(64))
-        launches = tuning.seconds(device, "64 launches", lambda: [vectors.fill(x, 0.0) for _ in range(64)])
-        wait = tuning.seconds(device, "a wait", lambda: vectors.dot(x, x))
-        _speeds[device] = tuning.bandwidth(device), launches / 64, wait, tuning.factorization_flops()
-    return _speeds[device]
+@functools.cache
+def _overheads(device: Device) -> tuple[float, float]:
+    """Seconds of a launch and of a wait."""
+    x = device.empty(64)
+    fills = lambda: [vectors.fill(x, 0.0) for _ in range(_LAUNCHES)]  # noqa: E731
+    wait = tuning.seconds(device, "a wait", lambda: vectors.dot(x, x))
+    return tuning.seconds(device, f"{_LAUNCHES} launches", fills) / _LAUNCHES, wait
+
+
+def _rank(device: Device, candidates: Sequence[_Candidate]) -> tuple[Any, str]:
+    """The method that takes the least time, and all by time; a speed is measured where it could change which.
+
+    Differences of times are linear in 1 / bandwidth: what is first at both ends of a range is so in between.
+    """
+    cores = os.cpu_count() or 1
+    flops, most = cores * _FLOPS, (cores if device.is_cpu else 1) * _FASTEST[device.is_cpu]
+    rank = lambda speed: sorted(candidates, key=lambda c: c.seconds(speed, flops))  # noqa: E731
+    ranked = rank(_SLOWEST)
+    if ranked[0] is not rank(most)[0]:
+        ranked = rank(_bandwidth(device))
+    if isinstance(ranked[0].method, Direct):
+        flops = _flops()
+        ranked = rank(_bandwidth(device))
+    return ranked[0].method, f"fastest first: {', '.join(map(str, ranked))}"
 
 
 def _candidate(S: Operator, columns: int, method: Any, products: float = 0) -> _Candidate:
-    """The time of so many products; of a dense factorization, where it is not there yet, and its use."""
-    n, (bandwidth, launch, wait, flops) = S.shape[0], _measured(S.device)
+    """What so many products need; or a dense factorization, where it is not there yet, and its use."""
+    n = S.shape[0]
     if isinstance(method, Direct):
-        factorize = 0.0 if S in precision.factors else 2.0 / 3.0 * n**3
-        read = 16.0 * n * n / bandwidth  # both triangles, and S for the residual
-        return _Candidate(method, 0, (factorize + 4.0 * n * n * columns) / flops + read)
+        factorize = 0.0 if S in factors else 2.0 / 3.0 * n**3
+        nbytes = 16.0 * n * n  # both triangles, and S for the residual
+        return _Candidate(method, 0, nbytes, 0.0, factorize + 4.0 * n * n * columns)
     moved, launches, waits = _STEPS[method.name]
     passes = math.ceil(columns / _AT_ONCE)
     nbytes = S.nbytes * passes + 4.0 * n * columns * moved
-    seconds = nbytes / bandwidth + passes * launches * launch + waits * wait
-    return _Candidate(method, products, products * seconds)
+    launch, wait = _overheads(S.device)
+    overhead = passes * launches * launch + waits * wait
+    return _Candidate(method, products, products * nbytes, products * overhead)

@@ -6,12 +6,11 @@ Projected conjugate directions. With r = w (b - A x), g = -A^T w r, and z = -g b
     p = z + beta d,   d' = clip(x + alpha p) - x,   x' = x + lambda d'
 
 with beta that makes p conjugate to the last d, alpha the step of Barzilai and Borwein, and lambda exact along
-d' or as far as the bounds allow: conjugate gradients on a face of the box, while clipping changes many active
-bounds at once, as projected gradients do (Moré and Toraldo, SIAM J. Optimization 1, 1991, take the two in
-turns). Where the last lambda was short, or 0 as p did not descend, p = z. A step is two products.
+d' or as far as the bounds allow: conjugate gradients on a face of the box, and many bounds at once (Moré and
+Toraldo, SIAM J. Optimization 1, 1991). Where the last lambda was short, or 0, p = z. A step is two products.
 
-A certificate comes with the gradient. With the Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i -
-upper_i)), the least error is by Cauchy and Schwarz
+The certificate: with the Frank-Wolfe gap sum_i max(g_i (x_i - lower_i), g_i (x_i - upper_i)), by Cauchy and
+Schwarz
 
     ||r*|| >= r.r* / ||r|| >= ||r|| - gap / ||r||,
 
@@ -80,10 +79,9 @@ def minimise(
     """The x within the bounds for which A x is nearest to b; STAGNATED where rounding hides any further gain.
 
     A is (M, N) with columns of like size, for instance S; b and the weights w >= 0, ones when not given, are
-    (M, k), the finite bounds (N,), and the start x0 (N, k) is moved within. x is within the bounds as float64
-    numbers, too. Done when the error, or what it is above the least possible one, is at most
-    ``max(rtol ||w b||, atol)`` in every column; where b = 0, rtol is of the error at the start.
-    ``callback(iteration, relative gap)`` hears of each step.
+    (M, k), the finite bounds (N,), and the start x0 (N, k) is moved within. Done when the error, or what it
+    is above the least possible one, is at most ``max(rtol ||w b||, atol)`` in every column; where b = 0, rtol
+    is of the error at the start. ``callback(iteration, relative gap)`` is called after each step.
     """
     start = time.perf_counter()
     largest = float(np.max(np.abs(b)))

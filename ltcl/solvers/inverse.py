@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """S^-1 = I - A, kept: a solution is one product, x = b - A b, and its error was bounded when A was made.
 
-A is one physical bounce of the scene (eq. 4 and 6), sparser than R = A + A^2 + ... that T tells. Made once,
-by `ltcl.invert`, it takes the place of a solve for every further frame.
+A is one physical bounce of the scene (eq. 4 and 6), sparser than R = A + A^2 + ...; by `ltcl.invert`.
 """
 
 from __future__ import annotations

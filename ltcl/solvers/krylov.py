@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Krylov methods: CG, BiCGStab and GMRES, with coefficients of their own for each right-hand side.
 
-The kernels leave partial sums of each column in a few slices of the rows; a group of the next kernel adds the
-slices up itself and works out the coefficients of its columns, which stay on the device. So CG and BiCGStab
-queue several steps between two readings. A column that is solved rests.
+The kernels leave partial sums of each column in a few slices of the rows; a group of the next kernel adds
+them up and computes the coefficients of its columns: CG and BiCGStab queue several steps between readings.
 
 Numbers in comments: Saad, Iterative Methods for Sparse Linear Systems, 2nd ed.; of BiCGStab algorithm 7.7, of
 GMRES 6.2 in blocks, 6.9 and 6.11, section 6.5.3 of the rotations.
@@ -96,12 +95,10 @@ class Columns:
 class CG:
     """Conjugate gradients, the fewest products where S is self-adjoint. Options: ``weights``, of <x, y>.
 
-    Of a Lambertian scene S is self-adjoint in <x, y> = sum_i w_i x_i y_i with w = area / albedo: the
-    transport T is symmetric (reciprocity) up to areas, and the first bounce F proportional to the albedo, so
-    that with pixels of equal area w = 1 / F does for S = T F^-1: the default where S comes from a transport.
+    Of a Lambertian scene S is self-adjoint in <x, y> = sum_i w_i x_i y_i with w = area / albedo, by
+    reciprocity: with pixels of equal area w = 1 / F, the default where S = T F^-1 comes from a transport.
 
-    A step is a product, inner products, and one update of all vectors, by the recurrences of Chronopoulos
-    and Gear (J. Comput. Appl. Math. 25, 1989, section 3).
+    Recurrences of Chronopoulos and Gear (J. Comput. Appl. Math. 25, 1989, section 3): one update a step.
     """
 
     name: ClassVar[str] = "cg"
@@ -153,9 +150,9 @@ class CG:
 class BiCGStab:
     """Any S, two products a step, eight vectors of memory however many steps it takes. No options.
 
-    Residuals swing, and a step may not exist (a division by 0): such a column starts anew from where it is;
-    where even a fresh start has no step it rests for good. A step is five launches: since <r*, S p> = <g, p>
-    with g = S^T r*, the first coefficient is known before S p is. Where S has no transpose a sixth finds it.
+    Where a step does not exist (a division by 0) a column starts anew, or rests where a fresh start has none
+    either. A step is five launches: as <r*, S p> = <S^T r*, p>, the first coefficient is known before S p is.
+    Where S has no transpose a sixth finds it.
     """
 
     name: ClassVar[str] = "bicgstab"
@@ -179,7 +176,8 @@ class BiCGStab:
             rests = ~monitor.unsolved & (phase != _BROKEN)
             changed[_PHASE[now]] = np.where(anew, _FRESH, np.where(rests, _RESTS, phase))
             if anew.any():
-                _start_anew((shadow, p), r, anew if step else None)  # 1., 2.
+                for vector in (shadow, p):  # 1., 2.
+                    vector.copy_from(r.device.upload(np.where(anew, r.get(), vector.get())) if step else r)
                 for row in (_RHO[now], _SHADOW):
                     changed[row] = np.where(anew, monitor.norms**2, changed[row])
                 changed[_AGAINST] = changed[_SHADOW]
@@ -209,24 +207,13 @@ class BiCGStab:
                 phase = np.where(phase == _BROKEN, phase, _WAITS)
 
 
-def _start_anew(vectors: Sequence[Array], r: Array, columns: np.ndarray | None) -> None:
-    """r* = p = r in these columns, (k,) bool, or in all."""
-    for vector in vectors:
-        if columns is None:
-            vector.copy_from(r)
-        else:
-            vector.set(np.where(columns, r.get(), vector.get()))
-
-
 @dataclass(frozen=True)
 class GMRES:
     """The least residual for any S, in m + 1 pictures of memory. Options: ``restart``, m, steps of a cycle.
 
-    Of all x in x_0 + span(r, S r, ..., S^(m-1) r) it takes the one with the smallest residual. Step j makes
-    2 j + 1 inner products: where products are cheap Chebyshev takes less time, in a few products more. Norms
-    of residuals are known before x is, which is formed at the end of a cycle, with its residual
-    V (beta e_1 - H y). Gram-Schmidt is done twice, which is enough for orthogonality to rounding (Giraud,
-    Langou, Rozloznik, Comput. Math. Appl. 50, 2005).
+    Step j makes 2 j + 1 inner products: where products are cheap Chebyshev takes less time. x is formed at
+    the end of a cycle, with its residual V (beta e_1 - H y). Gram-Schmidt is done twice, which is enough for
+    orthogonality to rounding (Giraud, Langou, Rozloznik, Comput. Math. Appl. 50, 2005).
     """
 
     name: ClassVar[str] = "gmres"

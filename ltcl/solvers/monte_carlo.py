@@ -4,24 +4,21 @@
     l_d(i) = l_out(i) + sum over k >= 1 and paths of (-1)^k R_i i1 R_i1 i2 ... l_out(ik)    (eq. 23)
 
 A walk samples one path, its entries in proportion to |R_ij| (eq. 25), its length by eq. 24. The forward dual
-(eq. 22) is the same on I - A. For a whole picture to 1 % any iteration is faster. Right-hand sides share
-their walks, and so do three colours where that leaves a finite variance. An infinite variance
-(`ltcl.theory.walks`) is refused. Of n samples of a pixel with spread s
+(eq. 22) is the same on I - A. Right-hand sides share their walks, and so do three colours where that leaves
+a finite variance. An infinite one (`ltcl.theory.walks`) is refused. Of n samples of a pixel with spread s
 
     standard_error^2 = s^2 / n + 3 (W_i max |b|)^2 / n^2
 
-Samples tell nothing of a light that none of them has met, but then its chance is at most about 3 / n (rule
-of three: Hanley and Lippman-Hand, 1983), and its share of the variance at most the second term; W_i is the
-root mean square weight of a walk after its first step, which does not grow where no row of R is heavier than
-the chance to go on. Rows with sums above 3/4 and above the others, that walks seldom meet, are not covered.
+A light that no sample has met has a chance of at most about 3 / n (rule of three: Hanley and Lippman-Hand,
+1983), and the second term of the variance; W_i is the root mean square weight of a walk after its first step.
+Rows with sums above 3/4 and above the others, that walks seldom meet, are not covered.
 
 The hybrid samples the products of Jacobi (eq. 20), with fresh columns j in each iteration, drawn by eq. 25:
 
     l^(k+1)_i = l_out(i) - |R_i| mean of sign(R_ij) l^(k)_j over a few columns j
 
-Later iterations damp the noise of earlier ones as they damp light. That of the last product remains, and no
-standard error is known; final gather makes that product exactly. It converges in the mean where rho(R) < 1,
-with bounded noise from enough samples on; fewer are refused.
+The noise of the last product remains, unless final gather makes that exactly; no standard error is known. It
+converges in the mean where rho(R) < 1, with bounded noise from enough samples on; fewer are refused.
 """
 
 from __future__ import annotations
@@ -148,9 +145,8 @@ class Sampler:
 class MonteCarlo(Sampler):
     """Estimates with their standard errors.
 
-    An `error` takes as many samples as it needs, in stages. Each draws fresh samples, as many as the stage
-    before asks for, and only the last stage of a pixel counts: samples chosen by their own spread would be
-    biased. Alias tables round chances to 2^-19 or so, and sums are float32: biases that show beyond 2^20.
+    An `error` takes stages of fresh samples, as many as the one before asks for; only the last one of a pixel
+    counts: samples chosen by their own spread are biased. So are alias tables and float32, beyond 2^20.
     """
 
     name: ClassVar[str] = "monte_carlo"
@@ -222,8 +218,7 @@ class MonteCarlo(Sampler):
     ) -> Estimate:
         """Means, standard errors and samples of all stages; of n samples `unmet` / n is part of the errors.
 
-        Without an error to meet there is one stage. Else the first is never the last, and each that follows
-        has the samples that squared errors of a / n + b / n^2 ask for, rounded up to powers of two.
+        Each after the first has the samples that squared errors of a / n + b / n^2 ask for, in powers of two.
         """
         r, target = walker.tables.device.upload(light), (self.error or np.inf) / units
         most = self.samples or (self.usual if self.error is None else _MOST)

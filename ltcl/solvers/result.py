@@ -98,7 +98,8 @@ class Solution:
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.x.shape))
-        return f"<ltcl Solution of {shape} values by {self._outcome()}>"
+        end = f"{self.status.name.lower()} after {self.products} products, residual {self.residual:.2g}"
+        return f"<ltcl Solution of {shape} values by {self.method}: {end}>"
 
     def _outcome(self) -> str:
         best, last = self.residual, self.residuals[-1]

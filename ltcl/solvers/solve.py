@@ -5,15 +5,14 @@ A method is a frozen dataclass whose fields are its options, with `name`, and `i
 or, where it draws random numbers, `sample(channels, callback)`.
 
 Of S = I + W^T C W in an orthonormal basis W, S x = b is (I + C) a = W b with x = W^T a: two transforms in
-all, where pixels take two for every product. Where W has but some coefficients of such a basis, S is the
-identity on the rest of b, and x = b + W^T (a - W b). `cg` with weights, diagonal in pixels alone, runs there.
+all. Where W has but some coefficients of such a basis, x = b + W^T (a - W b). `cg` with weights, diagonal in
+pixels alone, runs there.
 
 Where an exact S judges, a compressed S~ = S + E makes the steps of an iterative refinement,
 
     x^(k+1) = x^(k) + S~^-1 (b - S x^(k))
 
-With each solve to a tolerance t, the error shrinks by about ||S~^-1 E|| + t a step (Higham, Accuracy and
-Stability of Numerical Algorithms, 2nd ed., chapter 12).
+With solves to a tolerance t, the error shrinks by about ||S~^-1 E|| + t a step (Higham, 2nd ed., chapter 12).
 """
 
 from __future__ import annotations
@@ -129,9 +128,9 @@ def solve(
 
     Notes
     -----
-    "auto" factorizes small systems; else it compares the times that methods need, by the row sums of S and
-    a survey of three products, and tries others where its choice fails: see ``.reason``. Below rtol = 1e-6
-    its choice takes the steps of a refinement in float64. `ltcl.solvers.matrix_series` inverts S.
+    "auto" factorizes small systems; else the row sums of S decide, or "gmres" is tried; at the second solve,
+    or where it fails, a survey of three products shows what takes the least time: see ``.reason``. Below
+    rtol = 1e-6 its choice takes the steps of a refinement in float64. `ltcl.solvers.matrix_series` inverts S.
 
     ====================  =======================================================================
     method                options: what they are; their defaults
@@ -162,6 +161,8 @@ def solve(
     >>> s.converged, s.x.round(1).tolist()
     (True, [1.0, 0.0])
     """
+    if "with_residual" in options:
+        raise InputTypeError("unknown option 'with_residual'; the options are those of the method")
     options |= dict(rtol=rtol, atol=atol, maxiter=maxiter, x0=x0, callback=callback, exact=exact)  # noqa: C408
     checks.one_of("method", method, METHODS)
     if isinstance(S, (tuple, list)) and any(isinstance(channel, Operator) for channel in S):
@@ -180,8 +181,7 @@ def solve_each(
 ) -> tuple[Solution, ...]:
     """One solution a colour channel, as `solve` gives; methods that sample take walks that all three share.
 
-    `sides` are b of each and `exact` theirs, where there is one; `settings` are those of `solve`, but for x0.
-    `with_residual` asks for b - S x where it costs little.
+    `settings` are those of `solve`, but for x0; `with_residual` asks for b - S x where it costs little.
     """
     exacts = exact or [None] * len(systems)
     if len(systems) == 1 or method not in SAMPLED or any(E is not None for E in exacts):
@@ -343,7 +343,7 @@ def _automatic(problem: _Problem) -> Solution:
             )
     if problem.exact is not None:
         target = _step_tolerance(S)
-    for method, why, surveyed in auto.plan(S, target, problem.b[0].size):
+    for method, why, surveyed in auto.plan(S, target, problem.b[0].size, problem.exact is not None):
         reasons.append(why)
         products += surveyed
         try:
@@ -358,6 +358,8 @@ def _automatic(problem: _Problem) -> Solution:
         if attempts[-1].converged:
             break
         reasons.append(f"{attempts[-1].method} ended {attempts[-1].status.name.lower()}")
+        if attempts[-1].residual < 1.0:  # the next goes on from there
+            problem = dataclasses.replace(problem, x0=attempts[-1].x / problem.unit)
     if failure is not None and not attempts:
         raise failure
     best = attempts[-1] if attempts[-1].converged else min(attempts, key=lambda attempt: attempt.residual)
@@ -427,11 +429,7 @@ def _iterate(
 
 
 def _refine(method: Any, problem: _Problem, exact: Operator) -> tuple[np.ndarray, Monitor]:
-    """Refine solutions of S~ x = b until `exact` finds the residual required; products are by S and S~.
-
-    x is float64 on the host; so are residuals where the numbers of `exact` are at hand and a product with
-    them is cheap, or float32 could not tell.
-    """
+    """Refine solutions of S~ x = b, in float64, until `exact` finds the residual required."""
     S, b, rule = problem.S, problem.b, problem.rule
     right = S.device.upload(b)
     system = System(exact, right, vectors.norm(right), b)

@@ -5,18 +5,16 @@ Jacobi to Chebyshev take one launch a step (`Operator.stepper`), with x the iter
 
     x += d,   r -= S d,   d = keep d + gain r
 
-Jacobi (eq. 20), keep = 0 and gain = 1: l^(k+1) = l^(k) + (l_out - S l^(k)). Started from zero, k steps are
-the k-term inverse Neumann series (eq. 10), whose next term is the residual; the forward dual (eq. 18) is the
-same on I - A. Both converge where the spectral radius of R is below 1.
+Jacobi (eq. 20), keep = 0 and gain = 1: from zero, k steps are the k-term inverse Neumann series (eq. 10),
+whose next term is the residual; the forward dual (eq. 18) is the same on I - A. Both need rho(R) < 1.
 
 Richardson, gain = omega, converges for every albedo below one. On a spectrum in [a, b] the best omega is
 2 / (a + b) (Saad, Iterative Methods for Sparse Linear Systems, 2nd ed., example 4.1).
 
 Chebyshev (Saad, algorithm 12.1, whose numbers are in comments): the best polynomial in S for a spectrum in an
-interval, of a Lambertian scene the free bounds. A few steps of GMRES at the start draw these in. Where they
-leave out eigenvalues, the residual grows by their eigenvectors: more steps of GMRES take those out and show
-their eigenvalues, the bounds are widened, and the iteration goes on. Not for spectra with large imaginary
-parts, nor with eigenvalues on both sides of 0.
+interval, here the free bounds, drawn in by a few steps of GMRES. Where they leave out eigenvalues, the
+residual grows: more steps of GMRES find those, and the iteration goes on with wider bounds. Not for spectra
+with large imaginary parts, nor with eigenvalues on both sides of 0.
 
 Gauss-Seidel, SOR, block Gauss-Seidel and Southwell relax one row or block of rows after the other:
 
@@ -24,11 +22,9 @@ Gauss-Seidel, SOR, block Gauss-Seidel and Southwell relax one row or block of ro
     l_B += (S_BB)^-1 (l_out - S l)_B,  block B after block
     i = argmax |r_i|,  l_i += r_i / S_ii,  r -= S[:, i] r_i / S_ii
 
-Gauss-Seidel, omega = 1, is Jacobi that uses each new value at once (eq. 17-20, in place). Where S is
-self-adjoint, sweeps converge for every albedo (Saad, theorem 4.10). The residual of an iterate comes with the
-sweep that follows it: k iterations take k + 1 sweeps, each about one product. Southwell takes the largest
-residual first, as progressive radiosity does (R. V. Southwell, Relaxation Methods in Engineering Science,
-1940; M. Cohen et al., SIGGRAPH 1988).
+Where S is self-adjoint, sweeps converge for every albedo (Saad, theorem 4.10). The residual of an iterate
+comes with the next sweep: k iterations take k + 1, each about one product. Southwell takes the largest
+residual first, as progressive radiosity does (Cohen et al., SIGGRAPH 1988).
 """
 
 from __future__ import annotations
@@ -266,9 +262,8 @@ class SOR(GaussSeidel):
 class Southwell:
     """Options: ``rows`` relaxed in one step; a 64th of the picture when not given.
 
-    With ``rows=1`` it converges for every self-adjoint S. With more, each of as many equal parts of the
-    picture relaxes its own largest residual at the same time; too many at once behave like Jacobi and may
-    diverge. An iteration is as many steps as relax N rows, and so costs what one product costs.
+    With ``rows=1`` it converges for every self-adjoint S. With more, as many equal pieces of the picture
+    relax their largest residuals at once, which may diverge. An iteration relaxes N rows: one product.
     """
 
     name: ClassVar[str] = "southwell"

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One stopping rule for every method, and the system it is asked about.
 
-``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2 solved for l_d) for each column of b. CONVERGED is claimed
-only of a residual that is within the tolerance with all that rounding may hide (`ltcl.solvers.precision`):
-the one the method has where that is little, else one that is computed anew, in float64 where S is at hand.
+``||b - S x|| <= max(rtol ||b||, atol)`` (eq. 2) for each column of b. CONVERGED is claimed only of a residual
+within the tolerance with all that rounding may hide (`ltcl.solvers.precision`), computed anew where needed.
 """
 
 from __future__ import annotations
@@ -152,9 +151,8 @@ class Monitor:
         """Whether the solve ends with the iterate `x`, whose residual is `r`; sets `status` when it does.
 
         `norms` (m, k) are those of the residuals of the m steps since the last check, the newest last.
-        `travelled` is None where r was computed from x itself; of a residual kept by recursion it bounds the
-        way (k,) of x in these steps, `inf` where that is unknown. Such a residual is computed anew, into `r`,
-        before convergence is claimed, unless rounding cannot hide more than the tolerance.
+        `travelled` is None where r was computed from x itself; of a residual by recursion, computed anew into
+        `r` before convergence is claimed where rounding could hide it, the way (k,) of x, `inf` if unknown.
         """
         *before, last = norms
         if travelled is None:

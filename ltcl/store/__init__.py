@@ -2,7 +2,12 @@
 """Transports on disk: load one from, and save one to, .npz, .npy, .mtx, .h5, .mat and .zarr.
 
 Everything that a file declares is checked before memory is taken for it; pickles are never loaded. A .zarr
-folder is a `BlockStore` (`ltcl.store.blocks`): it grows block by block, and is read block by block.
+folder is a `BlockStore`: a scan grows in it batch by batch, and a finished T is read block by block.
+
+formats         which extension, read and write; npz, mtx, hdf5, matlab, zarr_folder: one format each
+headers         what files declare is checked here; record: what is in them
+block_store     `BlockStore`: a log of batches (`array_log`), finalized as zarr (`zarr_arrays`)
+rows            `StoredRows`: one channel as a matrix that is never loaded whole
 """
 
 from __future__ import annotations
@@ -17,11 +22,11 @@ from ltcl import checks
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import as_path
 from ltcl.solvers import Inverse
-from ltcl.store import arrays, formats
-from ltcl.store.blocks import BlockStore, StoredRows
-from ltcl.store.compressed import Parts
+from ltcl.store import formats, headers
+from ltcl.store.block_store import BlockStore
 from ltcl.store.inverses import load_inverse, save_inverse
-from ltcl.store.record import Matrix, Record
+from ltcl.store.record import Matrix, Parts, Record
+from ltcl.store.rows import StoredRows
 from ltcl.transport import Transport, from_arrays, to_arrays
 
 __all__ = ["BlockStore", "Parts", "Record", "StoredRows", "load", "load_inverse", "save", "save_inverse"]
@@ -30,6 +35,7 @@ __all__ = ["BlockStore", "Parts", "Record", "StoredRows", "load", "load_inverse"
 def load(
     path: str | os.PathLike[str],
     *,
+    variable: str | None = None,
     grid: tuple[int, int] | None = None,
     camera_grid: tuple[int, int] | None = None,
     first_bounce: str | np.ndarray | None = None,
@@ -42,14 +48,14 @@ def load(
     ----------
     path
         A .npz file (SciPy's sparse layouts, or arrays: `T` (M, N) or (3, M, N), and perhaps `grid`,
-        `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy, .mtx, .h5 or (MATLAB
-        v7.3) .mat file, or the folder of a store, whose blocks go to the device one by one.
+        `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy, .mtx, .h5 or .mat file
+        (MATLAB's versions 5 and 7.3), or the folder of a store, whose blocks go to the device one by one.
+    variable
+        Name of the matrix in a .npz, .h5 or .mat file; else T (in .mat LTM), or the only matrix.
     grid, camera_grid
         (h, w) of projector and camera; needed where the file does not tell, and preferred to what it tells.
-    first_bounce
-        As in `Transport`; None takes the file's, or else "diagonal".
-    on_dark, device
-        As in `Transport`.
+    first_bounce, on_dark, device
+        As in `Transport`; a first bounce of None takes the file's, or else "diagonal".
 
     Returns
     -------
@@ -65,6 +71,11 @@ def load(
     MemoryLimitError
         It does not fit the memory of the host or of the device.
 
+    Notes
+    -----
+    HDF5, .mtx and .mat keep no checksums: a flipped bit may be another number. A .mtx that is cut inside its
+    last number reads as one whose last number is shorter.
+
     Examples
     --------
     >>> import tempfile, pathlib, numpy as np
@@ -74,7 +85,7 @@ def load(
     (6, 6)
     """
     path = as_path(path)
-    record = formats.read(path)
+    record = formats.read(path, variable=variable)
     with formats.about(path):
         if isinstance(record, Parts):
             same = {"grid": grid or camera_grid, "first_bounce": first_bounce}
@@ -106,9 +117,9 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     Parameters
     ----------
     path
-        .npz and .zarr (as float32) keep everything, and they alone compressed operators; .h5 and .mat all
-        else; .npy (dense only) the matrix; .mtx matrix and grids, of three channels in T_r.mtx, T_g.mtx and
-        T_b.mtx for T.mtx.
+        .npz and .zarr keep everything, and they alone compressed operators; .h5 and .mat (version 5, less
+        than 4 GiB a variable) all else; .npy (dense only) the matrix; .mtx matrix and grids, of three
+        channels in T_r.mtx, T_g.mtx and T_b.mtx for T.mtx.
     T
         A transport made of matrices, or compressed.
 
@@ -136,26 +147,19 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
         raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport{also}")
     if T.blocks is not None:
         raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
-    held = (np.ndarray, scipy.sparse.csr_array, StoredRows)
-    if not any(isinstance(matrix, held) for matrix in T.matrices):
+    if not any(isinstance(matrix, Matrix) for matrix in T.matrices):
         formats.write(as_path(path), Parts(to_arrays(T)))
         return
-    matrices = tuple(_entries(matrix) for matrix in T.matrices)
+    matrices = []
+    for matrix in T.matrices:
+        if isinstance(matrix, np.ndarray):
+            matrix = headers.floats("T", matrix)
+        elif isinstance(matrix, scipy.sparse.csr_array):
+            parts = (headers.floats("T", matrix.data), matrix.indices, matrix.indptr)
+            matrix = scipy.sparse.csr_array(parts, shape=matrix.shape)
+        matrices.append(matrix)
     bounce = T.first_bounce if T.is_square else None
-    formats.write(as_path(path), Record(matrices, T.grid, T.camera_grid, bounce, T.mixing))
-
-
-def _entries(matrix: Any) -> Matrix:
-    if isinstance(matrix, scipy.sparse.csr_array):
-        parts = (arrays.as_floats("T", matrix.data), matrix.indices, matrix.indptr)
-        return scipy.sparse.csr_array(parts, shape=matrix.shape)
-    if isinstance(matrix, np.ndarray):
-        return arrays.as_floats("T", matrix)
-    if isinstance(matrix, StoredRows):
-        return matrix
-    raise InputTypeError(
-        f"T is made of {type(matrix).__name__}; only arrays and sparse matrices can be saved"
-    )
+    formats.write(as_path(path), Record(tuple(matrices), T.grid, T.camera_grid, bounce, T.mixing))
 
 
 def _unknown(name: str, pixels: int, whose: str) -> tuple[int, int]:

@@ -10,25 +10,15 @@ from typing import Any
 from ltcl.errors import FileError, InputTypeError
 from ltcl.files import as_path, input_file, replace_file
 from ltcl.solvers import Inverse
-from ltcl.store import compressed, formats
-from ltcl.store.archive import Archive
-
-_EXTENSION = ".npz"
+from ltcl.store import npz
+from ltcl.store.headers import about
+from ltcl.store.record import Parts
 
 
 def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
-    """Save what `ltcl.invert` made; an earlier file at `path` is replaced whole or not at all.
+    """Save what `ltcl.invert` made as .npz; an earlier file at `path` is replaced whole or not at all.
 
-    Parameters
-    ----------
-    path
-        .npz
-    inverse : Inverse
-
-    Raises
-    ------
-    FileError
-        Another extension, or the file cannot be written.
+    FileError for another extension, or where the file cannot be written.
 
     Examples
     --------
@@ -42,50 +32,39 @@ def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
     if not isinstance(inverse, Inverse):
         raise InputTypeError(f"inverse is a {type(inverse).__name__}; it must be what ltcl.invert(T) gives")
     path = check_name(path)
-    with formats.about(path), replace_file(path) as temporary:
-        compressed.write(temporary, compressed.Parts(inverse.to_arrays()), compressed.INVERSE)
+    with about(path), replace_file(path) as temporary:
+        npz.write_arrays(temporary, {"format": npz.INVERSE, **Parts(inverse.to_arrays()).arrays})
 
 
 def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse:
-    """Load an inverse onto a device, with the same bits as it was saved.
+    """Load an inverse of `save_inverse` onto a device (as `open_device` takes it), with the same bits.
 
-    Parameters
-    ----------
-    path
-        A .npz file of `save_inverse`.
-    device : Device or str, optional
-        As `open_device` takes it.
-
-    Raises
-    ------
-    FileError
-        The file is missing, damaged, truncated, lies about a size, or holds something else.
-    MemoryLimitError
-        It does not fit the memory of the host or of the device.
+    FileError where the file is missing, damaged, lies about a size, or holds something else; MemoryLimitError
+    where it does not fit the memory of the host or of the device.
     """
     parts = read(path)
-    with formats.about(as_path(path)):
+    with about(as_path(path)):
         return Inverse.from_arrays(parts.arrays, device)
 
 
-def read(path: str | os.PathLike[str]) -> compressed.Parts:
+def read(path: str | os.PathLike[str]) -> Parts:
     """The arrays in a file of an inverse; needs no device. Raises as `load_inverse`."""
     path = check_name(path)
     input_file(path)
-    with formats.about(path), Archive(path) as archive:
-        if not compressed.is_layout(archive, compressed.INVERSE):
-            raise FileError(f"is no inverse, whose format is {compressed.INVERSE}; ltcl.invert(T) makes one")
-        return compressed.read(archive)
+    with about(path), npz.Archive(path) as archive:
+        if archive.layout() != npz.INVERSE:
+            raise FileError(f"is no inverse, whose format is {npz.INVERSE}; ltcl.invert(T) makes one")
+        return archive.parts()
 
 
 def is_inverse(path: str | os.PathLike[str]) -> bool:
     """Whether a file says that it holds an inverse; not what is damaged, which its reader refuses."""
     path = as_path(path)
-    if path.suffix.lower() != _EXTENSION or not path.is_file():
+    if path.suffix.lower() != ".npz" or not path.is_file():
         return False
     try:
-        with Archive(path) as archive:
-            return compressed.is_layout(archive, compressed.INVERSE)
+        with npz.Archive(path) as archive:
+            return archive.layout() == npz.INVERSE
     except (FileError, OSError):
         return False
 
@@ -93,6 +72,6 @@ def is_inverse(path: str | os.PathLike[str]) -> bool:
 def check_name(path: str | os.PathLike[str]) -> Path:
     """`path`, if its extension is that of an inverse."""
     path = as_path(path)
-    if path.suffix.lower() != _EXTENSION:
-        raise FileError(f"{path}: the extension is {path.suffix!r}; inverses are {_EXTENSION}")
+    if path.suffix.lower() != ".npz":
+        raise FileError(f"{path}: the extension is {path.suffix!r}; inverses are .npz")
     return path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Transports as stores (`ltcl.store.blocks`): folders that are read block by block. Values become float32.
+"""Transports as stores (`block_store`): folders that are read block by block; float64 stays float64.
 
 A compressed transport is kept in extra arrays under the names of `ltcl.transport`, its texts in attributes,
 and the names of the arrays there too: other extra arrays are no part of it, and are not read.
@@ -7,7 +7,7 @@ and the names of the arrays there too: other extra arrays are no part of it, and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,100 +16,76 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.errors import FileError
-from ltcl.store.blocks import BlockStore, StoredRows, creating, finishing
-from ltcl.store.compressed import Parts
-from ltcl.store.record import Record
+from ltcl.files import fill_folder
+from ltcl.store.block_store import BlockStore, Layout, check_place, document, rows_at_once, write_finished
+from ltcl.store.record import Parts, Record
+from ltcl.store.rows import StoredRows
+from ltcl.store.zarr_arrays import Block
 
-KEEPS_FIRST_BOUNCE = True
-_EXTRAS = ("first_bounce", "mixing")
 _TEXTS, _ARRAYS = "texts", "arrays"
 
 
 def read(path: Path) -> Record | Parts:
     """The transport in a store, none of it in memory yet; each block is checked once, here."""
     store = BlockStore.open(path)
+    if not store.final:
+        raise FileError("is a scan that is not finished; finalize it first")
     if store.layout.kind == "compressed":
-        texts, names = _told(store)
-        arrays = {name: np.array(store.extra(name)) for name in names}
+        texts, names = (store.attributes.get(name) for name in (_TEXTS, _ARRAYS))
+        if not isinstance(texts, dict) or not isinstance(names, list):
+            raise FileError("is a compressed transport without its texts and the names of its arrays")
+        arrays = {name: store.extra(name) for name in names}
         return Parts(arrays | {name: np.array(str(text)) for name, text in texts.items()})
-    if store.orientation == "columns":
-        raise FileError("holds columns that have not been turned into rows; finalize it first")
-    finishing.refuse_missing(store, "rows")
-    F, mixing = (np.array(store.extra(name)) if name in store.extras else None for name in _EXTRAS)
+    F, mixing = (store.extra(n) if n in store.extras else None for n in ("first_bounce", "mixing"))
     if F is not None and len(F) == 1:
         F = F[0]
     matrices = tuple(StoredRows(store, channel) for channel in range(store.layout.channels))
     return Record(matrices, store.layout.grid, store.layout.camera_grid, F, mixing)
 
 
-def write(path: Path, record: Record | Parts) -> None:
-    """Write a store beside `path` and put it there when it is whole."""
-    with creating.beside(path, overwrite=True) as folder:
-        try:
-            _filled(folder, record).finalize()
-        except FileError as error:
-            raise FileError(str(error).replace(str(folder), str(path))) from error
+def write(path: Path, content: Record | Parts) -> None:
+    """Write a store in a temporary folder and put it at `path` when it is whole."""
+    if content.grid is None:
+        raise FileError("a store keeps the grid, and this transport does not tell it; give grid=(h, w)")
+    check_place(path, overwrite=True)
+    state: dict[str, Any] = {}
+    if isinstance(content, Parts):
+        layout = Layout(content.shape, content.grid, channels=len(content.first_bounce), kind="compressed")
+        extras, state = _arrays(content)
+    else:
+        dtype = np.result_type(*(T.dtype for T in content.matrices), np.float32).name
+        T, rows = content.matrices, rows_at_once(content.shape)
+        layout = Layout(content.shape, content.grid, content.camera_grid, len(T), rows, dtype=dtype)
+        extras = {} if content.mixing is None else {"mixing": content.mixing}
+        if content.first_bounce is not None and not content.bounces_from_diagonal:  # else of T as it is kept
+            extras["first_bounce"] = np.atleast_2d(content.first_bounce)
+    with fill_folder(path, replace=True) as folder:
+        rows = () if isinstance(content, Parts) else _blocks(content, layout)
+        files = write_finished(folder, layout, rows, extras.items())
+        (folder / "zarr.json").write_bytes(document(layout, {}, state, files))
 
 
-def conclude(store: BlockStore, parts: Parts, beside: Mapping[str, np.ndarray]) -> None:
+def conclude(store: BlockStore, parts: Parts, extras: Mapping[str, np.ndarray]) -> None:
     """Close a store of blocks for good as that of a compressed transport, which takes their place.
 
-    Arrays `beside` it join the extra arrays. Ended at any moment, it goes on from there when called again;
-    the blocks count until all else is there.
+    `extras` join its extra arrays. Ended at any moment, it goes on from there when called again.
     """
-    _keep(store, beside)
-    _keep_parts(store, parts)
+    arrays, state = _arrays(parts)
     sizes: dict[str, Any] = {"shape": parts.shape, "grid": parts.grid, "camera_grid": None}
-    store.finalize(layout=replace(store.layout, **sizes, kind="compressed"))
+    layout = replace(store.layout, **sizes, kind="compressed")
+    store.finalize(layout=layout, extras={**extras, **arrays}, state=state)
 
 
-def _filled(folder: Path, record: Record | Parts) -> BlockStore:
-    if record.grid is None:
-        raise FileError("a store keeps the grid, and this transport does not tell it; give grid=(h, w)")
-    sizes: dict[str, Any] = {"shape": record.shape, "grid": record.grid, "camera_grid": record.camera_grid}
-    if isinstance(record, Parts):
-        store = BlockStore.create(folder, **sizes, channels=len(record.first_bounce), kind="compressed")
-        _keep_parts(store, record)
-    else:
-        store = BlockStore.create(folder, **sizes, channels=len(record.matrices))
-        for channel, matrix in enumerate(record.matrices):
-            for block in range(store.layout.blocks()):
-                store.write(channel, block, _rows(matrix, *store.layout.span(block)))
-        if record.first_bounce is not None and not record.bounces_from_diagonal:  # else of T as it is kept
-            store.extra("first_bounce", np.atleast_2d(record.first_bounce))
-        if record.mixing is not None:
-            store.extra("mixing", record.mixing)
-    return store
+def _blocks(record: Record, layout: Layout) -> Iterator[tuple[int, int, Block]]:
+    for channel, T in enumerate(record.matrices):
+        for block in range(layout.blocks()):
+            start, stop = layout.span(block)
+            rows = T.rows(start, stop) if isinstance(T, StoredRows) else T[start:stop]
+            yield channel, block, Block(scipy.sparse.csr_array(rows), None)
 
 
-def _rows(matrix: Any, start: int, stop: int) -> scipy.sparse.csr_array:
-    part = matrix.rows(start, stop) if isinstance(matrix, StoredRows) else matrix[start:stop]
-    return scipy.sparse.csr_array(part)
-
-
-def _keep_parts(store: BlockStore, parts: Parts) -> None:
+def _arrays(parts: Parts) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays, and the attributes that hold the rest."""
     texts = {name: str(array) for name, array in parts.arrays.items() if array.dtype.kind in "SU"}
     arrays = {name: parts.arrays[name] for name in sorted(parts.arrays.keys() - texts.keys())}
-    _keep(store, arrays)
-    store.update(**{_TEXTS: texts, _ARRAYS: list(arrays)})
-
-
-def _keep(store: BlockStore, arrays: Mapping[str, np.ndarray]) -> None:
-    """Commit what an earlier run, which ended here, has not."""
-    there = store.extras
-    for name, array in arrays.items():
-        if name not in there or not _same(store.extra(name), array):
-            store.extra(name, array)
-
-
-def _same(a: np.ndarray, b: np.ndarray) -> bool:
-    return a.dtype == b.dtype and np.array_equal(a, b)
-
-
-def _told(store: BlockStore) -> tuple[dict[str, Any], list[str]]:
-    """Texts, and the names of the arrays."""
-    told = store.attributes
-    texts, names = told.get(_TEXTS), told.get(_ARRAYS)
-    if not isinstance(texts, dict) or not isinstance(names, list):
-        raise FileError("is a compressed transport without its texts and the names of its arrays")
-    return texts, names
+    return arrays, {_TEXTS: texts, _ARRAYS: list(arrays)}

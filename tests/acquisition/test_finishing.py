@@ -50,11 +50,11 @@ def test_what_is_photographed_is_all_it_takes(
         with pytest.raises(KeyboardInterrupt):
             acquire(rig(), store=path, **options)
     assert not BlockStore.open(path).final
-    told: list[tuple[int, int]] = []
+    told: list[tuple[str, int, int]] = []
     finalize(path, lambda *n: told.append(n))
     np.testing.assert_array_equal(dense(ltcl.load(path, on_dark="mask")), dense(whole))
     assert Report.of(path).to_json() == Report.of(tmp_path / "whole.zarr").to_json()
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    assert [done for _, done, _ in told] == sorted(done for _, done, _ in told)
     assert told
     finalize(path)
 

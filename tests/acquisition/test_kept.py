@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,8 @@ import pytest
 
 from ltcl.acquisition import FolderRig, VirtualRig, acquire, kept
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
-from ltcl.store.blocks import extras
-
-from .test_killed import contents
+from ltcl.store.array_log import ArrayLog
+from tests.store.stores import contents
 
 GRID = (8, 8)
 TRUTH = np.eye(64) * 0.5 + 0.002
@@ -72,20 +72,24 @@ def test_a_damaged_photograph_is_taken_again(tmp_path: Path, whole: tuple[int, d
     store = tmp_path / "T.zarr"
     with pytest.raises(AcquisitionError):
         run(Unplugged(20), store)
-    file = next((kept.place(store) / "extra").glob("shot_*/array/c/0/0"))
+    file = next(kept.place(store).glob("shot_*.npz"))
     file.write_bytes(file.read_bytes()[:-1] + b"\xff")
     rig = Unplugged()
     run(rig, store)
     assert 20 + rig.taken == whole[0] + 1
 
 
-def test_photographs_of_no_use_are_not_kept(tmp_path: Path) -> None:
-    """They would be black again, whatever is changed of the set-up."""
+def test_photographs_that_cannot_be_used_stay_and_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whatever ends a calibration; who has mended the set-up removes them."""
     store = tmp_path / "T.zarr"
     with pytest.raises(AcquisitionError) as error:
         run(VirtualRig(0 * TRUTH, GRID, bits=12, read=0, gain=None), store)
     assert "the rig failed" not in str(error.value)
-    assert not kept.place(store).exists()
+    assert kept.count(store) > 0
+    assert str(kept.place(store)) in caplog.text
+    shutil.rmtree(kept.place(store))
     run(Unplugged(), store)
 
 
@@ -116,25 +120,25 @@ def test_another_rig_is_refused(tmp_path: Path) -> None:
 def test_other_settings_use_what_they_can(tmp_path: Path) -> None:
     store = tmp_path / "T.zarr"
     with pytest.raises(AcquisitionError):
-        run(Unplugged(60), store, frames=3)
+        run(Unplugged(40), store, frames=3)
     rig, fresh = Unplugged(), Unplugged()
     run(rig, store, frames=4)
     run(fresh, tmp_path / "fresh.zarr", frames=4)
     assert contents(store) == contents(tmp_path / "fresh.zarr")
-    assert rig.taken < fresh.taken - 50
+    assert rig.taken < fresh.taken - 25
 
 
 def test_a_full_disk_loses_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store, write, left = tmp_path / "T.zarr", extras.write, [15]
+    store, put, left = tmp_path / "T.zarr", ArrayLog.put, [16]  # the first file tells the rig
 
-    def full(*given: Any) -> None:
+    def full(*given: Any, **arrays: Any) -> None:
         left[0] -= 1
         if left[0] < 0:
-            raise FileError("T.zarr.calibration: extra/shot cannot be written: No space left on device")
-        write(*given)
+            raise FileError("T.zarr.calibration/shot.npz: cannot be written: No space left on device")
+        put(*given, **arrays)
 
     with monkeypatch.context() as patch:
-        patch.setattr(extras, "write", full)
+        patch.setattr(ArrayLog, "put", full)
         with pytest.raises(FileError, match="No space left"):
             run(Unplugged(), store)
     assert kept.count(store) == 15
@@ -148,7 +152,7 @@ def test_a_folder_keeps_its_own(tmp_path: Path) -> None:
 
 
 def test_without_a_store_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extras, "write", lambda *_: pytest.fail("a photograph was kept"))
+    monkeypatch.setattr(ArrayLog, "put", lambda *_, **__: pytest.fail("a photograph was kept"))
     with pytest.raises(AcquisitionError, match="photograph 21"):
         acquire(Unplugged(20), geometry="aligned", strategy="pixel")
 
@@ -158,7 +162,7 @@ def test_what_a_kill_behind_the_calibration_left_goes(
 ) -> None:
     store = tmp_path / "T.zarr"
     with monkeypatch.context() as patch:
-        patch.setattr(kept.Shelf, "remove", lambda _: None)
+        patch.setattr(kept, "forget", lambda _: None)
         with pytest.raises(AcquisitionError):
             run(Unplugged(whole[0] - 10), store)
     assert kept.count(store) > 0

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.sparse
 
-from ltcl import images, operators, scenes, store
+import ltcl
+from ltcl import images, scenes
 from ltcl.cli.main import main
 from ltcl.device import Device
-from ltcl.transport import Transport
 
 
 @dataclass(frozen=True)
@@ -29,13 +28,18 @@ class Outcome:
 
     @property
     def json(self) -> Any:
-        """What stdout holds, if that is one JSON document and nothing else."""
+        """The one JSON document on stdout, of a run that ended well."""
+        assert self.code == 0, self.err
+        return self.document
+
+    @property
+    def document(self) -> Any:
+        """The one JSON document on stdout."""
         return json.loads(self.out, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
 
-    def refused(self, *parts: str) -> None:
-        """One line on stderr with these parts, nothing on stdout, exit code 1."""
-        assert self.code == 1
-        assert self.out == ""
+    def refused(self, *parts: str, code: int = 1) -> None:
+        """One line on stderr with these parts, nothing on stdout."""
+        assert (self.code, self.out) == (code, "")
         assert self.err.startswith("ltcl: error: ")
         assert self.err.count("\n") == 1
         for part in parts:
@@ -52,8 +56,8 @@ def program(capsys: pytest.CaptureFixture[str]) -> Program:
     def run(*arguments: object) -> Outcome:
         capsys.readouterr()
         code = main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return Outcome(code, out, err)
+        printed = capsys.readouterr()
+        return Outcome(code, printed.out, printed.err)
 
     return run
 
@@ -68,57 +72,61 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def transport(folder: Path, device: Device) -> Path:
     """A corner of two walls, grey, grid 5 x 10."""
     scene = scenes.dihedral(5, albedo=0.6)
-    path = folder / "corner.npz"
-    store.save(path, scene.transport(first_bounce=scene.first_bounce, device=device))
-    return path
+    ltcl.save(folder / "corner.npz", scene.transport(first_bounce=scene.first_bounce, device=device))
+    return folder / "corner.npz"
 
 
 @pytest.fixture(scope="session")
 def colour_transport(folder: Path, device: Device) -> Path:
     """A corner of three walls in colour, grid 4 x 12."""
     scene = scenes.box(4, sides=3, albedo=[(0.9, 0.2, 0.2), (0.2, 0.8, 0.3), (0.7, 0.7, 0.7)])
-    path = folder / "room.npz"
-    store.save(path, scene.transport(first_bounce=scene.first_bounce, device=device))
-    return path
+    ltcl.save(folder / "room.npz", scene.transport(first_bounce=scene.first_bounce, device=device))
+    return folder / "room.npz"
+
+
+@pytest.fixture(scope="session")
+def compressed(folder: Path, transport: Path) -> Path:
+    """The corner of two walls as wavelet coefficients."""
+    ltcl.save(folder / "compressed.npz", ltcl.compress(ltcl.load(transport), 0.05, basis="haar"))
+    return folder / "compressed.npz"
+
+
+@pytest.fixture(scope="session")
+def inverse(folder: Path, transport: Path) -> Path:
+    ltcl.save_inverse(folder / "inverse.npz", ltcl.invert(ltcl.load(transport), 1e-3, basis="pixels"))
+    return folder / "inverse.npz"
 
 
 @pytest.fixture(scope="session")
 def picture(folder: Path) -> Path:
     """Within reach of `transport`: 5 x 10, linear, between 0.3 and 0.4."""
-    path = folder / "sky.exr"
-    images.write(path, np.random.default_rng(1).uniform(0.3, 0.4, (5, 10)).astype(np.float32))
-    return path
+    images.write(folder / "sky.exr", np.random.default_rng(1).uniform(0.3, 0.4, (5, 10)).astype(np.float32))
+    return folder / "sky.exr"
 
 
 @pytest.fixture(scope="session")
 def large_picture(folder: Path) -> Path:
     """A PNG in colour, 20 x 30."""
-    path = folder / "large.png"
-    images.write(path, scenes.landscape(20, 30))
-    return path
-
-
-@pytest.fixture
-def dark_transport(tmp_path: Path) -> Path:
-    """Two of six projector pixels give no direct light."""
-    T = np.eye(6) + 0.01
-    T[2, 2] = T[4, 4] = 0.0
-    path = tmp_path / "dark.npz"
-    np.savez(path, T=T, grid=(2, 3))
-    return path
+    images.write(folder / "large.png", scenes.landscape(20, 30))
+    return folder / "large.png"
 
 
 @pytest.fixture(scope="session")
-def compressed_transport(folder: Path, device: Device) -> Path:
-    """The corner of two walls as wavelet coefficients, of which the least are dropped."""
-    scene = scenes.dihedral(5, albedo=0.6)
-    T = scene.transport(first_bounce=scene.first_bounce, device=device)
-    W = operators.Wavelet(device, T.grid, "db2")
-    R = T.systems[0].to_dense() - np.eye(50)
-    C = W.to_dense() @ R @ W.to_dense().T
-    core = operators.CSR(device, scipy.sparse.csr_array(np.where(np.abs(C) < 1e-3, 0.0, C)))
-    S = operators.IdentityPlus(operators.Compressed(core, W, W), solution_error=0.0041)
-    path = folder / "corner compressed.npz"
-    F = T.first_bounce
-    store.save(path, Transport(operators.ScaledColumns(S, F), T.grid, first_bounce=F))
-    return path
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A corner of two walls, 4 x 8, in a room that is not dark; nothing is photographed here."""
+    out = tmp_path_factory.mktemp("simulated") / "scan"
+    curves = ["--response", "film", "--projector-response", "film", "--ambient", "0.05"]
+    assert (
+        main(["simulate", "dihedral", "--out", str(out), "--size", "4", "--strategy", "pixel", *curves]) == 0
+    )
+    return out
+
+
+@pytest.fixture(scope="session")
+def acquired(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, all photographed; not to be changed."""
+    import shutil
+
+    scan = Path(shutil.copytree(simulated, tmp_path_factory.mktemp("acquired") / "scan"))
+    assert main(["acquire", "run", str(scan)]) == 0
+    return scan

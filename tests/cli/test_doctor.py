@@ -1,51 +1,56 @@
 # SPDX-License-Identifier: BSD-3-Clause
+"""`ltcl doctor` and `devices`: what works, what fails and what to do about it; `demo`: what it prints."""
+
 from __future__ import annotations
 
-import errno
-from pathlib import Path
+import json
+from typing import Any
 
 import pytest
 
-from ltcl.cli import device_checks, doctor
-from ltcl.device import Device, discovery, kernels
-from ltcl.errors import DeviceError, FileError
+from ltcl import demo
+from ltcl.cli import doctor
+from ltcl.device import Device, discovery
+from ltcl.solvers import METHODS
 
 from .conftest import Program
 
 
-def test_all_is_well_here(program: Program, device: Device) -> None:
-    outcome = program("doctor")
-    assert outcome.code == 0, outcome.out
-    assert "FAILED" not in outcome.out
-    assert device.name in outcome.out
+def test_all_is_well_here_and_every_solver_and_product_is_tried(program, device, monkeypatch):
+    kernel, files = Device.kernel, set()
+
+    def record(self: Device, file: str, *arguments: Any, **defines: Any) -> Any:
+        files.add(file)
+        return kernel(self, file, *arguments, **defines)
+
+    monkeypatch.setattr(Device, "kernel", record)
+    told = program("doctor", "--json").json
+    assert told["passed"] is True
+    assert {f"solve, {method}" for method in METHODS} <= {check["check"] for check in told["checks"]}
+    assert {"csr", "dense", "tile", "wavelet", "form_factor", "southwell", "walk", "vector"} <= files
+    assert device.name in program("doctor").out
 
 
-def test_json_covers_every_kernel_file(program: Program, device: Device) -> None:
-    outcome = program("doctor", "--json")
-    assert outcome.code == 0
-    assert outcome.json["passed"] is True
-    checks = {check["check"] for check in outcome.json["checks"]}
-    assert {f"kernels/{file.name}" for file in kernels.folder().glob("*.cl")} <= checks
-
-
-def test_wrong_device_fails_with_a_fix(program: Program, device: Device) -> None:
-    outcome = program("doctor", "--device", "nonsense", "--json")
+def failed(program: Program, *arguments: str) -> dict[str, Any]:
+    """The only check that fails."""
+    outcome = program("doctor", *arguments, "--json")
     assert outcome.code == 1
-    (failed,) = [check for check in outcome.json["checks"] if not check["passed"]]
-    assert "nonsense" in failed["found"]
-    assert "ltcl devices" in failed["fix"]
+    (check,) = [check for check in outcome.document["checks"] if not check["passed"]]
+    return check
 
 
-def test_unusable_cache_fails(
-    program: Program, device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    taken = tmp_path / "file"
-    taken.write_text("no folder")
-    monkeypatch.setenv("LTCL_CACHE", str(taken))
-    outcome = program("doctor")
-    assert outcome.code == 1
-    assert "FAILED  cache folder" in outcome.out
-    assert "LTCL_CACHE" in outcome.out
+def test_a_wrong_device_a_hidden_driver_and_a_bad_cache_have_a_fix(program, device, monkeypatch, tmp_path):
+    check = failed(program, "--device", "nonsense")
+    assert "nonsense" in check["found"]
+    assert "ltcl devices" in check["fix"]
+    (tmp_path / "file").write_text("no folder")
+    with monkeypatch.context() as patch:
+        patch.setenv("LTCL_CACHE", str(tmp_path / "file"))
+        assert "LTCL_CACHE" in failed(program)["fix"]
+        assert "FAILED  cache folder" in program("doctor").out
+    monkeypatch.setattr(discovery, "list_devices", list)
+    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
+    assert "OCL_ICD_VENDORS=/nowhere" in failed(program)["found"]
 
 
 # What the loader would do, with a driver that does as its file says.
@@ -62,59 +67,50 @@ if action == "refuse":
 
 
 @pytest.mark.parametrize("action", ["crash", "hang"])
-def test_crashing_driver_is_named_and_not_loaded(
-    program: Program, device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, action: str
-) -> None:
-    monkeypatch.setattr(device_checks, "TRIAL", TRIAL)
-    monkeypatch.setattr(device_checks, "_SECONDS", 2)
+def test_a_driver_that_crashes_or_hangs_is_named(program, device, monkeypatch, tmp_path, action):
+    monkeypatch.setattr(doctor, "TRIAL", TRIAL)
+    monkeypatch.setattr(doctor, "SECONDS", 2)
     monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
     for name, does in (("bad", action), ("good", "work"), ("odd", "refuse")):
         (tmp_path / f"{name}.icd").write_text(does)
-    outcome = program("doctor", "--json")
-    assert outcome.code == 1
-    *_, drivers = outcome.json["checks"]
-    crashing, working = drivers["found"].split("working")
+    check = failed(program)
+    crashing, working = check["found"].split("working")
     assert "bad.icd" in crashing
     assert "odd.icd" in working
     assert "good.icd" in working
-    assert "OCL_ICD_VENDORS" in drivers["fix"]
+    assert "OCL_ICD_VENDORS" in check["fix"]
 
 
-def test_wrong_results_are_a_failure() -> None:
-    with pytest.raises(DeviceError, match="differs from NumPy"):
-        device_checks._agrees(1.0, 1e-5, "NumPy")
-    with pytest.raises(DeviceError):
-        device_checks._agrees(float("nan"), 1e-5, "NumPy")
+def test_wrong_results_are_findings(program, device, monkeypatch):
+    monkeypatch.setitem(doctor.LIMITS, "product", 0.0)
+    checks = program("doctor", "--json").document["checks"]
+    wrong = [check for check in checks if "differs from NumPy" in check["found"]]
+    assert {check["check"].partition(",")[0] for check in wrong} == {"product"}
 
 
-def test_old_dependency_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_wanted", lambda: [("numpy", "999.0"), ("no-such-package", "1")])
-    finding = doctor.attempt("dependencies", doctor._dependencies, "pip install")
-    assert not finding.passed
-    assert "it must be at least 999.0" in finding.found
-    assert "no-such-package is missing" in finding.found
-
-
-def test_whatever_is_raised_is_a_finding() -> None:
-    finding = doctor.attempt("x", lambda: str(1 / 0), "no fix")
-    assert not finding.passed
-    assert finding.found.startswith("ZeroDivisionError")
-
-
-def test_chmod_is_no_advice_for_a_read_only_disk() -> None:
-    def fail() -> str:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    finding = doctor.attempt("cache folder", fail, doctor._cache_fix)
-    assert finding.fix == "set LTCL_CACHE=DIR to a folder that can be written"
-    assert doctor._cache_fix(FileError("mode 755")).startswith("chmod 700")
-
-
-def test_a_variable_that_hides_the_drivers_is_named(
-    program: Program, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_devices_mark_the_one_that_would_be_chosen(program, device, monkeypatch):
+    entries = program("devices", "--json").json
+    (chosen,) = [entry for entry in entries if entry["chosen"]]
+    assert (chosen["name"], chosen["index"]) == (device.name, device.description.index)
+    assert min(chosen["compute_units"], chosen["max_allocation"]) > 0
+    (marked,) = [line for line in program("devices").out.splitlines() if line.startswith("->")]
+    assert chosen["index"] in marked
+    monkeypatch.setenv("LTCL_DEVICE", "nonsense")
+    outcome = program("devices")
+    assert (outcome.code, outcome.err) == (0, "ltcl: LTCL_DEVICE=nonsense matches none of these\n")
+    assert device.name in outcome.out
+    assert "->" not in outcome.out
     monkeypatch.setattr(discovery, "list_devices", list)
-    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
-    outcome = program("doctor", "--json")
-    (failed,) = [check for check in outcome.json["checks"] if check["check"] == "device"]
-    assert "OCL_ICD_VENDORS=/nowhere" in failed["found"]
+    program("devices").refused("no OpenCL device", "install")
+
+
+def test_the_demo_says_what_was_reached_and_where_to_look(program, device, tmp_path):
+    outcome = program("demo", "--out", tmp_path, "--size", "6", "--verbose")
+    assert outcome.code == 0, outcome.err
+    errors = json.loads((tmp_path / "report.json").read_text())["errors"]
+    assert errors["compensated"] < 0.02 < errors["uncompensated"]
+    for error in errors.values():
+        assert f"{100 * error:.3g} %" in outcome.out
+    assert "diverged" in outcome.out
+    assert str(tmp_path / "contact_sheet.png") in outcome.out
+    assert [line.removeprefix("ltcl: ") for line in outcome.err.splitlines()] == list(demo.STEPS)

@@ -127,3 +127,11 @@ def test_fewer_and_more_camera_than_projector_pixels(device, camera, loss):
     )
     assert least <= c.error <= allowed * (1 + 1e-4)
     assert more > allowed * 0.999
+
+
+def test_a_loss_out_of_reach_is_refused_soon_where_colours_mix(device):
+    matrices, before = [lambertian(24, 1.0, seed=c).T for c in range(3)], device.launches.total()
+    T = ltcl.Transport(matrices, (4, 6), mixing=0.75 * np.eye(3) + 0.05, device=device)
+    with pytest.raises(InputError, match=r"loss.*0\.001"):
+        ltcl.compensate(T, random.uniform(0, 1, (4, 6, 3)), gain="auto", loss=1e-3)
+    assert device.launches.total() - before < 1000

@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import stat
 
 import pytest
-import scipy
 
 from ltcl.device import tuning
 from ltcl.errors import DeviceError, MemoryLimitError
@@ -69,13 +67,6 @@ def test_speeds_of_the_machine_are_remembered(device, speed):
     measured = speed(device)
     assert 1e6 < measured < 1e16
     assert speed(device) == measured
-
-
-def test_seconds_of_an_older_ltcl_are_not_taken_for_operations_a_second():
-    """They may lie in its file as "factorization": `auto` then foresaw one of 1.8e14 ms."""
-    machine = f"{platform.node()}|{os.cpu_count()} cores|scipy {scipy.__version__}"
-    tuning.remember(f"{machine}|factorization", 0.2475)
-    assert tuning.factorization_flops() > 1e6
 
 
 def test_without_tuning_the_first_variant_and_constants_are_taken(device, monkeypatch, folder):

@@ -139,20 +139,6 @@ def test_a_truncated_video_gives_the_frames_there_are_and_an_error(tmp_path, cap
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_matroska_whose_sound_outlasts_its_picture_is_read_with_a_warning(tmp_path, caplog):
-    path, codes = tmp_path / "a.mkv", film(10)
-    data = opencv_writes(path, codes)
-    place = data.index(b"\x44\x89\x88") + 3  # its duration, from which the number of frames is estimated
-    (duration,) = struct.unpack_from(">d", data, place)
-    path.write_bytes(data[:place] + struct.pack(">d", 1.5 * duration) + data[place + 8 :])
-    source = open_frames(path)
-    assert source.count == 15
-    for frame, code in zip(source, codes, strict=True):
-        np.testing.assert_allclose(frame.picture(), images.from_srgb(code / 255), rtol=1e-6)
-    (line,) = caplog.messages
-    assert line.startswith(f"{path}: 10 of 15 frames")
-
-
 @pytest.mark.parametrize("content", [b"", b"not a video", b"\0" * 5000, "mp4"])
 def test_what_is_no_video_is_refused(tmp_path, capfd, content):
     path = tmp_path / "a.mp4"

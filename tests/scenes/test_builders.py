@@ -171,15 +171,6 @@ def test_the_floor_under_a_block_is_dark_and_a_partition_makes_two_rooms(device:
     assert sums(scene)[[1, 5, 6, 7]] == pytest.approx(1, abs=0.01)
 
 
-def test_a_black_block_takes_light_away_and_a_speck_none(device: Device) -> None:
-    blocks = (Block(TABLE.corner, TABLE.size), Block((0.5, 0.5, 0.5), (1e-4, 1e-4, 1e-4)), None)
-    dark, speck, empty = (box(N, occluder=block, device=device) for block in blocks)
-    assert dark.grid == empty.grid == (N, 6 * N)
-    assert (dark.form_factors <= empty.form_factors).all()
-    assert np.sum(dark.matrices()[0]) < 0.9 * np.sum(empty.matrices()[0])
-    np.testing.assert_allclose(speck.form_factors, empty.form_factors, atol=1e-4)
-
-
 def test_colours_of_room_and_block_go_together(device: Device) -> None:
     scene = box(2, sides=2, albedo=0.5, occluder=LAMP, device=device)
     picture = scene.picture(scene.first_bounce)

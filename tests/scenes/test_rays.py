@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ltcl.errors import InputError, InputTypeError
+from ltcl.errors import InputError
 from ltcl.scenes import Block, box, cut, trihedral
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.rays import cast, clear, sight
@@ -22,31 +22,6 @@ SCREEN = Wall("screen", corner=(0, 1, 1), right=(1, 0, 0), down=(0, 0, -1))
 EYE = Viewer(eye=(0.5, 0, 0.5), target=(0.5, 1, 0.5))
 # Half as high and wide as it, in front of the middle of the screen: they look twice as large from the eye.
 CARD = Wall("card", corner=(0.375, 0.5, 0.625), right=(0.25, 0, 0), down=(0, 0, -0.25))
-
-
-def test_rays_find_the_place_on_a_slanted_wall_from_its_front() -> None:
-    slanted = Wall("slanted", corner=(0, 0, 1), right=(0.2, 1, 0.3), down=(1.5, 0.1, -0.4))
-    rng = np.random.default_rng(0)
-    u, v = rng.random((2, 50))
-    targets = slanted.points(u, v)
-    origins = targets + slanted.normal + rng.uniform(-0.3, 0.3, (50, 3))
-    hits = cast([slanted], origins, 3 * (targets - origins))
-    assert (hits.wall == 0).all()
-    np.testing.assert_allclose([hits.u, hits.v, hits.distance], [u, v, np.full(50, 1 / 3)])
-    behind = cast([slanted], 2 * targets - origins, origins - targets)  # black, and it still stops light
-    assert (behind.wall == -1).all()
-    np.testing.assert_allclose(behind.distance, 1)
-
-
-def test_no_ray_leaves_a_closed_box_and_the_nearest_wall_wins() -> None:
-    """Seams and corners included: rays from the middle aim at points of a lattice that holds them all."""
-    side = np.linspace(0, 1, 11)
-    points = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
-    points = points[(np.abs(points - 0.5).max(axis=1)) == 0.5]
-    for walls in (WALLS, (*WALLS, Wall("beyond", (-1, -1, 3), (3, 0, 0), (0, 3, 0))), WALLS[::-1]):
-        hits = cast(walls, np.full_like(points, 0.5), points - 0.5)
-        assert (hits.wall >= 0).all()
-        assert hits.distance == pytest.approx(1)
 
 
 def test_blocks_stop_rays_as_the_twin_says() -> None:
@@ -85,21 +60,6 @@ def test_sight_is_in_the_frame_of_each_patch_and_keeps_to_shadows() -> None:
     plate = [[(-1, -1, 1), (0.25, 2, 1.001)]]
     for n, expected in ((4, [0] * 8 + [1] * 8), (1, [0.5])):
         assert sight("projector", (0, 0.5, 2), [FLOOR], cut([FLOOR], n), plate).share.tolist() == expected
-
-
-@pytest.mark.parametrize(
-    ("place", "part"),
-    [
-        ((0.5, 0.5, 0), r"projector is at \(0.5, 0.5, 0\), on the wall 'floor'"),
-        ((0.5, 0.5, -1), r"projector is at .*, where it faces none of 1 wall"),
-        ((3, 3, 3.5), r"projector is at \(3, 3, 3.5\), in a block"),
-        ((1, 2), r"projector is \(1, 2\); it must be three finite numbers"),
-        ("here", "projector is 'here'"),
-    ],
-)
-def test_bad_places_are_refused(place: Any, part: str) -> None:
-    with pytest.raises((InputError, InputTypeError), match=part):
-        sight("projector", place, [FLOOR], cut([FLOOR], 2), [[(2, 2, 2), (4, 4, 4)]])
 
 
 def test_a_pinhole_shows_a_screen_as_it_is() -> None:

@@ -80,15 +80,6 @@ def test_what_does_not_fit_is_refused(corner: Scene, monkeypatch: pytest.MonkeyP
             what()
 
 
-def test_arrays_are_read_only_and_shared(corner: Scene) -> None:
-    own = np.array(corner.form_factors)
-    scene = replace(corner, form_factors=own)
-    assert np.shares_memory(scene.form_factors, own)
-    assert own.flags.writeable
-    with pytest.raises(ValueError, match="read-only"):
-        scene.form_factors[0, 0] = 1
-
-
 UNEVEN = np.zeros((75, 75))
 UNEVEN[74, 0] = 0.1
 

@@ -17,15 +17,6 @@ FLOOR = WALLS[2]
 BLOCK = Block(corner=(0.2, 0.3, 0.1), size=(0.4, 0.3, 0.5))
 
 
-def test_walls_are_the_six_faces_seen_from_inside_and_unroll_seamlessly() -> None:
-    for wall in WALLS:
-        assert np.array([0.5, 0.5, 0.5]) - wall.outline.mean(axis=0) == pytest.approx(wall.normal / 2)
-    assert len({tuple(wall.normal) for wall in WALLS}) == 6
-    around = [WALLS[k] for k in (0, 1, 4, 5)]
-    for wall, following in zip(around, around[1:] + around[:1], strict=True):
-        assert np.add(wall.corner, wall.right).tolist() == list(following.corner)
-
-
 def test_patches_lie_in_the_order_of_the_picture() -> None:
     n, patches = 3, cut(WALLS, 3)
     assert patches.area.sum() == pytest.approx(6)
@@ -47,18 +38,6 @@ def test_faces_of_a_block_look_outwards_and_close_it() -> None:
         flux += face.area * (outwards + middle) @ face.normal / 3
     assert flux == pytest.approx(0.4 * 0.3 * 0.5)  # the volume, by Gauss' theorem
     assert all(face.down == pytest.approx((0, 0, -0.5)) for face in BLOCK.faces()[:4])  # they stand upright
-
-
-def test_touching_walls_pass() -> None:
-    refuse_crossing(WALLS)
-    for corner, right, down in [
-        ((0.5, 0.2, 1), (0, 0.5, 0), (0, 0, -1)),  # stands on the floor
-        ((1.5, 0.2, 1), (0, 0.5, 0), (0, 0, -3)),  # cuts the plane, not the floor
-        ((0, 0, 0), (1, 0, 0), (0, 1, 0)),  # a floor with two sides
-        ((1, 0, 0), (0, 1, 0), (1, 0, 0)),  # beside it
-        ((0.5, 1, 0.5), (0.5, 0.5, 0), (0, 0, -1)),  # corner to corner
-    ]:
-        refuse_crossing([FLOOR, Wall("other", corner, right, down)])
 
 
 @pytest.mark.parametrize(
@@ -94,22 +73,6 @@ COLOURS = np.array([(0.1, 0.2, 0.3), (0.4, 0.5, 0.6)])
 def test_albedo_is_spread_over_walls_and_colours(albedo: Any, expected: Any) -> None:
     pictures = spread_albedo(albedo, walls=2, n=3).reshape(-1, 3, 2, 3)  # (channels, row, wall, column)
     assert pictures.tolist() == np.broadcast_to(np.array(expected)[:, None, :, None], pictures.shape).tolist()
-
-
-@pytest.mark.parametrize(
-    ("albedo", "part"),
-    [
-        ([0.1, 0.2, 0.3], r"\(3, 1\) .* \(1, 3\)"),
-        ([0.1, 0.2], r"shape \(2,\)"),
-        (1.0, r"outside \[0, 1\), the first 1;"),
-        ([[0.5, -0.25, 0]], "the first -0.25;"),
-        ([[0.5], [np.nan], [0]], "albedo has 1 NaN"),
-        ("white", "albedo is"),
-    ],
-)
-def test_bad_albedos_are_refused(albedo: Any, part: str) -> None:
-    with pytest.raises((InputError, InputTypeError), match=part):
-        spread_albedo(albedo, walls=3, n=2)
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,7 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "callback is a number": ({"callback": 3}, InputTypeError, "callback is 3"),
     "S is a transport": ({"S": ltcl.Transport(np.eye(4), (2, 2))}, InputTypeError, "S.*T.interreflection"),
     "unknown option": ({"light": 3}, InputTypeError, "unknown option 'light'"),
+    "no option, but of others": ({"with_residual": True}, InputTypeError, "unknown option 'with_residual'"),
     "no option, but a class variable": ({"name": "x"}, InputTypeError, "unknown option 'name'"),
     "of another method": ({"restart": 3, "arnoldi": 2}, InputTypeError, "one of method=.(chebyshev|gmres)"),
 }

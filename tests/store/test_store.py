@@ -1,26 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`load` and `save` of whole transports, and damage of any kind to their files."""
+"""`load` and `save` of whole transports."""
 
 from __future__ import annotations
-
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.sparse
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from ltcl import store
-from ltcl.errors import FileError, InputTypeError, LtclError
-from ltcl.store import formats
-from ltcl.store.record import Record
+from ltcl.errors import FileError, InputTypeError
 from ltcl.transport import Transport
 from tests.store.helpers import dense, same_matrix, sparse
 
 COLOUR = [dense(seed=seed) for seed in range(3)]
-SUFFIXES = [".npz", ".npy", ".mtx"]
 
 
 @pytest.mark.parametrize("bounce", ["diagonal", "exact", np.arange(1.0, 13)])
@@ -75,13 +67,6 @@ def test_blocks_between_colours_are_not_saved(tmp_path):
         store.save(tmp_path / "T.npz", T)
 
 
-def test_rectangular_transports_keep_both_grids(tmp_path):
-    T = Transport(dense(20, 12), grid=(3, 4), camera_grid=(4, 5))
-    store.save(tmp_path / "T.npz", T)
-    result = store.load(tmp_path / "T.npz")
-    assert (result.grid, result.camera_grid, result.shape) == ((3, 4), (4, 5), (20, 12))
-
-
 def test_masked_pixels_stay_masked(tmp_path):
     matrix = dense()
     matrix[3, 3] = 0
@@ -91,15 +76,10 @@ def test_masked_pixels_stay_masked(tmp_path):
     assert np.flatnonzero(store.load(tmp_path / "T.npz", on_dark="mask").masked).tolist() == [3]
 
 
-def test_integer_matrices_are_saved_as_floats(tmp_path):
-    store.save(tmp_path / "T.npz", Transport(np.eye(6, dtype=np.int64), grid=(2, 3)))
-    assert store.load(tmp_path / "T.npz").matrices[0].dtype == np.float64
-
-
 def test_the_grid_given_is_preferred_if_it_fits(tmp_path):
     store.save(tmp_path / "T.npz", Transport(dense(), grid=(3, 4)))
     assert store.load(tmp_path / "T.npz", grid=(2, 6), camera_grid=(1, 12)).grid == (2, 6)
-    with pytest.raises(FileError, match=r"T\.npz: grid is 5 x 5 = 25 pixels, but the matrix is for 12"):
+    with pytest.raises(FileError, match=r"T\.npz: grid is 5 x 5 = 25 pixels; .* must be 12"):
         store.load(tmp_path / "T.npz", grid=(5, 5))
 
 
@@ -160,6 +140,10 @@ def test_paths_that_lead_nowhere(tmp_path):
         "T.xyz": r"extension \.xyz is unknown; transports are \.npz, \.npy, \.mtx",
         "T": "has no extension",
     }
+    with pytest.raises(FileError, match="path is ''"):
+        store.load("")
+    with pytest.raises(FileError, match="path is ''"):
+        store.save("", Transport(dense(), grid=(3, 4)))
     for name, text in wanted.items():
         with pytest.raises(FileError, match=text) as error:
             store.load(tmp_path / name)
@@ -179,63 +163,7 @@ def test_a_failed_save_leaves_the_earlier_file(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("numpy.lib.format.write_array", full)
-    with pytest.raises(FileError, match=r"T\.npz: No space left"):
+    with pytest.raises(FileError, match=r"T\.npz: .*No space left"):
         store.save(path, Transport(2 * dense(), grid=(3, 4)))
     assert [p.name for p in tmp_path.iterdir()] == ["T.npz"]
     assert path.read_bytes() == before
-
-
-@pytest.fixture(scope="module")
-def samples(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Small good files of each kind, 12 x 12 on a grid of 3 x 4."""
-    folder = tmp_path_factory.mktemp("samples")
-    record = Record((dense(),), (3, 4), (3, 4), np.ones(12))
-    sparse_record = Record((sparse(),), (3, 4), (3, 4))
-    rgb = Record(tuple(sparse(seed=seed) for seed in range(3)), (3, 4), (3, 4))
-    formats.write(folder / "dense.npz", record)
-    formats.write(folder / "dense.npy", Record((dense(),)))
-    formats.write(folder / "dense.mtx", Record((dense(),), (3, 4), (3, 4)))
-    formats.write(folder / "sparse.npz", sparse_record)
-    formats.write(folder / "rgb.npz", rgb)
-    formats.write(folder / "sparse.mtx", sparse_record)
-    np.savez_compressed(folder / "compressed.npz", T=dense(), grid=[3, 4])
-    for layout in ("csc", "coo", "bsr", "dia"):
-        scipy.sparse.save_npz(folder / f"{layout}.npz", getattr(scipy.sparse, f"{layout}_array")(sparse()))
-    return folder
-
-
-NAMES = ["dense.npz", "dense.npy", "dense.mtx", "sparse.npz", "rgb.npz", "sparse.mtx", "compressed.npz"]
-NAMES += ["csc.npz", "coo.npz", "bsr.npz", "dia.npz"]
-
-
-@pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    cut=st.one_of(st.just(1.0), st.floats(0, 1)),
-    place=st.floats(0, 1, exclude_max=True),
-    byte=st.one_of(st.none(), st.integers(0, 255)),
-)
-def test_any_damage_gives_our_error_or_a_transport_of_the_same_shape(
-    samples, tmp_path, name, cut, place, byte
-):
-    data = bytearray((samples / name).read_bytes())
-    if byte is not None:
-        data[int(place * len(data))] = byte
-    path = tmp_path / name
-    path.write_bytes(data[: int(cut * len(data))])
-    given_grid = None if name in ("dense.npz", "dense.mtx", "sparse.npz", "sparse.mtx", "rgb.npz") else (3, 4)
-    message = ""
-    try:
-        T = store.load(path, grid=given_grid, camera_grid=given_grid, on_dark="mask")
-    except LtclError as error:
-        message = str(error)
-    else:
-        assert T.shape == (12, 12)
-    assert not message or message.startswith(f"{path}: ")
-    assert "\n" not in message
-
-
-def test_the_samples_are_good(samples, tmp_path):
-    for name in NAMES:
-        shutil.copy(samples / name, tmp_path)
-        assert store.load(tmp_path / name, grid=(3, 4)).shape == (12, 12)

@@ -7,13 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.geometry.consistency import consistent
-from ltcl.acquisition.geometry.decoded import Axis
-from ltcl.acquisition.geometry.gray import GrayCode
+from ltcl.acquisition.geometry.graycode import Axis, GrayCode, consistent
 from ltcl.acquisition.geometry.subpixel import refine
 from ltcl.errors import InputError
 
@@ -71,7 +68,7 @@ class Correspondence:
 
     @classmethod
     def of(cls, x: Axis, y: Axis, grid: tuple[int, int]) -> Correspondence:
-        """Decoded coordinates, less those that are not fully known or do not fit their neighbours."""
+        """Decoded coordinates, without those that are not fully known or do not fit their neighbours."""
         valid = (x.width <= 2.0) & (y.width <= 2.0)
         valid &= consistent(x.value, valid) & consistent(y.value, valid)
         (column, fits), (row, also) = refine(x, valid, grid[1]), refine(y, valid, grid[0])
@@ -87,47 +84,6 @@ class Correspondence:
         """Part of the camera's pixels that are valid."""
         return float(self.valid.mean())
 
-    def homography(self, where: Any = None, *, within: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """The homography that takes camera pixels (u, v, 1) to projector coordinates, robustly fitted.
-
-        Parameters
-        ----------
-        where : (H, W) bool, optional
-            The pixels to fit to; all valid ones when left out.
-        within : float
-            Projector pixels by which an inlier may be off.
-
-        Returns
-        -------
-        homography : (3, 3) float64
-        distance : (H, W) float32
-            How far each valid pixel is from it, in projector pixels; NaN elsewhere.
-
-        Raises
-        ------
-        InputError
-            Fewer than four pixels, or all on a line.
-
-        Examples
-        --------
-        >>> H, distance = Correspondence.aligned((4, 5)).homography()
-        >>> np.allclose(H, np.eye(3)), bool(distance.max() < 1e-4)
-        (True, True)
-        """
-        chosen = self.valid if where is None else self.valid & np.asarray(where, bool)
-        v, u = np.nonzero(chosen)
-        camera = np.stack([u, v], axis=1).astype(np.float64)
-        seen = np.stack([self.x[chosen], self.y[chosen]], axis=1).astype(np.float64)
-        found = None
-        if len(camera) >= 4 and all(np.linalg.matrix_rank(p - p.mean(axis=0)) == 2 for p in (camera, seen)):
-            found, _ = cv2.findHomography(camera, seen, cv2.RANSAC, within)
-        if found is None:
-            raise InputError(f"{len(camera)} pixel(s) tell no homography; there must be four, not on a line")
-        v, u = np.mgrid[: self.valid.shape[0], : self.valid.shape[1]]
-        p = np.einsum("ij,jhw->ihw", found, np.stack([u, v, np.ones_like(u)]).astype(np.float64))
-        distance = np.hypot(p[0] / p[2] - self.x, p[1] / p[2] - self.y)
-        return found, distance.astype(np.float32)
-
 
 def decode(
     images: Sequence[Any],
@@ -135,10 +91,8 @@ def decode(
     *,
     high_frequency: bool = False,
     subpixel: bool = True,
-    sigmas: float = 3.0,
-    dark: float = 2e-3,
 ) -> Correspondence:
-    """The map that photographs of Gray code tell, without a rig.
+    """The map from photographs of Gray code, without a rig.
 
     Parameters
     ----------
@@ -146,15 +100,15 @@ def decode(
         Of `GrayCode(grid, high_frequency).patterns()`, in that order.
     grid : (h, w)
         Of the projector.
-    high_frequency, sigmas, dark
-        As in `GrayCode` and its `decode`.
+    high_frequency : bool
+        As in `GrayCode`.
     subpixel : bool
         Fit planes through the edges of stripes; else coordinates are whole, or halves on edges.
 
     Raises
     ------
     InputError
-        As `GrayCode.decode`.
+        Another number of photographs, mixed sizes, NaN; or white shows nothing that black does not.
 
     Examples
     --------
@@ -162,5 +116,5 @@ def decode(
     1.0
     """
     code = GrayCode(checks.grid("grid", grid), high_frequency)
-    x, y = code.decode(images, sigmas=sigmas, dark=dark, edges=checks.flag("subpixel", subpixel))
+    x, y = code.decode(images, edges=checks.flag("subpixel", subpixel))
     return Correspondence.of(x, y, code.grid)

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs on the projector's grid: every projector pixel is a weighted mean of the camera pixels near it.
 
-Camera pixels that are smaller than the projector's tell these apart, by least squares (`unmixing`). Where
+Camera pixels that are smaller than the projector's separate these, by least squares (`unmixing`). Where
 they are not, camera pixel m at x_m, with footprint J_m, reaches projector pixel n with the weight
 
     w_nm = |det J_m| k(d^T Q_m^-1 d),  d = n - x_m,  Q_m = C J_m J_m^T + P I,  k(s) = (1 - s)^2 for s < 1
 
 which is an elliptical filter as wide as the two pixels together: it interpolates, and what is finer than two
-projector pixels blurs. All rows sum to one and are corrected to first order (`centring`).
+projector pixels blurs. All rows sum to one and are corrected to first order (`unmixing.centred`).
 
 A dark pixel beside a bright one, of which few camera pixels were decoded, would be a small difference of two
 large numbers. Where what its weights take away of white is more than 0.7 of what they add, errors of the
 photographs and of the map are multiplied by 6, and it counts as not seen. Known limit: a pixel of which
-0.7 or less is taken away may be off, too, by more than the noise.
+0.7 or less is taken away may deviate, too, by more than the noise.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,16 +25,14 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.acquisition.geometry.centring import centred
 from ltcl.acquisition.geometry.correspondence import Correspondence
-from ltcl.acquisition.geometry.footprints import jacobian
-from ltcl.acquisition.geometry.unmixing import unmix
+from ltcl.acquisition.geometry.unmixing import centred, jacobian, unmix
 from ltcl.errors import InputError
 
 CAMERA = 1.54  # C: wide enough that samples of a square grid surround every place, however large they are
 PROJECTOR = 1.1  # P: a kernel as wide as a tent over the projector's pixels
 SEEN = 0.05  # of a projector pixel: less is not seen
-TOLD = 0.9  # of its own light, by least squares
+RESOLVED = 0.9  # part of the answer of least squares that is a pixel's own light
 TAKEN = 0.7  # of what is added under white: more of it taken away leaves nothing that is known
 PART, HALF = 0.15, 0.5  # of its area, where that is so (less may be an error of the map), and where it is not
 
@@ -67,35 +66,34 @@ class Resampling:
     doubtful: np.ndarray | None = None
 
     @classmethod
-    def of(cls, found: Correspondence) -> Resampling:
-        """The resampling that a measured map tells.
+    def of(cls, mapping: Correspondence) -> Resampling:
+        """The resampling by a measured map.
 
         Raises
         ------
         InputError
             No two neighbouring pixels of the map are valid.
         """
-        if not isinstance(found, Correspondence):
-            raise InputError(f"found is a {type(found).__name__}; it must be a Correspondence")
-        J, known = jacobian(found)
+        if not isinstance(mapping, Correspondence):
+            raise InputError(f"mapping is a {type(mapping).__name__}; it must be a Correspondence")
+        J, known = jacobian(mapping)
         if not known.any():
-            raise InputError("found has no two valid neighbours; nothing tells the size of a camera pixel")
-        wide = _Samples.of(found, J, known).weights(found.grid)
-        fine = unmix(found, J, known)
+            raise InputError("mapping has no two valid neighbours; the size of a camera pixel is unknown")
+        wide, fine = _kernels(mapping, J, known), unmix(mapping, J, known)
         if fine is None:
             coverage = np.asarray(wide.sum(axis=1))
             keep = coverage >= SEEN
-            matrix = centred(_normalised(wide, keep), found)
+            matrix = centred(_normalised(wide, keep), mapping)
         else:
-            coverage, told = fine.area, fine.told >= TOLD
-            keep = (coverage >= PART) & told | (coverage >= HALF)
-            blurred = centred(_normalised(wide, keep & ~told), found)
-            matrix = scipy.sparse.diags_array((keep & told).astype(float)) @ fine.weights + blurred
+            coverage, resolved = fine.area, fine.resolved >= RESOLVED
+            keep = (coverage >= PART) & resolved | (coverage >= HALF)
+            blurred = centred(_normalised(wide, keep & ~resolved), mapping)
+            matrix = scipy.sparse.diags_array((keep & resolved).astype(float)) @ fine.weights + blurred
         matrix = scipy.sparse.csr_array(matrix, dtype=np.float32)
         matrix.eliminate_zeros()
         matrix.sort_indices()
         part = np.minimum(np.where(keep, coverage, 0.0), 1.0).astype(np.float32)
-        return cls(matrix, part.reshape(found.grid), found.grid, found.camera_grid)
+        return cls(matrix, part.reshape(mapping.grid), mapping.grid, mapping.camera_grid)
 
     @classmethod
     def aligned(cls, grid: tuple[int, int]) -> Resampling:
@@ -160,53 +158,30 @@ class Resampling:
         return (matrix @ flat).reshape(*self.grid, *array.shape[2:])
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """Camera pixels with a footprint: number, place, area, Q^-1 as a x^2 + 2 b x y + c y^2, extent."""
-
-    m: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    area: np.ndarray
-    form: tuple[np.ndarray, np.ndarray, np.ndarray]
-    reach: tuple[np.ndarray, np.ndarray]
-    pixels: int
-
-    @classmethod
-    def of(cls, found: Correspondence, J: np.ndarray, known: np.ndarray) -> _Samples:
-        (xu, xv), (yu, yv) = np.moveaxis(J[known], 0, -1)
-        xx, yy = (CAMERA * (u**2 + v**2) + PROJECTOR for u, v in ((xu, xv), (yu, yv)))
-        xy = CAMERA * (xu * yu + xv * yv)
-        det = xx * yy - xy**2
-        # The kernel over its ellipse integrates to pi sqrt(det Q) / 3.
-        area = np.abs(xu * yv - xv * yu) * 3 / (np.pi * np.sqrt(det))
-        place = (found.x[known].astype(np.float64), found.y[known].astype(np.float64))
-        form, reach = (yy / det, -xy / det, xx / det), (np.sqrt(xx), np.sqrt(yy))
-        return cls(np.flatnonzero(known), *place, area, form, reach, known.size)
-
-    def weights(self, grid: tuple[int, int]) -> scipy.sparse.csr_array:
-        """w of all pairs of a camera pixel and the projector pixels inside its ellipse, (N, M)."""
-        size = np.ceil(np.maximum(*self.reach) - 0.5).astype(int)  # pixels from the nearest one
-        parts = []
-        for far in np.unique(size):
-            some = np.flatnonzero(size == far)
-            offsets = range(-far, far + 1)
-            parts += [self._offset(some, i, j, grid) for j in offsets for i in offsets]
-        n, m, w = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return scipy.sparse.csr_array((w, (n, m)), shape=(grid[0] * grid[1], self.pixels))
-
-    def _offset(self, some: np.ndarray, i: int, j: int, grid: tuple[int, int]) -> tuple[np.ndarray, ...]:
-        """Pairs with the projector pixel i columns and j rows from the one nearest to the sample."""
-        x, y = self.x[some], self.y[some]
-        column, row = np.rint(x) + i, np.rint(y) + j
-        dx, dy = column - x, row - y
-        a, b, c = (part[some] for part in self.form)
-        s = a * dx * dx + 2 * b * dx * dy + c * dy * dy
-        h, w = grid
-        good = (s < 1) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
-        n = (row[good] * w + column[good]).astype(np.int64)
-        value = self.area[some[good]] * (1 - s[good]) ** 2
-        return n, self.m[some[good]], value
+def _kernels(mapping: Correspondence, J: np.ndarray, known: np.ndarray) -> scipy.sparse.csr_array:
+    """w_nm of all pairs of a camera pixel and the projector pixels inside its ellipse, (N, M)."""
+    h, w = mapping.grid
+    (xu, xv), (yu, yv) = np.moveaxis(J[known], 0, -1)
+    xx, yy = (CAMERA * (a**2 + b**2) + PROJECTOR for a, b in ((xu, xv), (yu, yv)))
+    xy = CAMERA * (xu * yu + xv * yv)
+    det = xx * yy - xy**2
+    # The kernel over its ellipse integrates to pi sqrt(det Q) / 3.
+    area = np.abs(xu * yv - xv * yu) * 3 / (np.pi * np.sqrt(det))
+    x, y = mapping.x[known].astype(np.float64), mapping.y[known].astype(np.float64)
+    size = np.ceil(np.sqrt(np.maximum(xx, yy)) - 0.5).astype(int)  # pixels from the nearest one
+    rows, columns, values = [], [], []
+    for far in np.unique(size):
+        m = np.flatnonzero(size == far)
+        for j, i in itertools.product(range(-far, far + 1), repeat=2):
+            column, row = np.rint(x[m]) + i, np.rint(y[m]) + j
+            dx, dy = column - x[m], row - y[m]
+            s = (yy[m] * dx * dx - 2 * xy[m] * dx * dy + xx[m] * dy * dy) / det[m]  # d^T Q^-1 d
+            good = (s < 1) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
+            rows.append((row[good] * w + column[good]).astype(np.int64))
+            columns.append(np.flatnonzero(known)[m[good]])
+            values.append(area[m[good]] * (1 - s[good]) ** 2)
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return scipy.sparse.csr_array(entries, shape=(h * w, known.size))
 
 
 def _normalised(weights: scipy.sparse.csr_array, keep: np.ndarray) -> scipy.sparse.csr_array:

@@ -5,13 +5,13 @@ An edge lies where pattern and inverse are equal; between two camera pixels line
 a few hundredths of a pixel, and there the projector coordinate is known: n + 1/2. Every boundary of two
 projector columns is an edge of exactly one bit. A weighted least-squares plane `x = a + b u + c v` through
 the edges in a window, and faintly through the coordinates of the pixels themselves, gives x at the pixel.
-Where they spread about it, the window crosses a border, and one to a side or a smaller one gives the plane;
-at the rim of the picture, beyond which there are no edges, it is one further inside.
-Where that leaves the pixel's own cell [n - 1/2, n + 1/2] by more than a quarter (sharp folds), the whole
-number stays, if there are others around for which it is so; else the bits of the pixel are wrong, and it is
-dropped.
+Where edges deviate from it, the window crosses a border, and one to a side or a smaller one gives the plane;
+at the rim of the picture, beyond which there are no edges, it is one further inside. Where that leaves the
+pixel's own cell [n - 1/2, n + 1/2] by more than a quarter, the whole number stays if others around leave
+theirs (a sharp fold); else the bits of the pixel are wrong, and it is dropped.
 
-Known limit: beside the border of an object pixels are off by some tenths, and so is light that only they see.
+Known limit: next to the border of an object pixels deviate by some tenths, and so does light that only they
+see.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ltcl.acquisition.geometry.decoded import Axis, Edges, strips
+from ltcl.acquisition.geometry.graycode import Axis, Edges, in_strips
 
-LEAVES = 0.25
-BESIDE = 1.0  # projector pixels from the picture: camera pixels further off see none of it
-COMPANY = 5  # side of a window
-SPREAD = 0.2  # of edges about a plane: more is no plane; whole numbers of pixels alone add 0.06
+LEAVES = 0.25  # projector pixels by which a plane may leave a pixel's cell: six times the error of an edge
+WEIGHT = 0.01  # of a whole number next to an edge: (0.04 / 0.29)^2 of their deviations, and half of that
+BEYOND = 1.0  # projector pixels from the picture: camera pixels further away see none of it
+COMPANY = 5  # camera pixels that leave their planes, in a window of as many to each side: a line of them
+SPREAD = 0.2  # deviation of edges from a plane: more is no plane; whole numbers of pixels alone add 0.06
 FULL = 0.9  # part of a window that is valid: less is a rim
-TOLD = 0.06  # of the squared reach: edges whose places vary less lie on one line, or nearly so
-EDGES = 8  # that tell a plane on one side
+ACROSS_LINE = 0.06  # of the squared reach: edges that spread less (evenly: 1/3) lie nearly on one line
+EDGES = 8  # that determine a plane on one side, which has three unknowns
 ACROSS = 2.5  # edges on each side of a pixel that a window should hold
-SMALLEST, LARGEST = 2, 15  # reach of a window, in camera pixels
+SMALLEST, LARGEST = 2, 15  # reach of a window, in camera pixels: 5 x 5 hold 8 edges; 31 x 31 are a surface
 STRIP = 1 << 16  # pixels of a strip of rows: its moments stay in the cache
 
 
@@ -41,17 +42,17 @@ def refine(axis: Axis, valid: np.ndarray, size: int) -> tuple[np.ndarray, np.nda
     axis : Axis
         Decoded with ``edges=True``; one without edges comes back as it is.
     valid : (H, W) bool
-        Pixels of width 2 at most that agree with their neighbours.
+        Pixels of width 2 at most that fit their neighbours.
     size : int
-        Projector pixels along the axis. Camera pixels that see a part of the outermost may lie beside them.
+        Projector pixels along the axis. Camera pixels that see a part of the outermost may lie beyond them.
     """
     if axis.edges is None:
         return axis.value, valid
     cell, reach = _cell(axis, size), _reach(axis.edges, valid)
     planes = _planes(axis, valid, reach)
     odd = valid & ~_fit(cell, planes[0])
-    odd &= ~_in_company(odd)
-    if odd.any():  # edges beside them are none
+    odd &= _sums([odd.astype(np.float32)], COMPANY)[0] < COMPANY - 0.5  # fewer than the line of a fold has
+    if odd.any():  # their edges are none
         valid = valid & ~odd
         planes = _planes(axis, valid, reach)
     plane = _at_pixels(axis, valid, cell, planes, reach)
@@ -60,10 +61,10 @@ def refine(axis: Axis, valid: np.ndarray, size: int) -> tuple[np.ndarray, np.nda
 
 
 def _cell(axis: Axis, size: int) -> np.ndarray:
-    """What each pixel may see, from and to; (2, H, W). Of cells at the border, what is beside them, too."""
+    """What each pixel may see, from and to; (2, H, W). Cells at the border of the picture reach beyond it."""
     low, high = axis.value - axis.width / 2, axis.value + axis.width / 2
-    low[low < 0] -= BESIDE
-    high[high > size - 1] += BESIDE
+    low[low < 0] -= BEYOND
+    high[high > size - 1] += BEYOND
     return np.stack([low, high])
 
 
@@ -76,7 +77,7 @@ def _fit(cell: np.ndarray, plane: np.ndarray) -> np.ndarray:
 def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
     """Planes through the window about each pixel, (5, H, W).
 
-    Value there; slopes b and c; what edges spread about it; the variance of their places in that direction
+    Value there; slopes b and c; the deviation of edges from it; the variance of their places in the direction
     in which it is least, in camera pixels.
     """
     H, W = valid.shape
@@ -89,7 +90,7 @@ def _planes(axis: Axis, valid: np.ndarray, reach: int) -> np.ndarray:
         own = slice(above, above + rows.stop - rows.start)
         _plane([m[own] for m in _moments(axis, valid, more, 2 * reach + 1)], above, planes[:, rows])
 
-    strips(H, max(STRIP // W, 4 * reach), strip)
+    in_strips(H, max(STRIP // W, 4 * reach), strip)
     return planes
 
 
@@ -117,67 +118,54 @@ def _inward(
     """Values and spreads (H, W) of the windows about pixels; at a rim, of one further inside.
 
     A window about a pixel at the rim holds few edges, maybe on one line: the whole numbers of pixels would
-    tell the slope across it.
+    decide the slope across it.
     """
     value, spread = planes[0].copy(), planes[3].copy()
-    count, mean_v, mean_u = _middle(valid, 2 * reach + 1)
-    lacking = valid & (count < FULL * (2 * reach + 1) ** 2) & (planes[4] < TOLD * reach**2)
-    v, u = np.nonzero(lacking)
-    j, i = mean_v[v, u] - v, mean_u[v, u] - u
+    window, one = 2 * reach + 1, valid.astype(np.float32)
+    rows, columns = (index.astype(np.float32) for index in np.ogrid[: valid.shape[0], : valid.shape[1]])
+    count, sum_v, sum_u = _sums([one, one * rows, one * columns], window)
+    v, u = np.nonzero(valid & (count < FULL * window**2) & (planes[4] < ACROSS_LINE * reach**2))
+    j, i = sum_v[v, u] / count[v, u] - v, sum_u[v, u] / count[v, u] - u  # to the middle of what is valid
     least = planes[4, v, u]
-    for further in (1, 2):  # a full window is twice as far inside as the middle of what there is
+    for further in (1, 2):  # a full window is twice as far inside as that middle
         at = (np.rint(further * part).astype(int) for part in (j, i))
-        there, spread_there, told = _from_beside(planes, v, u, *at)
-        some = (told > least) & (least < TOLD * reach**2) & (spread_there <= SPREAD)
+        there, spread_there, across = _extrapolated(planes, v, u, *at)
+        some = (across > least) & (least < ACROSS_LINE * reach**2) & (spread_there <= SPREAD)
         some &= _fit(cell[:, v, u], there)
         value[v[some], u[some]], spread[v[some], u[some]] = there[some], spread_there[some]
-        least = np.where(some, told, least)
+        least = np.where(some, across, least)
     return value, spread
 
 
-def _middle(valid: np.ndarray, window: int) -> tuple[np.ndarray, ...]:
-    """How many pixels of the window about each are valid, and their mean row and column; (H, W) each."""
-    v, u = (part.astype(np.float32) for part in np.ogrid[: valid.shape[0], : valid.shape[1]])
-    one = valid.astype(np.float32)
-    size = (window, window)
-    count, *sums = (
-        cv2.boxFilter(part, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for part in (one, one * v, one * u)
-    )
-    return count, *(total / np.maximum(count, 1.0) for total in sums)
+def _sums(planes: list[np.ndarray], window: int) -> list[np.ndarray]:
+    size, border = (window, window), cv2.BORDER_CONSTANT
+    return [cv2.boxFilter(plane, -1, size, normalize=False, borderType=border) for plane in planes]
 
 
 def _best(
     cell: np.ndarray, planes: np.ndarray, reach: int, v: np.ndarray, u: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values at pixels (v, u) of that window around or beside each which spreads least, and its spread."""
+    """Values at pixels (v, u) of that window around or next to each which spreads least, and its spread."""
     best, least = planes[0, v, u], np.full(len(v), np.inf)
     for j, i in ((j, i) for j in (0, -reach, reach) for i in (0, -reach, reach)):
-        there, spread, _ = _from_beside(planes, v, u, j, i)
+        there, spread, _ = _extrapolated(planes, v, u, j, i)
         better = (spread < least) & _fit(cell, there)
         best, least = np.where(better, there, best), np.where(better, spread, least)
     return best, least
 
 
-def _from_beside(planes: np.ndarray, v: np.ndarray, u: np.ndarray, j, i) -> tuple[np.ndarray, ...]:
-    """Values at pixels (v, u) of the planes `j` rows and `i` columns beside, and their last two parts."""
+def _extrapolated(planes: np.ndarray, v: np.ndarray, u: np.ndarray, j, i) -> tuple[np.ndarray, ...]:
+    """Values at pixels (v, u) of the planes `j` rows and `i` columns away; the last two parts of these."""
     H, W = planes.shape[1:]
     row, column = np.clip(v + j, 0, H - 1), np.clip(u + i, 0, W - 1)
     value, b, c, *rest = planes[:, row, column]
     return value - b * (column - u) - c * (row - v), *rest
 
 
-def _in_company(odd: np.ndarray) -> np.ndarray:
-    """Pixels with as many like them around as a line has that passes through."""
-    size = (COMPANY, COMPANY)
-    count = cv2.boxFilter(odd.astype(np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return odd & (count > COMPANY - 0.5)
-
-
 def _reach(edges: Edges, valid: np.ndarray) -> int:
-    """Camera pixels on each side, so that a few edges fit in, as far as their mean distance tells."""
+    """Camera pixels on each side of a window for a few edges, by their mean distance."""
     count = sum(int(np.count_nonzero(np.isfinite(t))) for t in (edges.right, edges.below))
-    return min(max(int(np.ceil(ACROSS * np.count_nonzero(valid) / max(count, 1))), 2), LARGEST)
+    return min(max(int(np.ceil(ACROSS * np.count_nonzero(valid) / max(count, 1))), SMALLEST), LARGEST)
 
 
 def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np.ndarray]:
@@ -186,9 +174,9 @@ def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np
     Edges to the right are at (u + r, v), those below at (u, v + d), with r and d in [0, 1].
     """
     edges, valid = axis.edges, valid[rows]
-    assert edges is not None  # noqa: S101  (said by `refine`)
+    assert edges is not None  # noqa: S101  (checked by `refine`)
     v, u = np.ogrid[: float(len(valid)), : float(valid.shape[1])]
-    n, value, place = axis.weight * valid, axis.value[rows].astype(np.float64), edges.place[rows]
+    n, value, place = WEIGHT * valid, axis.value[rows].astype(np.float64), edges.place[rows]
     x = n * value
     xx = x * value
     shifts = []
@@ -209,8 +197,7 @@ def _moments(axis: Axis, valid: np.ndarray, rows: slice, window: int) -> list[np
     nu, nv = n * u + r, n * v + d
     total = [n, nu, nv, x, (nu + r) * u + r * r, nu * v + d * u, (nv + d) * v + d * d]
     total += [x * u + rx, x * v + dx, xx]
-    size = (window, window)
-    return [cv2.boxFilter(m, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT) for m in total]
+    return _sums(total, window)
 
 
 def _plane(sums: list[np.ndarray], top: int, out: np.ndarray) -> None:
@@ -220,7 +207,7 @@ def _plane(sums: list[np.ndarray], top: int, out: np.ndarray) -> None:
     n, *means = sums
     part = 1.0 / np.maximum(n, 1e-6)  # no valid pixel near
     mean_u, mean_v, mean_x, uu, uv, vv, ux, vx, xx = (np.multiply(m, part, out=m) for m in means)
-    # A little more spread than there is: edges on one line tell the slope across it only.
+    # A little more spread than there is: edges on one line determine the slope across it only.
     uu += 1e-3 - mean_u**2
     vv += 1e-3 - mean_v**2
     uv -= mean_u * mean_v

@@ -6,9 +6,8 @@ mixing is relative to a channel's own light, as `ltcl.Transport(mixing=)` takes 
 
     M_cd = sum_p w_p L_cd L_cc / sum_p w_p (L_cc^2 - V_cc),    w_p = 1 / (V_cd + V_cc)
 
-(V_cc, the variance of L_cc, is the bias of its square), one for the set-up. Of each pixel
-M_cd(p) = L_cd / L_cc where its own light is told to better than 10 %, and that of the set-up elsewhere: what
-mixes depends on the spectrum of a surface, too.
+(V_cc, the variance of L_cc, is the bias of its square), one for the set-up. Known limit: it is the mean over
+the surfaces of the scene; what mixes depends on their spectra, too.
 """
 
 from __future__ import annotations
@@ -16,17 +15,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ltcl import checks
+from ltcl import checks, layout
 from ltcl.acquisition.radiometry.merge import Radiance
 from ltcl.errors import InputError, InputTypeError
 
-_WORST = 1e6  # condition number of a mixing, as for a transport
-_TOLD = 0.1  # relative error of a pixel's own light
 
-
-def mixing(lit: Sequence[Radiance], black: Radiance | None = None, *, per_pixel: bool = False) -> np.ndarray:
+def mixing(lit: Sequence[Radiance], black: Radiance | None = None) -> np.ndarray:
     """The mixing of colours, from pictures under red, green and blue.
 
     Parameters
@@ -35,19 +30,17 @@ def mixing(lit: Sequence[Radiance], black: Radiance | None = None, *, per_pixel:
         The scene under the projector's red, green and blue alone.
     black : Radiance of (H, W, 3), optional
         Under a black projector; it is subtracted from each.
-    per_pixel : bool
-        A matrix for each pixel.
 
     Returns
     -------
     np.ndarray
-        float64, (3, 3) or (H, W, 3, 3): rows are channels of the camera, columns those of the projector.
+        (3, 3) float64: rows are channels of the camera, columns those of the projector.
 
     Raises
     ------
     InputError, InputTypeError
         Not three pictures in colour of one shape; a channel of the camera without light of its own colour; a
-        mixing that cannot be undone.
+        mixing that cannot be undone (condition number above 1e6).
 
     Examples
     --------
@@ -72,51 +65,11 @@ def mixing(lit: Sequence[Radiance], black: Radiance | None = None, *, per_pixel:
         checks.shape(name, picture.value, lit[0].value.shape)
     pictures = [picture if black is None else picture - black for picture in lit]
     valid = np.all([picture.valid for picture in pictures], axis=(0, 3))
-    # (H, W, camera, projector)
-    L = np.stack([picture.value for picture in pictures], axis=-1).astype(np.float64)
-    V = np.stack([picture.variance for picture in pictures], axis=-1).astype(np.float64)
-    M = _of_all(L[valid], V[valid])
-    return _of_each(L, V, valid, M) if per_pixel else M
-
-
-def unmix(picture: ArrayLike, M: ArrayLike) -> np.ndarray:
-    """X of M x = picture, pixel by pixel: what to send so that each channel gets its own light.
-
-    Parameters
-    ----------
-    picture : (..., 3)
-        Linear light.
-    M : (3, 3) or (..., 3, 3)
-        As from `mixing`.
-
-    Returns
-    -------
-    np.ndarray
-        float32, as `picture`; below 0 or above 1 where no projector can.
-
-    Raises
-    ------
-    InputError
-        Other shapes, NaN, a mixing that cannot be undone.
-
-    Examples
-    --------
-    >>> unmix([0.6, 0.5, 0.0], [[1, 0.2, 0], [0, 1, 0], [0, 0, 1]])
-    array([0.5, 0.5, 0. ], dtype=float32)
-    """
-    light = checks.finite("picture", checks.real("picture", picture).astype(np.float64))
-    matrices = checks.finite("M", checks.real("M", M).astype(np.float64))
-    if light.shape[-1:] != (3,):
-        raise InputError(f"picture has shape {light.shape}; it must be (..., 3)")
-    checks.shape("M", matrices, (3, 3), (*light.shape, 3))
-    _check_regular("M", matrices)
-    return np.linalg.solve(matrices, light[..., None])[..., 0].astype(np.float32)
-
-
-def _of_all(L: np.ndarray, V: np.ndarray) -> np.ndarray:
-    """(3, 3) of light (pixels, 3, 3)."""
-    if len(L) == 0:
+    if not valid.any():
         raise InputError("lit have no pixel that is valid in all; other exposures are needed")
+    # (pixels, camera, projector)
+    L = np.stack([picture.value[valid] for picture in pictures], axis=-1).astype(np.float64)
+    V = np.stack([picture.variance[valid] for picture in pictures], axis=-1).astype(np.float64)
     M = np.eye(3)
     for c, d in np.argwhere(~np.eye(3, dtype=bool)):
         w = 1.0 / np.maximum(V[:, c, d] + V[:, c, c], 1e-300)
@@ -124,23 +77,4 @@ def _of_all(L: np.ndarray, V: np.ndarray) -> np.ndarray:
         if own <= 0:
             raise InputError(f"lit[{c}] has no light in its own channel {c}; is the order red, green, blue?")
         M[c, d] = np.sum(w * L[:, c, d] * L[:, c, c]) / own
-    _check_regular("the mixing of lit", M)
-    return M
-
-
-def _of_each(L: np.ndarray, V: np.ndarray, valid: np.ndarray, M: np.ndarray) -> np.ndarray:
-    own, variance = (np.diagonal(part, axis1=-2, axis2=-1) for part in (L, V))
-    with np.errstate(invalid="ignore"):
-        told = valid[..., None] & (own > 0) & (variance < (_TOLD * own) ** 2)
-    found = np.where(told[..., None], L / np.where(told, own, 1.0)[..., None], M)
-    bad = ~(np.linalg.cond(found) < _WORST)
-    found[bad] = M
-    return found
-
-
-def _check_regular(name: str, M: np.ndarray) -> None:
-    worst = float(np.max(np.linalg.cond(M)))
-    if not worst < _WORST:
-        raise InputError(
-            f"{name} has the condition number {worst:.3g}; it must be invertible, below {_WORST:g}"
-        )
+    return layout.mixing(M, 3, None)

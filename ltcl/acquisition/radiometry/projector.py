@@ -26,8 +26,8 @@ from ltcl.acquisition.radiometry.response import Response
 from ltcl.acquisition.radiometry.stack import NO_LIGHT
 from ltcl.errors import InputError, InputTypeError
 
-_TABLE = 1025
-_LEAST = 3.0  # standard errors that white must stand above black
+_TABLE = 1025  # four values for each code of 8 bits
+_SIGNIFICANT = 3.0  # standard errors that white must be above black: one black projector in 700 passes
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -72,7 +72,7 @@ def measure(codes: Any, pictures: Sequence[Any]) -> ProjectorResponse:
     if levels.ndim != 1 or len(levels) < 2 or np.any(np.diff(levels) <= 0) or levels[0] or levels[-1] != 1:
         raise InputError(f"codes is {codes!r}; it must rise from 0 to 1")
     if len(pictures) == 3 and not isinstance(pictures[0], Radiance):
-        tables = [_table(levels, part, f"pictures[{c}]") for c, part in enumerate(pictures)]
+        tables = [_table(levels, channel, f"pictures[{c}]") for c, channel in enumerate(pictures)]
         return ProjectorResponse(np.stack(tables))
     return ProjectorResponse(_table(levels, pictures, "pictures"))
 
@@ -80,7 +80,7 @@ def measure(codes: Any, pictures: Sequence[Any]) -> ProjectorResponse:
 def _table(codes: np.ndarray, pictures: Sequence[Any], name: str) -> np.ndarray:
     if len(pictures) != len(codes):
         raise InputError(
-            f"{name} holds {len(pictures)} picture(s) for {len(codes)} codes; one each is needed"
+            f"{name} holds {len(pictures)} picture(s); it must hold {len(codes)}, one for each code"
         )
     for k, picture in enumerate(pictures):
         if not isinstance(picture, Radiance):
@@ -93,7 +93,7 @@ def _table(codes: np.ndarray, pictures: Sequence[Any], name: str) -> np.ndarray:
     dark, bright = (pictures[k].variance[seen].astype(np.float64) for k in (0, -1))
     w, s = 1.0 / np.maximum(dark + bright, 1e-300), L[-1] - L[0]
     # Not weighted: colours that a channel does not light have next to no variance, and would decide alone.
-    if np.sum(s) < _LEAST * np.sqrt(np.sum(dark + bright)):
+    if np.sum(s) < _SIGNIFICANT * np.sqrt(np.sum(dark + bright)):
         raise InputError(f"{name} are no brighter under code 1 than under code 0; {NO_LIGHT}")
     above = (L[1:-1] - L[0]) * s - dark
     g = (above @ w) / np.sum(w * (s**2 - dark - bright))

@@ -19,17 +19,21 @@ from ltcl.errors import InputError
 
 BLACK = 0.05  # of full scale: photographs that reach no more at any exposure show no scene
 NO_LIGHT = "is the lens cap on, the projector off or showing something else, or every exposure far too short?"
-_SEEN = 1 << 14  # pixels that the order of two photographs is told by
-_OFFSET = 0.18  # codes without light that a camera may have: what is darkest may be without light
-_LIT, _PART = 0.03, 0.02  # codes above those, that are light; part of the pixels, for fewer may be stuck
-_CLIPPED = 0.98  # codes above tell nothing of an order
-_RATIO = 1.2  # of seconds, below which two photographs may look alike
-_CHANCE = 3e-5  # of refusing photographs in order: 4 standard deviations where pixels are many
+_COMPARED = (
+    1 << 14
+)  # pixels that decide the order of two photographs: 4 standard errors are 3 % of a deviation
+_CLIPPED = 0.98  # codes above, from 250 of 255 on, may be saturated: no order shows there
+_OFFSET = 0.18  # codes that a camera may have without light: 0.125 of 14 bits raw, and a margin of noise
+_LIT, _SHARE = (
+    0.03,
+    0.02,
+)  # codes above the darkest that are light, 8 of 8 bits; share of the pixels: hot ones
+_CHANCE = 3e-5  # of refusing photographs in order: 4 standard deviations of a normal value
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Stack:
-    """Photographs as given, (K) of (H, W) or (H, W, 3), in ascending order of their seconds.
+    """Photographs, (K) of (H, W) or (H, W, 3), in ascending order of their seconds.
 
     Attributes
     ----------
@@ -55,9 +59,9 @@ class Stack:
         """Height times width."""
         return self.images[0].shape[0] * self.images[0].shape[1]
 
-    def codes(self, k: int, part: Any = slice(None)) -> np.ndarray:
+    def codes(self, k: int, pixels: Any = slice(None)) -> np.ndarray:
         """Photograph k, or some of its pixels, in [0, 1]: float32, (pixels, channels)."""
-        return normalised(self.images[k].reshape(self.pixels, self.channels)[part], self.levels)
+        return normalised(self.images[k].reshape(self.pixels, self.channels)[pixels], self.levels)
 
 
 def normalised(codes: np.ndarray, levels: int) -> np.ndarray:
@@ -71,61 +75,42 @@ def photographs(name: str, images: Any) -> tuple[np.ndarray, ...]:
     """A sequence of pictures of one shape and type, finite, not empty; others are refused by their number."""
     if len(images) == 0:
         raise InputError(f"{name} holds no photograph; there must be one at least")
-    found = tuple(checks.real(f"{name}[{k}]", image) for k, image in enumerate(images))
-    first = found[0]
+    arrays = tuple(checks.real(f"{name}[{k}]", image) for k, image in enumerate(images))
+    first = arrays[0]
     if first.ndim not in (2, 3) or first.shape[2:] not in ((), (3,)) or first.size == 0:
         raise InputError(f"{name}[0] has shape {first.shape}; it must be (H, W) or (H, W, 3), not empty")
     if first.dtype.kind != "f" and first.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{name}[0] holds {first.dtype}; photographs are uint8, uint16 or float")
-    for k, image in enumerate(found):
+    for k, image in enumerate(arrays):
         checks.shape(f"{name}[{k}]", image, first.shape)
         if image.dtype != first.dtype:
             raise InputError(f"{name}[{k}] holds {image.dtype}; it must be {first.dtype}, as {name}[0]")
         if image.dtype.kind == "f":
             checks.finite(f"{name}[{k}]", image)
-    return found
+    return arrays
 
 
 def stack(images: Sequence[Any], seconds: Any, levels: int | None = None) -> Stack:
-    """Photographs and their seconds as a checked `Stack`.
+    """Photographs (uint8, uint16, or floats with 1 for the largest code) and their seconds, checked.
 
-    Parameters
-    ----------
-    images : sequence of (H, W) or (H, W, 3)
-        uint8, uint16, or floats with 1 for the largest code.
-    seconds : (K,)
-        Exposure of each, in any order.
-    levels : int, optional
-        Codes the camera can write, 4096 of 12 bits; None takes 256 or 65536 by the type, and 0 (no rounding)
-        of floats.
-
-    Raises
-    ------
-    InputError
-        No photographs; another shape or type than the first; NaN; seconds that are not as many positive
-        numbers; levels that a photograph exceeds; a longer exposure that is not brighter.
-
-    Examples
-    --------
     >>> dim, bright = np.full((2, 3), 40, np.uint8), np.full((2, 3), 80, np.uint8)
     >>> stack([bright, dim], [0.2, 0.1]).seconds
     array([0.1, 0.2])
     """
-    found = photographs("images", images)
+    arrays = photographs("images", images)
     times = checks.finite("seconds", checks.real("seconds", seconds).astype(np.float64))
-    if times.shape != (len(found),) or times.min() <= 0:
+    if times.shape != (len(arrays),) or times.min() <= 0:
         raise InputError(
-            f"seconds is {seconds!r}; it must be {len(found)} positive number(s), one for each photograph"
+            f"seconds is {seconds!r}; it must be {len(arrays)} positive number(s), one for each photograph"
         )
-    levels = levels_of(found, levels)
     order = np.argsort(times, kind="stable")
-    made = Stack(tuple(found[k] for k in order), times[order], levels)
-    _check_order(made, order)
-    return made
+    bracket = Stack(tuple(arrays[k] for k in order), times[order], levels_of(arrays, levels))
+    _check_order(bracket, order)
+    return bracket
 
 
 def levels_of(images: tuple[np.ndarray, ...], levels: int | None) -> int:
-    """Codes of the camera: as given, where photographs allow it, or by their type; 0 of floats."""
+    """Codes of the camera: `levels`, where photographs allow it, or by their type; 0 of floats."""
     dtype = images[0].dtype
     natural = 0 if dtype.kind == "f" else np.iinfo(dtype).max + 1
     if levels is None:
@@ -140,51 +125,38 @@ def levels_of(images: tuple[np.ndarray, ...], levels: int | None) -> int:
     return levels
 
 
-def _check_order(made: Stack, order: np.ndarray) -> None:
-    """Refuse a photograph that is not brighter than one of fewer seconds."""
-    part = slice(None, None, max(1, made.pixels // _SEEN))
-    for k in range(len(made.images) - 1):
-        ratio = made.seconds[k + 1] / made.seconds[k]
+def _check_order(bracket: Stack, order: np.ndarray) -> None:
+    """Refuse a photograph that is not brighter than one of fewer seconds.
+
+    The mean over all pixels must not fall, and that over lit ones must rise by as much as the fourth root of
+    the seconds, at least: codes of any camera rise more. A dark picture may be as dark at any exposure.
+    """
+    compared = slice(None, None, max(1, bracket.pixels // _COMPARED))
+    for k in range(len(bracket.images) - 1):
+        ratio = bracket.seconds[k + 1] / bracket.seconds[k]
         if ratio == 1.0:
             continue
-        short, long = (made.codes(j, part).astype(np.float64) for j in (k, k + 1))
+        short, long = (bracket.codes(j, compared).astype(np.float64) for j in (k, k + 1))
         seen = np.maximum(short, long) < _CLIPPED
+        # What is darkest of a channel may be its offset.
+        channels = [channel[some] for channel, some in zip(short.T, seen.T, strict=True)]
+        darkest = np.array([np.quantile(codes, 0.01) if codes.size else 0.0 for codes in channels])
+        light = (np.minimum(short, long) - np.where(darkest < _OFFSET, darkest, 0.0))[seen]
         rise = (long - short)[seen]
-        above = (np.minimum(short, long) - _dark(short, seen))[seen]
-        if _falls(rise, made.levels) or (ratio > _RATIO and _stays(rise, above, ratio, made.levels)):
+        # About 4 standard deviations of the noise of one photograph: the median of |a - b| is 0.95 of one.
+        lit = light > max(_LIT, 4.0 * float(np.median(np.abs(rise)))) if rise.size else rise > 0
+        due = light[lit].mean() * (ratio**0.25 - 1.0) if lit.sum() >= max(2, _SHARE * lit.size) else 0.0
+        if _below(rise, 0.0, bracket.levels) or (due > 0 and _below(rise[lit], due, bracket.levels)):
             raise InputError(
-                f"images[{order[k + 1]}] has {made.seconds[k + 1]:g} s and is not brighter than "
-                f"images[{order[k]}] of {made.seconds[k]:g} s; brightness must rise with the seconds"
+                f"images[{order[k + 1]}] has {bracket.seconds[k + 1]:g} s and is not brighter than "
+                f"images[{order[k]}] of {bracket.seconds[k]:g} s; brightness must rise with the seconds"
             )
 
 
-def _falls(rise: np.ndarray, levels: int) -> bool:
-    return len(rise) > 1 and rise.mean() < -_error(rise, levels)
-
-
-def _dark(short: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Codes (channels,) that may be without light, where other channels have offsets of their own."""
-    parts = [part[here] for part, here in zip(short.T, seen.T, strict=True)]
-    darkest = np.array([np.quantile(part, 0.01) if part.size else 0.0 for part in parts])
-    return np.where(darkest < _OFFSET, darkest, 0.0)
-
-
-def _stays(rise: np.ndarray, above: np.ndarray, ratio: float, levels: int) -> bool:
-    """Whether what is lit does not rise; beside it a picture may be as dark at any exposure."""
-    if len(rise) < 2:
+def _below(rise: np.ndarray, due: float, levels: int) -> bool:
+    """Whether the mean of some pixels is below `due` by more than rounding and its error (Student's t)."""
+    if rise.size < 2:
         return False
-    noise = 4.0 * float(np.median(np.abs(rise)))  # about 4 standard deviations of one of them
-    lit = above > max(_LIT, noise)
-    if lit.sum() < max(2, _PART * len(lit)):
-        return False
-    rise, above = rise[lit], above[lit]
-    # Codes rise more than the fourth root of light, or the noise may be all that hides it.
-    least = above.mean() * (ratio**0.25 - 1.0)
-    return bool(np.median(rise) < 0.1 * least and rise.mean() + _error(rise, levels) < least)
-
-
-def _error(rise: np.ndarray, levels: int) -> float:
-    """How far the mean of two pixels or more may be off; a few tell their own noise badly (Student's t)."""
     rounding = 1.0 / (6.0 * levels**2) if levels else 0.0
-    scatter = math.sqrt((rise.var(ddof=1) + rounding) / len(rise))
-    return -float(stdtrit(len(rise) - 1, _CHANCE)) * (scatter + 1.0 / max(levels, 1 << 12))
+    error = math.sqrt((rise.var(ddof=1) + rounding) / rise.size) + 1.0 / max(levels, 1 << 12)
+    return bool(rise.mean() - stdtrit(rise.size - 1, _CHANCE) * error < due)

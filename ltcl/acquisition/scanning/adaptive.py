@@ -11,8 +11,7 @@ C as far as it is found, times W times the pattern. Then the four children e_k m
 
     e_k - v_k r / V,    r = sum_k e_k - e,    V = sum_k v_k + v
 
-of variances v, into which goes a part of what was subtracted. Where noise is small and r is mostly above a
-tenth of e, the set-up has changed between levels, or photographs are mixed up: logged, above 0.3 refused.
+of variances v, into which goes a part of what was subtracted.
 
 Known limit: light that stays at a cell is smooth there. `threshold` is how much of what a camera pixel sees
 under white may be; details below it are lost, sums are not.
@@ -27,16 +26,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import scipy.sparse
 
-from ltcl.acquisition.scanning.cells import Cells
-from ltcl.acquisition.scanning.colouring import colour
+from ltcl.acquisition.scanning.cells import Cells, colour
+from ltcl.acquisition.scanning.codes import all_but_one
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Seen
-from ltcl.acquisition.scanning.pixel import all_but_one
-from ltcl.acquisition.scanning.sums import compare
 
 AT_ONCE = 16  # patterns of a batch
 _TRUST = 0.1  # relative error of what is subtracted for cells that are lit beside
-_SURE, _FEW = 0.05, 8  # relative noise below which cells tell whether they add up, and how many must
-_ODD = 0.1  # relative: what is beside their parents then
 
 
 class Source(Protocol):
@@ -180,8 +175,6 @@ def _divide(
     energy, variance = _measured(found, level, parents, place, kids, groups, pictures, source)
     own = kids[:, place]
     copied = only[place]
-    off = mostly_beside(energy[:, :, ~copied], variance[:, :, ~copied], parents.where(~copied))
-    compare(f"cells of level {level - 1}", off, f"that of level {level}", much=_ODD)
     energy, variance = _balanced(energy, variance, parents)
     energy[:, :, copied] = np.where(own >= 0, 1.0, 0.0)[:, None, copied] * parents.energy[:, copied]
     variance[:, :, copied] = parents.variance[:, copied]
@@ -238,21 +231,6 @@ def _own(
         beside = np.stack([(C @ sums)[pixels] for C in stored])
     variance = picture.variance[:, pixels] + pictures.ambient[:, pixels] + (_TRUST * beside) ** 2
     return picture.value[:, pixels] - beside, variance
-
-
-def mostly_beside(energy: np.ndarray, variance: np.ndarray, parents: Entries) -> float:
-    """How far children are from adding up to their parents: the median, where noise is far below; or NaN.
-
-    >>> one = np.full((1, 8), 1.0)
-    >>> parents = Entries(np.arange(8), np.arange(8), one, 0 * one)
-    >>> mostly_beside(np.stack([0.2 * one] * 4), np.zeros((4, 1, 8)), parents).__round__(3)
-    0.2
-    """
-    noise = np.sqrt(variance.sum(axis=0) + parents.variance)
-    sure = noise < _SURE * parents.energy
-    if np.count_nonzero(sure) < _FEW:
-        return float("nan")
-    return float(np.median(np.abs(energy.sum(axis=0) / np.where(sure, parents.energy, 1.0) - 1.0)[sure]))
 
 
 def _balanced(energy: np.ndarray, variance: np.ndarray, parents: Entries) -> tuple[np.ndarray, np.ndarray]:

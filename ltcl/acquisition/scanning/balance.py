@@ -20,8 +20,10 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture
+from ltcl.errors import ScanRefused
 from ltcl.store import BlockStore
 
+_REFUSED = 0.3  # of white
 SUMS = "scanned.sums"
 """Extra array (channels, N) of a store: row sums of T by its columns, before they were made to add up."""
 
@@ -76,10 +78,10 @@ def sums(store: BlockStore, channel: int) -> np.ndarray:
     return total
 
 
-def beside(sums: np.ndarray, white: Picture) -> float:
-    """How far `sums` (channels, N) are from white, relative to it, where that is known; NaN without light.
+def deviation(sums: np.ndarray, white: Picture) -> float:
+    """Relative root mean square deviation of `sums` (channels, N) from white, NaN without light.
 
-    >>> beside(np.array([[3.0]]), Picture(np.array([[2.0]]), np.array([[0.0]])))
+    >>> deviation(np.array([[3.0]]), Picture(np.array([[2.0]]), np.array([[0.0]])))
     0.5
     """
     known = white.variance < 1e-3 * UNKNOWN
@@ -87,14 +89,31 @@ def beside(sums: np.ndarray, white: Picture) -> float:
     return float(np.sqrt(np.sum((sums - white.value)[known] ** 2) / light)) if light > 0 else float("nan")
 
 
-def mostly_beside(sums: np.ndarray, white: Picture) -> float:
-    """The same of the pixel in the middle, so that a few which saturate count for nothing.
+def check_row_sums(name: str, sums: np.ndarray, white: Picture) -> None:
+    """Refuse a scan whose row sums (channels, N) mostly deviate from white by more than 30 %.
 
-    >>> sums = np.array([[1.1, 0.9, 0.0]])
-    >>> round(mostly_beside(sums, Picture(np.array([[1.0, 1.0, 50.0]]), np.zeros((1, 3)))), 3)
-    0.1
+    It takes a camera of one exposure: others are refused before a batch is kept.
+
+    Raises
+    ------
+    ScanRefused
+        What is committed already cannot be used.
+
+    Examples
+    --------
+    >>> check_row_sums(
+    ...     "T.zarr", np.ones((1, 1)), Picture(2 * np.ones((1, 1)), np.zeros((1, 1)))
+    ... )  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ltcl.errors.ScanRefused: T.zarr: row sums of T mostly deviate by 50 % from the photograph under white ...
     """
     lit = (white.variance < 1e-3 * UNKNOWN) & (white.value > 0)
     if not lit.any():
-        return float("nan")
-    return float(np.median(np.abs(sums - white.value)[lit]) / np.median(white.value[lit]))
+        return
+    median = float(np.median(np.abs(sums - white.value)[lit]) / np.median(white.value[lit]))
+    if median > _REFUSED:
+        raise ScanRefused(
+            f"{name}: row sums of T mostly deviate by {100 * median:.0f} % from the photograph under white "
+            f"(allowed: {100 * _REFUSED:.0f} %); the scene, the light or the exposure changed during the "
+            "scan: acquire into another store"
+        )

@@ -8,63 +8,14 @@ but the calibration, so that a scan which was stopped goes on with the next bloc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Protocol
 
 import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.scanning import thresholds
-from ltcl.acquisition.scanning.hadamard import Hadamard
+from ltcl.acquisition.scanning.codes import Code
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Pictures
-from ltcl.acquisition.scanning.pixel import Pixels
 from ltcl.store import BlockStore
-
-
-class Code(Protocol):
-    """How the pixels of a batch are lit, and its columns found: `Pixels`, `Hadamard`."""
-
-    @property
-    def size(self) -> int:
-        """Pixels of a batch."""
-        ...
-
-    def count(self, pixels: int) -> int:
-        """Patterns for a batch of so many pixels."""
-        ...
-
-    def patterns(self, pixels: int) -> np.ndarray:
-        """(patterns, pixels) bool."""
-        ...
-
-    def decode(
-        self, value: np.ndarray, variance: np.ndarray, ambient: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Columns (pixels or more, M) and their variance."""
-        ...
-
-
-def code_of(strategy: str, grid: tuple[int, int], order: int) -> Code:
-    """The code of a strategy: `Hadamard` of "hadamard", else `Pixels`.
-
-    Two batches at least, so that no pattern is white, which the calibration has photographed already.
-
-    >>> code_of("hadamard", (64, 64), 63), code_of("pixel", (4, 4), 63)
-    (Hadamard(size=63), Pixels(size=8))
-    """
-    half = max(1, grid[0] * grid[1] // 2)
-    if strategy == "hadamard":
-        return Hadamard(min(order, max(1, (1 << (half.bit_length() - 1)) - 1)))
-    return Pixels(min(Pixels().size, half))
-
-
-def patterns(code: Code, n: int) -> int:
-    """Patterns for n pixels.
-
-    >>> patterns(Pixels(4), 10)
-    13
-    """
-    whole, rest = divmod(n, code.size)
-    return whole * code.count(code.size) + (code.count(rest) if rest else 0)
 
 
 def scan(
@@ -82,7 +33,9 @@ def scan(
     missing = sorted({block for _, block in store.missing("columns")})
     lit = {block: _count(code, store, block) for block in range(store.layout.blocks("columns"))}
     tell(sum(count for block, count in lit.items() if block not in missing))
-    pictures.announce(p for block in missing for p in _lit(pictures.grid, code, store, block))
+    pictures.announce(
+        (p for block in missing for p in _lit(pictures.grid, code, store, block)), code.count(code.size)
+    )
     for block in missing:
         _batch(pictures, code, store, block, sigmas, lambda: tell(1))
 
@@ -93,7 +46,12 @@ def _count(code: Code, store: BlockStore, block: int) -> int:
 
 
 def _batch(
-    pictures: Pictures, code: Code, store: BlockStore, block: int, sigmas: float, tell: Callable[[], None]
+    pictures: Pictures,
+    code: Code,
+    store: BlockStore,
+    block: int,
+    sigmas: float,
+    tell: Callable[[], None],
 ) -> None:
     start, stop = store.layout.span(block, "columns")
     taken = pictures.take(_lit(pictures.grid, code, store, block), tell)

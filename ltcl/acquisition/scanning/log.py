@@ -37,9 +37,8 @@ class Log:
         number = self._batches
         while self._written(number):
             number += 1
-        self._pictures.announce(
-            islice(patterns, (number - self._batches) * self._store.layout.block_rows, None)
-        )
+        size = self._store.layout.block_rows
+        self._pictures.announce(islice(patterns, (number - self._batches) * size, None), size)
 
     def _written(self, number: int) -> bool:
         return all((c, number) in self._store.written for c in range(self._pictures.channels))

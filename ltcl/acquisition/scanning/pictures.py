@@ -8,21 +8,24 @@ blocks of the scan, less the ambient light, in units of the light that all chann
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import islice
 from typing import NamedTuple, Self
 
 import numpy as np
 
+from ltcl.acquisition import anchor
+from ltcl.acquisition.agreement import Deviation
 from ltcl.acquisition.calibration import Calibration
-from ltcl.acquisition.exposing import telling
+from ltcl.acquisition.exposure import acquisition_error
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.scanning import exposed, order
-from ltcl.acquisition.scanning.block import Blocks
-from ltcl.errors import AcquisitionError
+from ltcl.acquisition.scanning.cells import Blocks
+from ltcl.acquisition.scanning.checks import Checks, Shot
 from ltcl.store import BlockStore
 
 UNKNOWN = np.float32(1e12)
 """The variance of a value of which nothing is known."""
+_CLEAR = 5.0  # standard deviations of white
 _SEEN = 0.5  # of what a projector pixel is seen by: less of it valid tells nothing
 
 
@@ -99,11 +102,18 @@ class Pictures(Seen):
     def __init__(self, shots: Shots, calibration: Calibration, side: int = 1) -> None:
         super().__init__(calibration, side)
         self.shots = shots
+        self.checks = Checks(calibration, shots.name)
 
-    def announce(self, patterns: Iterable[np.ndarray]) -> None:
-        """Tell the rig of patterns that will be asked for, so that a person can photograph all in one go."""
+    def announce(self, patterns: Iterable[np.ndarray], size: int) -> None:
+        """Tell the rig of patterns that come next, in batches of `size`, to be photographed in one go."""
+        rest = iter(patterns)
+        while batch := list(islice(rest, size)):
+            self.shots.prepare(self._listed([self._codes(part) for part in batch]))
+
+    def _listed(self, batch: list[np.ndarray]) -> list[tuple[np.ndarray, float]]:
+        """What is photographed for a batch of codes: each at all exposures, then the anchor."""
         times = self.calibration.exposures
-        self.shots.prepare((self._codes(part), t) for part in patterns for t in times)
+        return [*((part, t) for part in batch for t in times), (anchor.marked(batch), times[0])]
 
     def take(self, patterns: Iterable[np.ndarray], tell: Callable[[], None]) -> list[Picture]:
         """A picture under each pattern (h, w) of the scan, on where it is not 0; told of each.
@@ -111,50 +121,61 @@ class Pictures(Seen):
         Raises
         ------
         AcquisitionError
-            Photographs do not show their patterns (`exposed`, `order`).
+            Photographs deviate from what is known of them (`checks`).
         """
         patterns = list(patterns)
         codes = [self._codes(pattern) for pattern in patterns]
-        times = self.calibration.exposures
-        self.shots.prepare([(part, t) for part in codes for t in times])
-        found, contradictions = [], []
+        self.shots.prepare(self._listed(codes))
+        merged: list[tuple[Shot, Radiance]] = []
+        deviations: list[tuple[Shot, Deviation]] = []
+        following = None
         for part in codes:
-            images = [self.shots.photograph(part, t) for t in times]
-            contradictions.append(exposed.contradiction(images, self.calibration, part))
-            try:
-                found.append(self._picture(images))
-            except AcquisitionError:
-                exposed.check(contradictions, self._names(len(contradictions)))  # may name an earlier one
-                raise
+            shot = self._photographed(part, self.calibration.exposures)
+            found = self.checks.deviation(shot)
+            following = shot if deviations and following is None else following
+            if found is not None:
+                deviations.append((shot, found))
+            if len(deviations) > 1:
+                break
+            if not deviations:
+                merged.append((shot._replace(images=[]), self._merged(shot)))
             tell()
-        exposed.check(contradictions, self._names(len(found)))
-        value, variance = (np.stack(part) for part in zip(*found, strict=True))
-        lit = np.stack(patterns).reshape(len(found), -1)
-        order.check(lit, value, variance, self.ambient, self.white, self._names(len(found)))
-        return found
+        self.checks.refuse(deviations, following)
+        pictures = [self._picture(light) for _, light in merged]
+        self._check_places(patterns, pictures, [shot.numbers for shot, _ in merged])
+        blocks = self._photographed(anchor.marked(codes), self.calibration.exposures[:1])
+        self.checks.refuse_moved(blocks, merged)
+        return pictures
 
-    def _names(self, count: int) -> Callable[[int], str]:
-        """What the photographs of each of the last `count` pictures are called."""
-        each = len(self.calibration.exposures)
-        before = self.shots.number - each * count
-
-        def name(a: int) -> str:
-            last = before + (a + 1) * each
-            return f"photograph {last}" if each == 1 else f"photographs {last + 1 - each} to {last}"
-
-        return name
+    def _check_places(
+        self, patterns: list[np.ndarray], pictures: list[Picture], numbers: list[range]
+    ) -> None:
+        """Refuse pictures that show other patterns of their batch, where white is well above its noise."""
+        white = self.white.value.sum(axis=0)
+        clear = white > _CLEAR * np.sqrt(self.white.variance.sum(axis=0))
+        value = np.stack([picture.value.sum(axis=0) for picture in pictures])[:, clear] / white[clear]
+        variance = (
+            np.stack([picture.variance.sum(axis=0) for picture in pictures])[:, clear] / white[clear] ** 2
+        )
+        lit = np.stack(patterns).reshape(len(patterns), -1)[:, clear] > 0
+        self.checks.refuse_misplaced(lit, value, variance, numbers)
 
     def _codes(self, pattern: np.ndarray) -> np.ndarray:
         return self.blocks.enlarged(np.asarray(pattern, np.float32))
 
-    def _picture(self, images: list[np.ndarray]) -> Picture:
+    def _photographed(self, codes: np.ndarray, seconds: tuple[float, ...]) -> Shot:
+        images = [self.shots.photograph(codes, t) for t in seconds]
+        return Shot(codes, images, range(self.shots.number + 1 - len(images), self.shots.number + 1))
+
+    def _merged(self, shot: Shot) -> Radiance:
         told = self.calibration
         levels = told.noise.levels or None
-        last = self.shots.number
-        with telling(f"photographs {last + 1 - len(images)} to {last}"):
-            merged = merge(
-                images, told.exposures, told.response, told.noise, levels=levels, black=told.offset
+        with acquisition_error(f"photographs {shot.numbers[0]} to {shot.numbers[-1]}"):
+            return merge(
+                shot.images, told.exposures, told.response, told.noise, levels=levels, black=told.offset
             )
+
+    def _picture(self, merged: Radiance) -> Picture:
         lit = self._on_grid(merged)
         variance = np.where(lit.variance < UNKNOWN, lit.variance / self._scale**2, UNKNOWN)
         known = (variance < UNKNOWN) & (self._dark.variance < UNKNOWN)

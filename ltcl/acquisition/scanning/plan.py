@@ -1,59 +1,52 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a scan takes and gives, said before the first photograph: photographs, time, disk, signal over noise.
+"""Photographs, time, disk space and errors of a scan, before its first photograph.
 
-Of N pixels, direct light d, indirect light g of all pixels together, ambient light a, all in radiance, an
-entry of T off its diagonal is about l = g / N. One photograph of radiance L and t seconds has the variance
-V(L) = variance(L t) / t^2 of the noise model, several are merged as 1 / V = sum_k 1 / V_k. So entries have
+For N pixels with direct light d, indirect light g of all pixels together and ambient light a (radiance), an
+entry of T off its diagonal is about l = g / N. A photograph of radiance L and t seconds has the variance
+V(L) = variance(L t) / t^2 of the noise model; several are merged as 1 / V = sum_k 1 / V_k. Entries have
 
     pixel      V(l + a);  V(d + a) on the diagonal
     hadamard   2 / m V(m l + a) in batches of n pixels, m = (n + 1) / 2 of them lit at a time;
                2 / m (V(d + m l + a) + V(m l + a)) / 2 in the batch of the camera pixel's own light
 
-and where photons of l make the noise the second is twice the first; where reading, rounding or ambient light
-do, it is 2 / m of it. A picture T p of even random light p in [0, 1] sums a row up. Rows are made to add up
-to white, the noisiest entries most, so that of the variances v of a row
+Hadamard doubles the variance where photons of l make the noise, and divides it by m / 2 where reading,
+rounding or ambient light do. A picture T p of random light p in [0, 1] sums a row up; rows are corrected to
+the sum that white shows, the noisiest entries most, so that of the variances v of a row
 
     e^2 = (sum v - sum v^2 / sum v) / 3 / (d + g)^2
 
-is left, relative to T p. An adaptive scan has about K = 3 log4 N cells with V(g / K + a), for all of p, and
-half of its threshold that is spread too smoothly. To each comes `_REST` that the calibration leaves. `choose`
-takes the smallest, and the adaptive scan where it takes fewer photographs at about the same; or where there
-are so many pixels that only it ends in time.
+is left, relative to T p. An adaptive scan has about K = 3 log4 N cells with V(g / K + a) for all of p, and
+spreads half of its threshold too smoothly. `_SYSTEMATIC` is what the calibration adds to each.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
-from ltcl import checks
+from ltcl.acquisition.calibrate import photographs
 from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.radiometry import NoiseModel
-from ltcl.acquisition.scanning import adaptive, columns
-from ltcl.acquisition.scanning.block import Blocks
-from ltcl.acquisition.scanning.cells import Cells
+from ltcl.acquisition.scanning import adaptive, codes
+from ltcl.acquisition.scanning.cells import Blocks, Cells
 
 STRATEGIES = ("adaptive", "pixel", "block", "hadamard")
 MANY = 2048  # pixels from which one at a time, or as many patterns, take too long
-THRESHOLD = 0.004  # of what a camera pixel sees, that a cell is divided for
-_INDIRECT = 0.25  # of what a camera pixel sees under white, unless more is known
-_REST = 0.002  # of T p: response and white
-_ABOUT = 1.5  # times the smallest error: as good
-_BYTES = 12  # of an entry: value, place, variance
+THRESHOLD = 0.004  # of what a camera pixel sees, for which a cell is divided
+_INDIRECT = 0.25  # of what a camera pixel sees under white, unless it is measured: a white corner
+_SYSTEMATIC = 0.002  # relative error of T p by response and white
+_SIMILAR = 1.5  # times the smallest error: fewer photographs count more
+_BYTES = 12  # of an entry: value, index, variance
 
 
 @dataclass(frozen=True)
 class Light:
-    """What a scene is taken to send to the camera: radiance, in linear sensor values a second.
+    """Radiance of a scene, in linear sensor values a second.
 
-    Attributes
-    ----------
-    direct, indirect, ambient : float
-        Of a pixel of its own light; of that of all other pixels together; without the projector.
+    Of a pixel: `direct` from its own light, `indirect` from all others together, `ambient` without projector.
     """
 
     direct: float = 0.5
@@ -61,26 +54,21 @@ class Light:
     ambient: float = 0.01
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Plan:
     """Of one strategy.
 
     Attributes
     ----------
-    strategy : str
+    strategy, why : str
     grid : (h, w)
         Of the transport.
-    patterns, photographs : int
-        Without those of the calibration; of an adaptive scan what a scene like `Light` needs at most.
-    seconds : float
-        Of exposure, and of what the set-up takes for each photograph besides.
-    disk : int
-        Bytes at most.
-    snr_direct, snr_indirect : float
-        Signal over noise of an entry on the diagonal and of one beside it.
-    error : float
-        e, relative, of T p; 1 at most, as where every exposure saturates.
-    why : str
+    patterns, calibration, photographs : int
+        Patterns of the scan (of an adaptive one at most); photographs of the calibration; all of them.
+    seconds, disk : float, int
+        Of all exposures with overhead; bytes at most.
+    snr_direct, snr_indirect, error : float
+        Signal over noise of an entry on the diagonal and of one off it; e of T p, 1 at most.
 
     Examples
     --------
@@ -92,6 +80,7 @@ class Plan:
     strategy: str
     grid: tuple[int, int]
     patterns: int
+    calibration: int
     photographs: int
     seconds: float
     disk: int
@@ -100,17 +89,11 @@ class Plan:
     error: float
     why: str
 
-    def to_json(self) -> str:
-        """One line of JSON."""
-        return json.dumps(asdict(self))
-
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         h, w = self.grid
         return (
-            f"{self.strategy}: {self.photographs} photographs of {self.patterns} patterns for {h} x {w} "
-            f"pixels, {duration(self.seconds)}, {checks.size(self.disk)} at most; signal over noise "
-            f"{self.snr_direct:.3g} (direct), {self.snr_indirect:.2g} (a weak entry); a picture T p is off "
-            f"by {100 * self.error:.2g} %; {self.why}"
+            f"<ltcl Plan {self.strategy}: {self.photographs} photographs, {self.calibration} to calibrate, "
+            f"{h} x {w} pixels, {duration(self.seconds)}, error of T p {100 * self.error:.2g} %>"
         )
 
 
@@ -125,6 +108,7 @@ def plans(
     order: int = 63,
     threshold: float = THRESHOLD,
     overhead: float = 0.0,
+    calibration: int | None = None,
 ) -> dict[str, Plan]:
     """A plan for every strategy.
 
@@ -133,59 +117,93 @@ def plans(
     grid : (h, w)
         Of the projector.
     exposures : sequence of float
-        Seconds of the photographs of each pattern.
+        Seconds of the photographs of each pattern, ascending.
     noise, light
-        Of camera and scene: guesses before there is a photograph, `measured` after the calibration.
+        Guesses before there is a photograph, `measured` after the calibration.
     channels, block, order, threshold
         As in `ltcl.acquire`.
     overhead : float
-        Seconds that each photograph takes beside its exposure.
+        Seconds of each photograph besides its exposure.
+    calibration : int, optional
+        Its photographs; by default as many as `acquisition.calibrate` expects.
     """
     noise, light = noise or NoiseModel(), light or Light()
-    run = _Run(tuple(exposures), noise, light, channels, overhead, threshold)
-    coarse, whys = Blocks(grid, min(block, max(grid))).grid, {"adaptive": "cells divided where it tells"}
-    sizes = {"adaptive": (grid, _cells(grid, light, threshold), 1)}
-    for name, pixels in (("pixel", grid), ("block", coarse), ("hadamard", grid)):
-        code = columns.code_of(name, pixels, order)
-        lit = code.size if name == "hadamard" else 1
-        sizes[name] = (pixels, columns.patterns(code, pixels[0] * pixels[1]), lit)
-        whys[name] = f"{code.size} pixels a batch" + (", and their sum" if lit == 1 else "")
-    return {name: run.plan(name, *sizes[name], whys[name]) for name in STRATEGIES}
+    times, white = np.array(exposures, np.float64), light.direct + light.indirect
+    count = photographs(grid, channels=channels) if calibration is None else calibration
+    before = count * (float(np.sqrt(times[0] * times[-1])) + overhead)
+
+    def variance(radiance: float) -> float:
+        x = (radiance + light.ambient) * times
+        t, x = times[x < noise.saturation], x[x < noise.saturation]
+        return float(1.0 / np.sum(t**2 / noise.variance(x))) if t.size else math.inf
+
+    made = {}
+    for name in STRATEGIES:
+        pixels = Blocks(grid, min(block, max(grid))).grid if name == "block" else grid
+        n = pixels[0] * pixels[1]
+        weak = light.indirect / n
+        own, other = variance(light.direct), variance(weak)
+        # Columns are stored twice while they are transposed; an adaptive scan keeps its pictures to the end.
+        if name == "adaptive":
+            patterns, why = (
+                _cells(grid, light, threshold),
+                "cells divided where camera pixels see much of them",
+            )
+            entries, K = n * patterns, max(1.0, 3.0 * math.log(n, 4))
+            square = K * variance(light.indirect / K) + (threshold / 2 * white) ** 2
+        else:
+            code = codes.code_of(name, pixels, order)
+            patterns, why = codes.patterns(code, n), f"{code.size} pixels a batch"
+            entries, size = 2 * n * n, 1
+            if name == "hadamard":
+                size, m = code.size, (code.size + 1) / 2
+                other = 2.0 / m * variance(m * weak)
+                own = (other + 2.0 / m * variance(light.direct + m * weak)) / 2
+            square = _row_variance((own, size), (other, n - size)) / 3.0
+        made[name] = Plan(
+            name,
+            pixels,
+            patterns,
+            count,
+            count + len(times) * patterns,
+            before + patterns * (float(times.sum()) + len(times) * overhead),
+            channels * _BYTES * entries,
+            light.direct / math.sqrt(own),
+            weak / math.sqrt(other),
+            min(math.hypot(math.sqrt(square) / white, _SYSTEMATIC), 1.0),
+            why,
+        )
+    return made
 
 
-def measured(told: Calibration) -> Light:
-    """What the calibration tells of the scene; how much of it is indirect it does not tell.
-
-    An indirect part of a quarter is taken: of a white corner with an albedo of one half.
-    """
-    white, dark = (part.value[part.valid] for part in (told.white, told.ambient))
+def measured(calibration: Calibration) -> Light:
+    """The light of a measured scene; which part of it is indirect is taken as a quarter."""
+    white, dark = (part.value[part.valid] for part in (calibration.white, calibration.ambient))
     lit = float(np.median(white[white > 0.1 * white.max(initial=0.0)])) if white.size else Light().direct
     ambient = max(float(np.median(dark)), 0.0) if dark.size else 0.0
     return Light((1.0 - _INDIRECT) * lit, _INDIRECT * lit, ambient)
 
 
-def choose(given: dict[str, Plan]) -> tuple[str, str]:
-    """The strategy that "auto" takes, and why.
+def choose(plans: dict[str, Plan]) -> tuple[str, str]:
+    """The strategy of "auto", and why: adaptive for many pixels, or with fewer photographs at similar error.
 
     >>> light, photons, reading = Light(ambient=0.0), NoiseModel(2000.0, 0.0), NoiseModel(1e6, 0.01)
     >>> [choose(plans((12, 12), (1.0,), noise, light))[0] for noise in (photons, reading)]
     ['pixel', 'hadamard']
     """
-    names = ("pixel", "hadamard", "adaptive")
-    h, w = given["pixel"].grid
+    h, w = plans["pixel"].grid
     if h * w > MANY:
         return "adaptive", f"{h * w} pixels are more than {MANY}"
-    errors = {name: given[name].error for name in names}
-    best = min(names[:2], key=errors.__getitem__)
-    quick = given["adaptive"].photographs < given[best].photographs
-    chosen = "adaptive" if quick and errors["adaptive"] <= _ABOUT * errors[best] else best
-    each = ", ".join(f"{name} {100 * errors[name]:.2g} %" for name in names)
-    fewer = "fewer" if quick else "no fewer"
-    return chosen, f"a picture T p is off by: {each}; adaptive takes {fewer} photographs at most"
+    errors = {name: plans[name].error for name in ("pixel", "hadamard", "adaptive")}
+    best = min(("pixel", "hadamard"), key=errors.__getitem__)
+    fewer = plans["adaptive"].photographs < plans[best].photographs
+    each = ", ".join(f"{name} {100 * error:.2g} %" for name, error in errors.items())
+    why = f"relative error of a picture T p: {each}; adaptive takes {'' if fewer else 'no '}fewer photographs"
+    return ("adaptive" if fewer and errors["adaptive"] <= _SIMILAR * errors[best] else best), why
 
 
 def duration(seconds: float) -> str:
-    """Time as people read it.
+    """Time for people.
 
     >>> duration(42.0), duration(5000.0)
     ('42 s', '1 h 23 min')
@@ -196,69 +214,10 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
 
 
-@dataclass(frozen=True)
-class _Run:
-    exposures: tuple[float, ...]
-    noise: NoiseModel
-    light: Light
-    channels: int
-    overhead: float
-    threshold: float
-
-    def plan(self, name: str, grid: tuple[int, int], patterns: int, order: int, why: str) -> Plan:
-        n, most, light = grid[0] * grid[1], len(self.exposures), self.light
-        # A block is as bright on its own pixels as one pixel, and sends that much more to the others.
-        own, weak = self._entries(n, order)
-        whole = self._cells(n) if name == "adaptive" else _balanced((own, order), (weak, n - order)) / 3.0
-        lit = light.direct + light.indirect
-        return Plan(
-            name,
-            grid,
-            patterns,
-            most * patterns,
-            patterns * (sum(self.exposures) + most * self.overhead),
-            self._disk(name, n, patterns),
-            light.direct / math.sqrt(own),
-            light.indirect / n / math.sqrt(weak),
-            min(math.hypot(math.sqrt(whole) / lit, _REST), 1.0),
-            why,
-        )
-
-    def _entries(self, n: int, order: int) -> tuple[float, float]:
-        """Variance of an entry in the batch of the camera pixel's own light, and in others."""
-        if order == 1:
-            return self.variance(self.light.direct), self.variance(self.light.indirect / n)
-        on = (order + 1) / 2
-        dim, bright = (
-            self.variance(part + on * self.light.indirect / n) for part in (0.0, self.light.direct)
-        )
-        return (dim + bright) / on, 2.0 / on * dim
-
-    def _cells(self, n: int) -> float:
-        """e^2 (d + g)^2 of an adaptive scan."""
-        cells = max(1.0, 3.0 * math.log(n, 4))
-        lost = self.threshold / 2 * (self.light.direct + self.light.indirect)
-        return cells * self.variance(self.light.indirect / cells) + lost**2
-
-    def variance(self, radiance: float) -> float:
-        """Of one merged picture, at this radiance and the ambient one."""
-        t = np.array(self.exposures)
-        x = (radiance + self.light.ambient) * t
-        usable = x < self.noise.saturation
-        if not usable.any():
-            return math.inf
-        return float(1.0 / np.sum(t[usable] ** 2 / self.noise.variance(x[usable])))
-
-    def _disk(self, name: str, n: int, patterns: int) -> int:
-        # Columns are there twice while they are turned; an adaptive scan keeps its pictures until it ends.
-        entries = n * patterns if name == "adaptive" else 2 * n * n
-        return self.channels * _BYTES * entries
-
-
-def _balanced(*parts: tuple[float, int]) -> float:
+def _row_variance(*parts: tuple[float, int]) -> float:
     """sum v - sum v^2 / sum v of (v, count)s.
 
-    >>> _balanced((100.0, 1), (1.0, 2)).__round__(2), _balanced((math.inf, 1), (1.0, 2))
+    >>> _row_variance((100.0, 1), (1.0, 2)).__round__(2), _row_variance((math.inf, 1), (1.0, 2))
     (3.94, inf)
     """
     whole = sum(v * count for v, count in parts)
@@ -266,9 +225,8 @@ def _balanced(*parts: tuple[float, int]) -> float:
 
 
 def _cells(grid: tuple[int, int], light: Light, threshold: float) -> int:
-    """Patterns of an adaptive scan: no pixel asks for more cells than have its threshold each."""
-    cells = Cells(grid)
-    share = light.indirect / (light.direct + light.indirect)
+    """Patterns of an adaptive scan: a pixel asks at most for as many cells as have its threshold each."""
+    cells, share = Cells(grid), light.indirect / (light.direct + light.indirect)
     active = 1.0 + share / max(threshold, 1e-9)
-    found = sum(4 * min(math.prod(size), active) for size in cells.sizes[1:])
-    return min(math.ceil(found), adaptive.most_patterns(cells))
+    most = sum(4 * min(math.prod(size), active) for size in cells.sizes[1:])
+    return min(math.ceil(most), adaptive.most_patterns(cells))

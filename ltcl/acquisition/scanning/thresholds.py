@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.scanning.block import Blocks
+from ltcl.acquisition.scanning.cells import Blocks
 from ltcl.acquisition.scanning.pictures import UNKNOWN
 
 _STEP = 4  # sides of tiles, from one to the next

@@ -69,11 +69,11 @@ class Rig:
         self.T = light_transport(x, y, grid)
         self.shape, self.noise, self.indirect, self.gamma = x.shape, noise, indirect, gamma
         self.bits, self.albedo, self.full = bits, albedo, full
-        self.rng, self.taken = np.random.default_rng(seed), 0
+        self.rng, self.count = np.random.default_rng(seed), 0
 
     def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
         """The scene under `codes`; `full` seconds give the albedo its own value."""
-        self.taken += 1
+        self.count += 1
         light = codes.astype(np.float64) ** self.gamma
         image = self.albedo * (self.T @ light.ravel()).reshape(self.shape) + self.indirect * light.mean()
         image = image * seconds / self.full + self.noise * self.rng.standard_normal(self.shape)

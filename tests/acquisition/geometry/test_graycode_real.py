@@ -2,8 +2,7 @@
 """Photographs of a real projector and camera: ../shared/data/graycode-real.
 
 42 photographs, 1280 x 1024, of Gray code for 1024 x 768 in OpenCV's order, and the authors' calibration.
-What was found out about them by measurement: the authors count a step of the code as two projector pixels;
-squares of the chessboard are 75 of their units wide.
+The authors count a step of the code as two projector pixels.
 """
 
 from __future__ import annotations
@@ -40,24 +39,26 @@ def board(photographs) -> np.ndarray:
     return cv2.fillConvexPoly(np.zeros(photographs[0].shape, np.uint8), hull, 1) > 0
 
 
-def test_what_is_lit_is_decoded_and_what_is_not_is_not(photographs, found, board):
+def test_lit_pixels_are_decoded_and_others_are_not(photographs, found, board):
     lit = photographs[40].astype(float) - photographs[41]
     assert found.valid[lit > 30].mean() > 0.9  # translucent tape washes out the finest stripes
     assert found.valid[board & (lit > 60)].mean() > 0.999  # the white squares
     assert found.valid[lit < 5].mean() < 0.03
-    assert found.confidence[found.valid].min() >= 0
     assert found.confidence[board & (lit > 60)].mean() > 0.2
 
 
 @pytest.mark.parametrize("subpixel", [False, True])
 def test_the_board_is_a_plane(photographs, found, board, subpixel):
     """But for distortion of the two lenses, a homography takes one picture of a plane to the other."""
-    chosen = found if subpixel else decode(photographs, GRID, subpixel=False)
-    _, distance = chosen.homography(board)
-    off = distance[board & chosen.valid]
-    assert np.median(off) < (0.15 if subpixel else 0.4)
-    assert np.sqrt(np.mean(off**2)) < (0.25 if subpixel else 0.45)
-    assert np.mean(off > 1.0) < (0.001 if subpixel else 0.005)
+    decoded = found if subpixel else decode(photographs, GRID, subpixel=False)
+    chosen = board & decoded.valid
+    camera = np.stack(np.nonzero(chosen)[::-1], axis=1).astype(np.float64)
+    projector = np.stack([decoded.x[chosen], decoded.y[chosen]], axis=1).astype(np.float64)
+    H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
+    distance = np.linalg.norm(cv2.perspectiveTransform(camera[:, None], H)[:, 0] - projector, axis=1)
+    assert np.median(distance) < (0.15 if subpixel else 0.4)
+    assert np.sqrt(np.mean(distance**2)) < (0.25 if subpixel else 0.45)
+    assert np.mean(distance > 1.0) < (0.001 if subpixel else 0.005)
 
 
 def test_the_calibration_of_the_authors_agrees(shared_data, found, board):
@@ -83,8 +84,3 @@ def test_the_calibration_of_the_authors_agrees(shared_data, found, board):
     flat = X - X.mean(axis=0)
     spread = np.linalg.svd(flat, full_matrices=False)[1] / np.sqrt(len(X))
     assert spread[2] < 0.02 * spread[1]  # the board is flat
-
-
-def test_a_missing_photograph_is_missed(photographs):
-    with pytest.raises(ValueError, match="photographs are 41; they must be 42"):
-        decode(photographs[:-1], GRID)

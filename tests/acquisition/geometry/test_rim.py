@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The rim of the projector's picture, where no stripes end: what cameras anywhere before it tell."""
+"""The rim of the projector's picture, where no stripes end: seen by cameras anywhere."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, deco
 from tests.acquisition.scanning.helpers import corner
 
 GRID = (8, 16)
+random = np.random.default_rng()
 
 
 def placed(seed: int) -> tuple[Any, tuple[int, int]]:
@@ -43,30 +44,29 @@ def at_the_rim(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("high_frequency", [False, True])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_places_are_known_up_to_the_rim(seed: int, high_frequency: bool) -> None:
     place, camera = placed(seed)
     C = camera_map(place, camera, GRID, points=24)
     photographs = [(C @ p.ravel()).reshape(camera) for p in GrayCode(GRID, high_frequency).patterns()]
     found = decode(photographs, GRID, high_frequency=high_frequency)
     x, y = truth(place, camera)
-    off = np.hypot(found.x - x, found.y - y)
+    deviation = np.hypot(found.x - x, found.y - y)
     rim = found.valid & at_the_rim(x, y)
     assert rim.sum() > 100
-    assert np.sqrt(np.mean(off[rim] ** 2)) < 0.04
-    assert off[rim].max() < 0.08
-    assert np.sqrt(np.mean(off[found.valid & ~rim] ** 2)) < 0.03
+    assert np.sqrt(np.mean(deviation[rim] ** 2)) < 0.04
+    assert deviation[rim].max() < 0.08
+    assert np.sqrt(np.mean(deviation[found.valid & ~rim] ** 2)) < 0.03
 
 
-@pytest.mark.parametrize("seed", [*range(8), 16, 25])
+@pytest.mark.parametrize("seed", [0, 1, 16, 25])
 def test_light_of_the_outermost_pixels_comes_out(seed: int) -> None:
     """A scene with light between its walls, ambient light and a camera of 12 bits."""
     place, camera = placed(seed)
     C = camera_map(place, camera, GRID, points=24)
     options: dict[str, Any] = {"bits": 12, "response": "srgb", "ambient": 0.01, "seed": seed}
-    R = Resampling.of(
-        measure(Shots(VirtualRig(corner(), GRID, camera_grid=camera, camera_map=C, **options)), GRID)
-    )
+    rig = VirtualRig(corner(), GRID, camera_grid=camera, camera_map=C, **options)
+    R = Resampling.of(measure(Shots(rig), GRID, seconds=0.3))
     area = np.asarray(C.sum(axis=0)).reshape(GRID)
     wholly = area > 0.97 * area.max()
     assert R.seen[wholly].all()
@@ -75,13 +75,13 @@ def test_light_of_the_outermost_pixels_comes_out(seed: int) -> None:
     white = R.apply(np.asarray(C @ np.ones(np.prod(GRID))).reshape(camera))
     assert np.abs(white - 1)[wholly].max() < 0.03
     assert np.sqrt(np.mean((white - 1)[wholly & rim] ** 2)) < 0.006
-    for p in np.random.default_rng(1).random((3, np.prod(GRID))):
+    for p in random.random((3, np.prod(GRID))):
         light = corner() @ p
         wrong = (R.apply(np.asarray(C @ light).reshape(camera)) - light.reshape(GRID))[R.seen]
         assert np.linalg.norm(wrong) < 0.006 * np.linalg.norm(light.reshape(GRID)[R.seen])
 
 
-@pytest.mark.parametrize("shift", np.linspace(0, 1, 9)[1:])
+@pytest.mark.parametrize("shift", [0.25, 0.5, 0.75, 1.0])
 def test_borders_along_rows_of_camera_pixels_are_shared_by_their_part(shift: float) -> None:
     """A camera that is not turned: all pixels of a row straddle alike, and an error would be that of all."""
     size, (h, w) = 3.7, GRID
@@ -106,13 +106,12 @@ def test_a_camera_that_lies_on_the_borders_sees_no_stripes_that_are_not_there() 
 
     camera = (int(size * GRID[0]) + 9, int(size * GRID[1]) + 9)
     C = camera_map(place, camera, GRID, points=24)
-    rng = np.random.default_rng(3)
     photographs = [
-        (C @ p.ravel()).reshape(camera) + 0.003 * rng.standard_normal(camera)
+        (C @ p.ravel()).reshape(camera) + 0.003 * random.standard_normal(camera)
         for p in GrayCode(GRID, high_frequency=True).patterns()
     ]
     found = decode(photographs, GRID, high_frequency=True)
     x, y = truth(place, camera)
-    off = np.hypot(found.x - x, found.y - y)[found.valid]
+    deviation = np.hypot(found.x - x, found.y - y)[found.valid]
     assert found.valid.sum() > 0.7 * C.sum()
-    assert off.max() < 0.3
+    assert deviation.max() < 0.3

@@ -20,10 +20,9 @@ from ltcl.acquisition import (
     acquire,
     camera_map,
     forecast_picture,
-    measuring,
 )
-from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling
-from ltcl.acquisition.geometry.sharpness import Sharpness, leak
+from ltcl.acquisition.calibrate import measure as calibrate
+from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness
 from ltcl.acquisition.radiometry import Response
 from ltcl.acquisition.rig import Shots
 from ltcl.errors import AcquisitionError, FileError
@@ -32,6 +31,7 @@ from ltcl.store import BlockStore
 from ..scanning.helpers import corner
 
 GRID = (8, 16)
+random = np.random.default_rng()
 LINE = Response(np.array([[-0.004 / 0.996, 1.0]]))
 
 
@@ -46,28 +46,34 @@ def shown(codes: np.ndarray, q: tuple[float, float]) -> np.ndarray:
 @pytest.mark.parametrize("q", [(0.0, 0.0), (0.1, 0.3), (0.45, 0.02)])
 @pytest.mark.parametrize("grid", [(8, 16), (32, 40)])
 @pytest.mark.parametrize("narrow", [False, True])
-def test_leaks_are_measured(q: tuple[float, float], grid: tuple[int, int], narrow: bool) -> None:
+def test_blur_is_measured(q: tuple[float, float], grid: tuple[int, int], narrow: bool) -> None:
     """With noise and with light from elsewhere, which is even; of walls that are not."""
-    rng = np.random.default_rng(3)
-    albedo = rng.uniform(0.3, 0.9, grid)
-    taken = [
-        (codes, albedo * (shown(codes, q) + 0.2 * codes.mean()) + 0.003 * rng.normal(size=grid))
+    albedo = random.uniform(0.3, 0.9, grid)
+    photographs = [
+        (codes, albedo * (shown(codes, q) + 0.2 * codes.mean()) + 0.003 * random.normal(size=grid))
         for codes in GrayCode(grid, narrow).patterns()
     ]
-    found = leak(Resampling.aligned(grid), [(a.astype(np.float32), b.astype(np.float32)) for a, b in taken])
-    assert found is not None
-    np.testing.assert_allclose(found, q, atol=0.02)
+    photographs = [(codes, image.astype(np.float32)) for codes, image in photographs]
+    found = Sharpness.of(Correspondence.aligned(grid), Resampling.aligned(grid), photographs)
+    np.testing.assert_allclose(found.leak, q, atol=0.02)
 
 
-def test_too_few_patterns_tell_nothing() -> None:
-    taken = [(codes, codes) for codes in GrayCode((8, 8)).patterns()]
-    assert leak(Resampling.aligned((8, 8)), taken[:8]) is None
-    assert leak(Resampling.aligned((8, 8)), ()) is None
+def test_with_too_few_patterns_the_map_decides() -> None:
+    """Three pairs of photographs without blur are too few; camera pixels half a pixel further mix two."""
+    y, x = np.mgrid[: GRID[0], : GRID[1]] * 1.0
+    half = Correspondence(x - 0.5, y - 0.5, np.ones(GRID), np.ones(GRID, bool), GRID)
+    R = Resampling.of(half)
+    photographs = [(codes, codes) for codes in GrayCode(GRID).patterns()]
+    for part in (photographs[:6], ()):
+        found = Sharpness.of(half, R, part)
+        assert all(0.3 < q < 0.6 for q in found.leak)
+        with pytest.raises(AcquisitionError, match="camera pixels are"):
+            found.check()
 
 
 @pytest.mark.parametrize("q", [(0.1, 0.1), (0.2, 0.3), (0.4, 0.0)])
-def test_pictures_of_noise_are_off_by_that(q: tuple[float, float]) -> None:
-    p = np.random.default_rng(0).random((200, 200))
+def test_blur_is_the_error_of_pictures_of_noise(q: tuple[float, float]) -> None:
+    p = random.random((200, 200))
     wrong = np.linalg.norm(shown(p, q) - p) / np.linalg.norm(p)
     assert Sharpness(q, 0.2).blur == pytest.approx(wrong, rel=0.15)
 
@@ -89,105 +95,83 @@ def view(size: float, blur: float = 0.0) -> tuple[scipy.sparse.csr_array, tuple[
 
 def camera(size: float, blur: float = 0.0, T: Any = None, **options: Any) -> VirtualRig:
     C, grid = view(size, blur)
-    told = {"bits": 12, "response": "linear", "ambient": 0.01, **options}
-    return VirtualRig(corner() if T is None else T, GRID, camera_grid=grid, camera_map=C, **told)
+    options = {"bits": 12, "response": "linear", "ambient": 0.01, **options}
+    return VirtualRig(corner() if T is None else T, GRID, camera_grid=grid, camera_map=C, **options)
 
 
-def wrong(made: Calibration, C: Any) -> float:
-    """How far pictures of noise are off on the projector's grid, after one scale."""
-    R = made.resampling
-    seen = R.seen.ravel()
-    P = np.random.default_rng(7).random((GRID[0] * GRID[1], 6))
-    ours, theirs = (R.weights @ (C @ (corner() @ P)))[seen], (corner() @ P)[seen]
-    scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
-    return float(np.linalg.norm(scale * ours - theirs) / np.linalg.norm(theirs))
-
-
-@pytest.mark.parametrize(("size", "blur"), [(3.5, 0.0), (1.4, 0.0), (3.5, 0.9), (2.5, 0.9)])
-def test_what_is_told_is_how_far_pictures_are_off(size: float, blur: float, caplog: Any) -> None:
-    """Sharp, coarse, out of focus; and there is a warning of each that is bad, none of the first.
+@pytest.mark.parametrize(
+    ("size", "blur"), [(3.7, 0.0), (2.5, 0.0), (1.4, 0.0), (3.5, 0.9), (2.5, 0.9)], ids=str
+)
+def test_reported_blur_is_the_error_of_pictures(size: float, blur: float, caplog: Any) -> None:
+    """Sharp twice, coarse, out of focus; a warning of each that is bad; no plain wall is doubtful.
 
     Uneven light passes for a q of up to 0.02, which blurs by 2 %.
     """
     with caplog.at_level(logging.WARNING):
-        found = measuring.measure(Shots(camera(size, blur)), response=LINE)
-    assert found.sharpness is not None
-    truth = wrong(found, view(size, blur)[0])
-    assert 0.6 * truth < found.sharpness.blur < 1.6 * truth + 0.02
-    assert ("fine detail are off" in caplog.text) == (truth > 0.02)
+        calibration = calibrate(Shots(camera(size, blur)), response=LINE)
+    R = calibration.resampling
+    P = random.random((GRID[0] * GRID[1], 6))
+    exact, seen = corner() @ P, R.seen.ravel()
+    ours, theirs = (R.weights @ (view(size, blur)[0] @ exact))[seen], exact[seen]
+    scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
+    truth = np.linalg.norm(scale * ours - theirs) / np.linalg.norm(theirs)
+    assert calibration.sharpness is not None
+    assert 0.6 * truth < calibration.sharpness.blur < 1.6 * truth + 0.02
+    assert ("camera pixels are" in caplog.text) == (truth > 0.02)
+    assert R.doubtful is not None
+    assert not R.doubtful.any()
 
 
 def test_a_hopeless_camera_is_refused_before_the_scan() -> None:
-    with pytest.raises(AcquisitionError, match=r"does not tell the projector's pixels apart: .* closer"):
+    with pytest.raises(AcquisitionError, match=r"camera pixels are .* closer"):
         acquire(camera(0.95), strategy="pixel", response=LINE)
 
 
-def test_a_map_that_was_given_tells_as_well() -> None:
-    """Camera pixels half a pixel aside mix two of the projector's along each axis."""
-    y, x = np.mgrid[: GRID[0], : GRID[1]] * 1.0
-    half = Correspondence(x - 0.5, y - 0.5, np.ones(GRID), np.ones(GRID, bool), GRID)
-    with pytest.raises(AcquisitionError, match="does not tell"):
-        Sharpness.of(half, Resampling.of(half)).check()
-
-
-def test_it_is_kept_told_and_forecast(tmp_path: Path) -> None:
+def test_it_is_stored_reported_and_forecast(tmp_path: Path) -> None:
     """Out of focus: the store has it, the report says it, and forecasts are as large as the error."""
-    made, path = camera(3.0, 1.0), tmp_path / "T.zarr"
-    T = acquire(made, strategy="hadamard", store=path, response=LINE)
-    kept = Calibration.of(path).sharpness
-    assert kept is not None
-    told = Report.of(path)
-    assert (told.sharpness, told.blur) == (kept.own, kept.blur)
-    assert f"{kept.own:.0%} of a pixel is its own light" in str(told)
+    path = tmp_path / "T.zarr"
+    T = acquire(camera(3.0, 1.0), strategy="hadamard", store=path, response=LINE)
+    stored, report = Calibration.of(path).sharpness, Report.of(path)
+    assert stored is not None
+    assert (report.sharpness, report.blur) == (stored.own, stored.blur)
     assert Setup.of(path).calibration.resampling.doubtful is not None
-    p = np.random.default_rng(2).random(GRID)
+    p = random.random(GRID)
     seen, truth = np.asarray(T @ p).ravel()[~T.masked], (corner() @ p.ravel())[~T.masked]
     scale = (seen @ truth) / (seen @ seen)
-    off = np.linalg.norm(scale * seen - truth) / np.linalg.norm(truth)
+    error = np.linalg.norm(scale * seen - truth) / np.linalg.norm(truth)
     forecast = forecast_picture(path, p, draws=4).ravel()[~T.masked]
-    assert off > 0.05
-    assert 0.5 * off < np.linalg.norm(forecast) / np.linalg.norm(seen) < 1.5 * off
+    assert error > 0.05
+    assert 0.5 * error < np.linalg.norm(forecast) / np.linalg.norm(seen) < 1.5 * error
 
 
-def test_a_dark_patch_beside_bright_walls_is_masked_where_nothing_tells_it(tmp_path: Path) -> None:
+def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_path: Path) -> None:
     """Gray code does not decode in it: pixels at its rim were made of camera pixels of the bright walls."""
-    albedo = np.random.default_rng(3).uniform(0.3, 0.9, GRID)
-    albedo[2:6, 3:7] = 0.02
-    rho = albedo.ravel()
-    part = corner() / 0.6 - np.eye(len(rho))  # light between walls, of rows of albedo 0.6
-    T = rho[:, None] * (np.eye(len(rho)) + part * rho)
-    made, path = camera(3.7, T=T, response="srgb"), tmp_path / "T.zarr"
-    found = acquire(made, strategy="hadamard", store=path)
-    R, told = Calibration.of(path).resampling, Report.of(path)
-    assert R.doubtful is not None
-    patch = np.zeros(GRID, bool)
+    albedo, patch = np.full(GRID, 0.8), np.zeros(GRID, bool)
     patch[2:6, 3:7] = True
-    assert R.doubtful.any()
-    assert not R.doubtful[~patch].any()
-    assert told.doubtful == R.doubtful.mean()
-    assert f"{told.doubtful:.2%} too dark" in str(told)
-    assert found.masked[R.doubtful.ravel()].all()
-    seen = ~found.masked
-    white = np.asarray(found @ np.ones(GRID), np.float64).ravel()[seen]
-    wanted = T.sum(axis=1)[seen]
-    scale = (white @ wanted) / (white @ white)
-    assert (scale * white > 0.5 * wanted).all()
-    rows = np.asarray(found @ np.eye(len(rho), dtype=np.float32).reshape(-1, *GRID)).reshape(len(rho), -1)
-    assert scale * rows.min() > -0.005 * wanted.max()
-
-
-def test_plain_walls_are_not_doubted() -> None:
-    for size in (2.5, 3.7):
-        found = measuring.measure(Shots(camera(size)), response=LINE).resampling
-        assert found.doubtful is not None
-        assert not found.doubtful.any()
+    albedo[patch] = 0.015
+    rho = albedo.ravel()
+    between = corner() / 0.6 - np.eye(len(rho))  # light between walls, of rows of albedo 0.6
+    truth = rho[:, None] * (np.eye(len(rho)) + between * rho)
+    path = tmp_path / "T.zarr"
+    T = acquire(camera(3.7, T=truth, response="srgb"), strategy="hadamard", store=path)
+    doubtful = Calibration.of(path).resampling.doubtful
+    assert doubtful is not None
+    assert doubtful.any()
+    assert not doubtful[~patch].any()
+    assert Report.of(path).doubtful == doubtful.mean()
+    assert T.masked[doubtful.ravel()].all()
+    seen = ~T.masked
+    white, exact = np.asarray(T @ np.ones(GRID), np.float64).ravel()[seen], truth.sum(axis=1)[seen]
+    scale = (white @ exact) / (white @ white)
+    assert (scale * white > 0.5 * exact).all()
+    rows = np.asarray(T @ np.eye(len(rho), dtype=np.float32).reshape(-1, *GRID))
+    assert scale * rows.min() > -0.01 * exact.max()  # what errors of the map make of bright walls
 
 
 def test_a_store_of_an_earlier_ltcl_is_named(tmp_path: Path) -> None:
     path = tmp_path / "T.zarr"
     acquire(VirtualRig(0.5 * np.eye(32), (4, 8), bits=12), geometry="aligned", strategy="pixel", store=path)
     assert Calibration.of(path).sharpness is None
-    assert "sharpness not told" in str(Report.of(path))
 
     class Earlier(BlockStore):
         @property

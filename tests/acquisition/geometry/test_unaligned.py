@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Maps measured with folds and occluders, of a corner with indirect light: what is told and what is not."""
+"""Maps measured with folds and occluders, of a corner with indirect light: what is known and what is not."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ltcl.acquisition.geometry import Resampling, measure
 from tests.acquisition.scanning.helpers import corner
 
 GRID, CAMERA, SIZE = (8, 16), (30, 60), 3.0
+random = np.random.default_rng()
 Place = Callable[[Any, Any], tuple[Any, Any]]
 
 
@@ -84,7 +85,7 @@ def test_light_of_single_pixels_survives_folds_and_occluders(place: Place) -> No
     assert R.seen[area > 4].all()
     clear = area > 7.5  # all of it, or nearly
     assert clear.mean() > 0.5
-    for p in np.random.default_rng(1).random((4, 128)):
+    for p in random.random((4, 128)):
         light = corner() @ p
         seen = R.apply((C @ light).reshape(CAMERA))
         wrong = (seen - light.reshape(GRID))[clear]

@@ -12,23 +12,17 @@ from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.images import from_srgb, to_srgb
 
 Curve = Callable[[np.ndarray], np.ndarray]
-_G, _M = 1.2, 0.25
-
-
-def _film(light: np.ndarray) -> np.ndarray:
-    return (1 + _M**_G) * light**_G / (light**_G + _M**_G)
-
-
-def _film_undone(code: np.ndarray) -> np.ndarray:
-    return _M * (code / (1 + _M**_G - code)) ** (1 / _G)
-
+_G, _M = 1.2, 0.25  # of a film: light^G / (light^G + M^G)
 
 # Light to code and code to light, both of [0, 1].
 CURVES: dict[str, tuple[Curve, Curve]] = {
     "linear": (lambda x: x, lambda c: c),
     "srgb": (to_srgb, from_srgb),
     "gamma2.2": (lambda x: x ** (1 / 2.2), lambda c: c**2.2),
-    "film": (_film, _film_undone),
+    "film": (
+        lambda x: (1 + _M**_G) * x**_G / (x**_G + _M**_G),
+        lambda c: _M * (c / (1 + _M**_G - c)) ** (1 / _G),
+    ),
 }
 
 

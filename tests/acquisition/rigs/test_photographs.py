@@ -1,166 +1,136 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Photographs of every kind come as the camera stored them, with exposure and time; damage is named."""
+"""Photographs of every kind reach a `FolderRig` as the camera stored them; damage and exposures are named."""
 
 from __future__ import annotations
 
 import sys
 import types
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenEXR
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 from ltcl import images
-from ltcl.acquisition.rigs import exif, photographs
-from ltcl.acquisition.rigs.exif import Taken
-from ltcl.errors import AcquisitionError, FileError, LtclError
+from ltcl.acquisition import FolderRig
+from ltcl.errors import AcquisitionError, LtclError
 from tests.acquisition.rigs import camera_files
 
 RNG = np.random.default_rng(8)
 GREY = RNG.integers(0, 256, (5, 7), dtype=np.uint8)
 COLOUR = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
+DEEP = RNG.integers(0, 65536, (5, 7, 3), dtype=np.uint16)
+RAW = np.tile([[1000, 2000], [2000, 3000]], (16, 24))
 
 
-@pytest.mark.parametrize("codes", [GREY, COLOUR])
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp"])
-def test_codes_come_as_they_are(tmp_path: Path, suffix: str, codes: np.ndarray) -> None:
-    images.write(tmp_path / f"a{suffix}", codes / 255, encoding="linear", bits=8)
-    found = photographs.read(tmp_path / f"a{suffix}")
-    assert found.codes.dtype == np.uint8
-    np.testing.assert_array_equal(found.codes, codes)
-    assert found.taken == Taken(None, None)
+def rig(folder: Path, channels: int = 3) -> FolderRig:
+    rig = FolderRig(folder, (1, 1), channels)
+    rig.prepare([([[1.0]], 1 / 30)])
+    return rig
 
 
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_sixteen_bits_come_as_they_are(tmp_path: Path, suffix: str) -> None:
-    codes = RNG.integers(0, 65536, (5, 7, 3), dtype=np.uint16)
-    images.write(tmp_path / f"a{suffix}", codes / 65535, encoding="linear", bits=16)
-    np.testing.assert_array_equal(photographs.read(tmp_path / f"a{suffix}").codes, codes)
+def photograph(folder: Path, channels: int = 3) -> np.ndarray:
+    return rig(folder, channels).photograph([[1.0]], 1 / 30)
 
 
-def test_floats_come_as_they_are(tmp_path: Path) -> None:
+def place(folder: Path, suffix: str) -> Path:
+    rig(folder)
+    return folder / f"photographs/photo_000001{suffix}"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "bits", "codes"),
+    [(suffix, 8, codes) for suffix in (".png", ".tif", ".bmp") for codes in (GREY, COLOUR)]
+    + [(suffix, 16, DEEP) for suffix in (".png", ".tif")],
+)
+def test_codes_are_not_changed(tmp_path: Path, suffix: str, bits: int, codes: np.ndarray) -> None:
+    images.write(place(tmp_path, suffix), codes / (2**bits - 1), encoding="linear", bits=bits)
+    if codes.ndim == 2:
+        with pytest.raises(AcquisitionError, match=rf"photograph 1 \(photo_000001\{suffix}\) is grey"):
+            photograph(tmp_path)
+    else:
+        np.testing.assert_array_equal(photograph(tmp_path), codes)
+    (tmp_path / "shots.json").unlink()
+    np.testing.assert_array_equal(photograph(tmp_path, 1), codes if codes.ndim == 2 else codes[..., 1])
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".exr"])
+def test_floats_are_not_changed(tmp_path: Path, suffix: str) -> None:
     values = RNG.normal(0.5, 1.0, (5, 7, 3)).astype(np.float32)
-    for name in ("a.tif", "a.exr"):
-        images.write(tmp_path / name, values)
-        np.testing.assert_array_equal(photographs.read(tmp_path / name).codes, values)
-    half = values.astype(np.float16)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, {"RGB": half}).write(str(tmp_path / "half.exr"))
-    found = photographs.read(tmp_path / "half.exr").codes
-    assert found.dtype == np.float32
-    np.testing.assert_array_equal(found, half.astype(np.float32))
+    images.write(place(tmp_path, suffix), values)
+    np.testing.assert_array_equal(photograph(tmp_path), values)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
-def test_exif_tells_exposure_and_time(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    camera_files.write(path, COLOUR, 1 / 60, "2026:03:01 12:00:05.25")
-    found = photographs.read(path)
-    assert found.taken.seconds == pytest.approx(1 / 60, rel=1e-4)
-    assert found.taken.time == datetime(2026, 3, 1, 12, 0, 5, 250000)
-    assert found.codes.shape == (5, 7, 3)
-    if suffix != ".jpg":
-        np.testing.assert_array_equal(found.codes, COLOUR)
-
-
-@pytest.mark.parametrize("time", ["    :  :     :  :  ", "yesterday", "2026:13:01 12:00:00", ""])
-def test_times_that_are_none_are_none(tmp_path: Path, time: str) -> None:
-    camera_files.write(tmp_path / "a.jpg", COLOUR, None, time)
-    assert photographs.read(tmp_path / "a.jpg").taken == Taken(None, None)
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), None, "1/30", (1, 30), 10**400])
-def test_exposures_that_are_none_are_none(value: Any) -> None:
-    assert exif.positive(value) is None
-
-
-def test_rotations_are_not_applied(tmp_path: Path) -> None:
-    tags = Image.Exif()
-    tags[0x0112] = 6
-    Image.fromarray(COLOUR).save(tmp_path / "a.png", exif=tags)
-    np.testing.assert_array_equal(photographs.read(tmp_path / "a.png").codes, COLOUR)
+@pytest.mark.parametrize(
+    ("seconds", "good"), [(1 / 30, True), (1 / 31, True), (0.0, True), (1 / 34, False), (1 / 24, False)]
+)
+def test_exposures_of_exif_are_those_of_the_list(
+    tmp_path: Path, suffix: str, seconds: float, good: bool
+) -> None:
+    camera_files.write(place(tmp_path, suffix), COLOUR, seconds)
+    if good:
+        assert photograph(tmp_path).shape == (5, 7, 3)
+    else:
+        with pytest.raises(AcquisitionError, match=rf"exposed for {seconds:.4g} s .* 0\.03333 s"):
+            photograph(tmp_path)
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), suffix=st.sampled_from([".jpg", ".tif", ".png"]))
 def test_damage_gives_one_line_or_a_photograph(tmp_path: Path, data: st.DataObject, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    camera_files.write(path, COLOUR, 1 / 60, camera_files.NOON)
-    good = bytearray(path.read_bytes())
+    for old in (tmp_path / "photographs").glob("*"):
+        old.unlink()
+    path = place(tmp_path, suffix)
+    camera_files.write(path, COLOUR, 1 / 30)
+    content = bytearray(path.read_bytes())
     for _ in range(data.draw(st.integers(1, 4))):
-        good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
-    path.write_bytes(good[: data.draw(st.integers(1, len(good)))])
-    message = f"{path}: "
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content[: data.draw(st.integers(1, len(content)))])
+    message = f"photograph 1 (photo_000001{suffix}) "
     try:
-        assert photographs.read(path).codes.size
-        seconds = exif.read(path).seconds
-        assert seconds is None or 0 < seconds < np.inf
+        assert photograph(tmp_path).size
     except LtclError as error:
         message = str(error)
-    assert message.startswith(f"{path}: ")
+    assert message.startswith(f"photograph 1 (photo_000001{suffix}) ")
     assert "\n" not in message
-
-
-def test_a_damaged_exif_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "a.jpg"
-    path.write_bytes(b"\xff\xd8\xff\xe1\0\4ab")
-    with pytest.raises(FileError, match="EXIF header that cannot be read"):
-        exif.read(path)
-
-
-RAW = np.tile([[1000, 2000], [2000, 3000]], (16, 24))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.1])
 def test_raw_is_linear_and_keeps_its_black(tmp_path: Path, scale: float) -> None:
     raw = np.rint(RAW * scale).astype(np.uint16)
-    camera_files.write_dng(tmp_path / "a.dng", raw, 1 / 30, black=256, white=4095)
-    codes, taken = photographs.read(tmp_path / "a.dng")
+    camera_files.write_dng(place(tmp_path, ".dng"), raw, 1 / 30, black=256, white=4095)
+    codes = photograph(tmp_path)
     assert (codes.shape, codes.dtype) == ((32, 48, 3), np.uint16)
-    wanted = np.array([1000, 2000, 3000]) * scale * 65535 / 4095  # no gain but that of full scale
-    np.testing.assert_allclose(codes, np.broadcast_to(wanted, codes.shape), atol=1.5)
-    assert taken.seconds == pytest.approx(1 / 30, rel=1e-3)
-    assert taken.time == datetime(2026, 3, 1, 12, 0, 0)
+    expected = np.array([1000, 2000, 3000]) * scale * 65535 / 4095  # no gain but that of full scale
+    np.testing.assert_allclose(codes, np.broadcast_to(expected, codes.shape), atol=1.5)
+    camera_files.write_dng(place(tmp_path, ".dng"), raw, 1 / 60, black=256, white=4095)
+    with pytest.raises(AcquisitionError, match=r"exposed for 0\.01667 s"):
+        photograph(tmp_path)
 
 
-def test_raw_of_a_sum_is_the_sum_of_raws(tmp_path: Path) -> None:
-    a, b = np.random.default_rng(4).integers(0, 2000, (2, 32, 48), dtype=np.uint16)
-    for name, raw in [("a", a), ("b", b), ("sum", a + b)]:
-        camera_files.write_dng(tmp_path / f"{name}.dng", raw, 1.0, black=0, white=4095)
-    x, y, z = (photographs.read(tmp_path / f"{name}.dng").codes.astype(int) for name in ("a", "b", "sum"))
-    np.testing.assert_allclose(x + y, z, atol=4)  # a demosaicing that looks for edges bends this
+def test_raw_does_not_depend_on_the_rest_of_the_picture(tmp_path: Path) -> None:
+    bright, codes = RAW.astype(np.uint16), []
+    for _ in range(2):
+        camera_files.write_dng(place(tmp_path, ".dng"), bright, 1 / 30, black=256, white=4095)
+        codes.append(photograph(tmp_path))
+        bright[10:14, 10:14] = 4000
+    np.testing.assert_array_equal(codes[0][20:], codes[1][20:])
 
 
-def test_a_bright_spot_does_not_change_the_scale_of_raw(tmp_path: Path) -> None:
-    bright = RAW.astype(np.uint16)
-    bright[10:14, 10:14] = 4000
-    camera_files.write_dng(tmp_path / "a.dng", RAW.astype(np.uint16), 1.0, black=256, white=4095)
-    camera_files.write_dng(tmp_path / "b.dng", bright, 1.0, black=256, white=4095)
-    a, b = (photographs.read(tmp_path / name).codes for name in ("a.dng", "b.dng"))
-    np.testing.assert_array_equal(a[20:], b[20:])
-
-
-def test_a_broken_raw_is_named(tmp_path: Path) -> None:
-    camera_files.write_dng(tmp_path / "a.dng", RAW, 1.0, black=0, white=4095)
-    good = (tmp_path / "a.dng").read_bytes()
-    for bad in (good[:100], b"no camera wrote this", good[: len(good) // 2]):
-        (tmp_path / "a.dng").write_bytes(bad)
-        with pytest.raises(FileError, match=r"a\.dng: is no readable camera RAW") as error:
-            photographs.read(tmp_path / "a.dng")
-        assert "\n" not in str(error.value)
-
-
-def test_raw_without_rawpy_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.nef").write_bytes(b"raw")
+@pytest.mark.parametrize("part", [slice(100), slice(0), slice(2000)])
+def test_a_broken_raw_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: slice) -> None:
+    path = place(tmp_path, ".dng")
+    camera_files.write_dng(path, RAW, 1 / 30, black=0, white=4095)
+    path.write_bytes(path.read_bytes()[part])
+    with pytest.raises(AcquisitionError, match=r"^photograph 1 \(photo_000001\.dng\) cannot be used: "):
+        photograph(tmp_path)
+    path.write_bytes(b"raw")
     monkeypatch.setitem(sys.modules, "rawpy", None)
     with pytest.raises(AcquisitionError, match=r"ltcl\[camera\]"):
-        photographs.read(tmp_path / "a.nef")
+        photograph(tmp_path)
 
 
 def test_a_raw_that_declares_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,18 +142,9 @@ def test_a_raw_that_declares_too_much_is_refused(tmp_path: Path, monkeypatch: py
 
         def __exit__(self, *_: object) -> None: ...
 
-    (tmp_path / "a.nef").write_bytes(b"raw")
+    place(tmp_path, ".nef").write_bytes(b"raw")
     fake: Any = types.ModuleType("rawpy")
     fake.imread, fake.LibRawError, fake.NotSupportedError = lambda _: Raw(), OSError, OSError
     monkeypatch.setitem(sys.modules, "rawpy", fake)
-    with pytest.raises(LtclError, match="developing the RAW file needs 4096 TiB"):
-        photographs.read(tmp_path / "a.nef")
-
-
-@pytest.mark.parametrize(
-    ("name", "content"), [("a.png", b""), ("a.dng", b""), ("a.gif", b"GIF"), ("a", b"x")]
-)
-def test_what_is_no_photograph_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(FileError):
-        photographs.read(tmp_path / name)
+    with pytest.raises(LtclError, match=r"photo_000001\.nef.*developing the RAW file needs 4096 TiB"):
+        photograph(tmp_path)

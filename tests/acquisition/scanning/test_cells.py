@@ -6,9 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ltcl.acquisition.scanning.block import Blocks
-from ltcl.acquisition.scanning.cells import Cells
-from ltcl.acquisition.scanning.colouring import colour
+from ltcl.acquisition.scanning.cells import Blocks, Cells, colour
 from ltcl.errors import InputError
 from ltcl.operators import Pyramid
 from tests import reference
@@ -50,7 +48,7 @@ def test_blocks(pixels, side):
         assert big[r, c] == x[r // side, c // side]
     for r, c in np.ndindex(blocks.grid):
         part = picture[r * side : (r + 1) * side, c * side : (c + 1) * side]
-        assert blocks.mean(picture)[r, c] == pytest.approx(part.mean())
+        assert blocks.sum(picture)[r, c] == pytest.approx(part.sum())
     with pytest.raises(InputError, match="block is"):
         Blocks(pixels, 0)
 

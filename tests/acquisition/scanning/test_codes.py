@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ltcl.acquisition.scanning import Hadamard, Pixels
-from ltcl.acquisition.scanning.columns import patterns
+from ltcl.acquisition.scanning.codes import patterns
 from ltcl.acquisition.scanning.pictures import UNKNOWN
 from ltcl.errors import InputError
 

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Small stores whose every entry is known, and acquisitions into them that end at a given moment."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+import ltcl
+from ltcl.store import BlockStore
+
+PACKAGE = os.path.dirname(ltcl.__file__)
+
+
+def transport(rows: int = 10, columns: int = 12, channel: int = 0) -> scipy.sparse.csr_array:
+    """(rows, columns) float32 with empty rows and a strong diagonal."""
+    rng = np.random.default_rng([rows, columns, channel])
+    T = np.where(rng.random((rows, columns)) < 0.4, rng.random((rows, columns)), 0.0)
+    np.fill_diagonal(T, 2.0 + channel)
+    T[3:4] = 0.0
+    return scipy.sparse.csr_array(T.astype(np.float32))
+
+
+def variance(T: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
+    """As many variances, each telling where it belongs."""
+    values = np.arange(1, T.nnz + 1, dtype=np.float32)
+    return scipy.sparse.csr_array((values, T.indices, T.indptr), shape=T.shape)
+
+
+def make(path: Path, **options: Any) -> BlockStore:
+    """An empty store for `transport()`: blocks of 3, the last one of less."""
+    given = {"shape": (10, 12), "grid": (3, 4), "camera_grid": (2, 5), "block_rows": 3, **options}
+    return BlockStore.create(path, **given)
+
+
+def part(store: BlockStore, T: scipy.sparse.csr_array, block: int) -> scipy.sparse.csr_array:
+    """The columns of T in a batch, as rows."""
+    start, stop = store.layout.span(block, "columns")
+    return scipy.sparse.csr_array(T[:, start:stop].T)
+
+
+def fill(store: BlockStore, *, with_variance: bool = False, final: bool = True) -> BlockStore:
+    """Every batch of `transport()`."""
+    for channel, block in store.missing():
+        T = transport(*store.layout.shape, channel)
+        V = part(store, variance(T), block) if with_variance else None
+        store.write(channel, block, part(store, T, block), V)
+    if final:
+        store.finalize()
+    return store
+
+
+def whole(store: BlockStore, channel: int = 0) -> np.ndarray:
+    """T of a store, by its rows."""
+    return np.concatenate([store.read(channel, block).toarray() for block in range(store.layout.blocks())])
+
+
+def contents(path: Path) -> dict[str, str]:
+    """SHA-256 of every file by its name."""
+    files = [file for file in path.rglob("*") if file.is_file()]
+    return {str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def acquire(path: Path, told: Callable[[int, int], Any] = lambda c, b: None) -> None:
+    """What an acquisition does: begin or resume, write what is missing, finish; `told` of every block."""
+    sizes: dict[str, Any] = {"shape": (12, 12), "camera_grid": None, "block_rows": 5, "channels": 3}
+    store = BlockStore.open(path, "a") if path.exists() else make(path, **sizes)
+    if not store.final:
+        for channel, block in store.missing():
+            T = transport(12, 12, channel)
+            store.write(channel, block, part(store, T, block), part(store, variance(T), block))
+            told(channel, block)
+        if "response" not in store.extras:
+            store.extra("response", np.arange(5.0))
+        store.update(finished=True)
+        store.finalize(memory=64 * 40)
+
+
+def in_child(work: Callable[[], None]) -> int:
+    """Process id of a child that does `work`, and ends with 0, or with 2 of Ctrl-C."""
+    child = os.fork()
+    if child:
+        return child
+    status = 1
+    try:
+        work()
+        status = 0
+    except KeyboardInterrupt:
+        status = 2
+    finally:
+        os._exit(status)
+
+
+def status_of(child: int) -> int:
+    """0 or the number of the signal, negative."""
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def at_line(number: int, act: Callable[[], None]) -> list[int]:
+    """From here on `act` at the line of ltcl's code with that number; returns the lines so far, growing."""
+    count = [0]
+
+    def line(frame: FrameType, event: str, _: Any) -> Any:
+        if event == "line":
+            count[0] += 1
+            if count[0] == number:
+                act()
+        return line
+
+    def call(frame: FrameType, event: str, _: Any) -> Any:
+        return line if frame.f_code.co_filename.startswith(PACKAGE) else None
+
+    sys.settrace(call)
+    return count
+
+
+def interrupt() -> None:
+    """As Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
+def kill() -> None:
+    """Without a chance to clean up."""
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -1,0 +1,414 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Stores: what is written comes back by rows, plain zarr reads it, and damage to any file is noticed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+import scipy.sparse
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import ltcl
+from ltcl.errors import FileError, InputError, InputTypeError
+from ltcl.store import BlockStore, zarr_arrays
+
+from .stores import fill, make, part, transport, variance, whole
+
+random = np.random.default_rng()
+SQUARE: dict[str, Any] = {"shape": (12, 12), "camera_grid": None, "block_rows": 5}
+
+
+def refused(path: Path, *words: str) -> None:
+    """Assert that `verify` refuses the store in one line that names it and `words`."""
+    with pytest.raises(FileError) as error:
+        BlockStore.open(path).verify()
+    text = str(error.value)
+    assert text.startswith((f"{path}: ", f"{path}/log/"))
+    assert "\n" not in text
+    assert all(word in text for word in words), text
+
+
+@pytest.mark.parametrize("memory", [64, 64 * 20, 1 << 20])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_round_trip_with_any_memory(tmp_path: Path, channels: int, memory: int) -> None:
+    store = make(tmp_path / "T.zarr", channels=channels)
+    fill(store, with_variance=True, final=False)
+    assert (store.final, store.missing(), len(store.written)) == (False, [], 4 * channels)
+    store.finalize(memory=memory)
+    again = BlockStore.open(tmp_path / "T.zarr")
+    assert (again.final, again.missing(), len(again.written)) == (True, [], 4 * channels)
+    for channel in range(channels):
+        T = transport(channel=channel)
+        np.testing.assert_array_equal(whole(again, channel), T.toarray())
+        for block in range(4):
+            start, stop = store.layout.span(block)
+            np.testing.assert_array_equal(again.variance(channel, block), variance(T)[start:stop].data)
+    again.verify()
+    assert sorted(os.listdir(again.path)) == [
+        *(f"channel_{c}" for c in range(channels)),
+        "extra",
+        "zarr.json",
+    ]
+
+
+def test_rows_are_changed_once_even_if_all_is_asked_for_again(tmp_path: Path) -> None:
+    store = fill(make(tmp_path / "T.zarr"), with_variance=True, final=False)
+    left = [3]
+
+    def change(channel: int, first: int, matrix: Any, spread: Any) -> tuple[Any, Any]:
+        left[0] -= 1
+        if left[0] == 0:
+            raise OSError("no more")
+        more = 1.0 + np.arange(first, first + matrix.shape[0])
+        return scipy.sparse.diags_array(more) @ matrix, 2.0 * spread
+
+    with pytest.raises(FileError, match="no more"):
+        store.finalize(memory=64, change=change)
+    assert not store.final
+    store.finalize(memory=64, change=change)
+    T = transport()
+    np.testing.assert_allclose(whole(store), (1.0 + np.arange(10))[:, None] * T.toarray())
+    np.testing.assert_array_equal(store.variance(0, 1), 2.0 * variance(T)[3:6].data)
+
+
+def test_variance_of_some_columns_only_is_unknown_elsewhere(tmp_path: Path) -> None:
+    store = make(tmp_path / "T.zarr")
+    for block in range(4):
+        columns = part(store, transport(), block)
+        store.write(0, block, columns, np.ones(columns.nnz) if block == 2 else None)
+    store.finalize()
+    spread = store.variance(0, 0)
+    assert spread is not None
+    known = (store.read(0, 0).indices >= 6) & (store.read(0, 0).indices < 9)
+    np.testing.assert_array_equal(np.isnan(spread), ~known)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_plain_zarr_reads_it_and_checks_it(tmp_path: Path, dtype: str) -> None:
+    path, T = tmp_path / "T.zarr", transport(12, 12).astype(dtype) * 0.1
+    ltcl.save(path, ltcl.Transport(T, (3, 4), on_dark="mask"))
+    root = zarr.open_group(path, mode="r")
+    assert {name for name, _ in root.groups()} == {"channel_0", "extra"}
+    group = zarr.open_group(path / "channel_0" / "block_000000.0", mode="r")
+    header: Any = group.attrs["binsparse"]
+    values, indices, pointers = (np.asarray(group[n]) for n in ("values", "indices_1", "pointers_to_1"))
+    for name, array in (("values", values), ("indices_1", indices), ("pointers_to_1", pointers)):
+        assert array.dtype == header["data_types"][name]
+    found = scipy.sparse.csr_array((values, indices, pointers), shape=header["shape"])
+    np.testing.assert_array_equal(found.toarray(), T.toarray())
+    assert (values.dtype, len(values)) == (dtype, header["number_of_stored_values"])
+    chunk = path / "channel_0" / "block_000000.0" / "values" / "c" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:-9] + b"x" + chunk.read_bytes()[-8:])
+    with pytest.raises(ValueError, match="checksum"):
+        np.asarray(group["values"])
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 10))
+def test_any_shape_cut_anyhow(
+    tmp_path_factory: pytest.TempPathFactory, rows: int, columns: int, size: int
+) -> None:
+    path = tmp_path_factory.mktemp("store") / "T.zarr"
+    grids = {"shape": (rows, columns), "grid": (1, columns), "camera_grid": (rows, 1)}
+    store = fill(make(path, **grids, block_rows=size))
+    np.testing.assert_array_equal(whole(store), transport(rows, columns).toarray())
+
+
+def test_missing_blocks_are_named_and_written_ones_replaced(tmp_path: Path) -> None:
+    store = make(tmp_path / "T.zarr")
+    for block in (0, 2):
+        store.write(0, block, part(store, transport(), block))
+    twice = part(store, transport() * np.float32(2), 2)
+    store.write(0, 2, twice)
+    np.testing.assert_array_equal(store.read(0, 2).toarray(), twice.toarray())
+    assert store.missing() == [(0, 1), (0, 3)]
+    with pytest.raises(FileError, match=r"2 block\(s\) \(channel, block\) \(0, 1\), \(0, 3\)"):
+        store.finalize()
+    with pytest.raises(FileError, match=r"columns_0.000001.npz: is missing"):
+        store.read(0, 1)
+    with pytest.raises(FileError, match="finalize"):
+        ltcl.load(store.path)
+
+
+@pytest.mark.parametrize("sigmas", [0.0, 0.5])
+def test_first_bounce(tmp_path: Path, sigmas: float) -> None:
+    """Variances of `fill` are 1, 2, ... in the order of the entries; only the first few are far above."""
+    store = make(tmp_path / "T.zarr", **SQUARE, channels=3)
+    fill(store, with_variance=True, final=False)
+    store.finalize(sigmas=sigmas)
+    wanted = []
+    for channel in range(3):
+        T = transport(12, 12, channel)
+        F, sigma = T.diagonal(), np.sqrt(variance(T).diagonal())
+        wanted.append(np.where(sigmas * sigma < F, F, 0.0))
+    np.testing.assert_array_equal(store.extra("first_bounce"), wanted)
+    np.testing.assert_array_equal(store.extra("masked"), (np.array(wanted) <= 0).any(axis=0))
+    assert (np.count_nonzero(wanted) < 33) == (sigmas > 0)
+
+
+@pytest.mark.parametrize("final", [False, True])
+def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
+    store = make(tmp_path / "T.zarr", provenance={"rig": "virtual", "seed": 3})
+    arrays = {}
+    for dtype in ("bool", "uint8", "int64", "float16", "float32", "float64"):
+        for shape in ((), (0,), (3,), (2, 3), (2, 0, 4)):
+            name = f"an.array-{dtype}-{'x'.join(map(str, shape))}"
+            arrays[name] = np.arange(np.prod(shape, dtype=int)).reshape(shape).astype(dtype)
+            store.extra(name, arrays[name])
+    store.update(step=4, name="π")
+    BlockStore.open(store.path, "a").update(step=5)
+    for bad in (float("nan"), object()):
+        with pytest.raises(InputError, match="plain JSON"):
+            store.update(bad=bad)
+    fill(store, final=final)
+    again = BlockStore.open(store.path)
+    again.verify()
+    assert set(arrays) <= set(again.extras)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(again.extra(name), array)
+        assert (again.extra(name).dtype, again.extra(name).shape) == (array.dtype, array.shape)
+    assert again.attributes == {"step": 5, "name": "π"}
+    versions = {"ltcl": ltcl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
+    assert again.provenance == {"versions": versions, "rig": "virtual", "seed": 3}
+    with pytest.raises(InputError, match=r"\.\./escape"):
+        store.extra("../escape", np.ones(2))
+    with pytest.raises(InputTypeError, match="words"):
+        store.extra("words", np.array(["a"]))
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"grid": (3, 5)}, "h \\* w must be 12"),
+        ({"camera_grid": (3, 3)}, "h \\* w must be 10"),
+        ({"camera_grid": None}, "camera_grid is None"),
+        ({"channels": 2}, "channels is 2"),
+        ({"orientation": "diagonals"}, "orientation is 'diagonals'"),
+        ({"block_rows": 0}, "block_rows is 0"),
+        ({"shape": (1 << 31, 1), "grid": (1, 1), "camera_grid": (1 << 31, 1)}, "2147483647"),
+        ({"provenance": {"rig": object()}}, "plain JSON"),
+    ],
+)
+def test_bad_stores_are_not_made(tmp_path: Path, options: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        make(tmp_path / "T.zarr", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_blocks_and_modes_are_refused(tmp_path: Path) -> None:
+    store = make(tmp_path / "T.zarr")
+    good = part(store, transport(), 0)
+    for block, matrix, text in (
+        (0, good[:2], r"matrix has shape \(2, 10\)"),
+        (4, good, "block is 4"),
+        (-1, good, "block is -1"),
+        (0, good * np.nan, "NaN"),
+        (0, good.astype(np.float64) * 1e39, "float32"),
+    ):
+        with pytest.raises(InputError, match=text):
+            store.write(0, block, matrix)
+    for spread in (good[[1, 0, 2]], np.full(good.nnz, -1.0), np.ones(good.nnz + 1)):
+        with pytest.raises(InputError, match="variance"):
+            store.write(0, 0, good, spread)
+    with pytest.raises(InputTypeError, match="matrix is a ndarray"):
+        store.write(0, 0, good.toarray())
+    assert store.written == frozenset()
+    for change in (lambda s: s.write(0, 0, good), lambda s: s.finalize(), lambda s: s.update(a=1)):
+        with pytest.raises(FileError, match="mode 'a'"):
+            change(BlockStore.open(store.path))
+    fill(store)
+    with pytest.raises(FileError, match="final"):
+        BlockStore.open(store.path, "a").write(0, 0, good)
+
+
+def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
+    path, other = tmp_path / "T.zarr", tmp_path / "other"
+    fill(make(path))
+    with pytest.raises(FileError, match="is there already"):
+        make(path)
+    BlockStore.open(path).verify()
+    assert make(path, overwrite=True).written == frozenset()
+    other.mkdir()
+    (other / "thesis.txt").write_text("years of work")
+    for work in (lambda: make(other, overwrite=True), lambda: ltcl.store.zarr_folder.write(other, RECORD)):
+        with pytest.raises(FileError, match="no store of ltcl"):
+            work()
+    assert (other / "thesis.txt").exists()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["T.zarr", "other"]
+    zarr.create_group(tmp_path / "plain")
+    for name, text in (
+        ("nowhere", "no such"),
+        ("other/thesis.txt", "no folder"),
+        (".", "zarr.json"),
+        ("plain", "ltcl"),
+    ):
+        with pytest.raises(FileError, match=text):
+            BlockStore.open(tmp_path / name)
+
+
+RECORD = ltcl.store.Record((np.eye(6),), (2, 3))
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A final store with everything that one can have, but small, and one that grows."""
+    paths = {}
+    for name in ("final", "growing"):
+        store = make(tmp_path_factory.mktemp("damage") / "T.zarr", **SQUARE, provenance={"rig": "π"})
+        store.extra("response", np.linspace(0, 1, 5))
+        store.extra("scalar", np.array(2.0))
+        store.update(step=3)
+        fill(store, with_variance=True, final=name == "final")
+        store.verify()
+        paths[name] = store.path
+    return paths
+
+
+@pytest.fixture(params=["final", "growing"])
+def copy(stores: dict[str, Path], tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    return Path(shutil.copytree(stores[request.param], tmp_path / "T.zarr"))
+
+
+def files(path: Path) -> list[Path]:
+    return sorted(file for file in path.rglob("*") if file.is_file())
+
+
+def test_any_damage_to_any_file_is_noticed(copy: Path) -> None:
+    for file in files(copy):
+        good = file.read_bytes()
+        places = random.choice(len(good), min(len(good), 6), replace=False).tolist()
+        flipped = [good[:k] + bytes([good[k] ^ (1 << k % 8)]) + good[k + 1 :] for k in places]
+        for bad in (*flipped, good[:-1], good[: len(good) // 2], b"", good + b" "):
+            file.write_bytes(bad)
+            refused(copy)
+        file.unlink()
+        if file.parent.name != "log":  # a batch that is not there is one to be written
+            refused(copy, "missing")
+        os.mkfifo(file)
+        refused(copy)
+        file.unlink()
+        (copy.parent / "moved").write_bytes(good)
+        file.symlink_to(copy.parent / "moved")
+        refused(copy)
+        file.unlink()
+        file.write_bytes(good)
+    BlockStore.open(copy).verify()
+
+
+def test_damage_is_noticed_by_loading(stores: dict[str, Path], tmp_path: Path) -> None:
+    path = Path(shutil.copytree(stores["final"], tmp_path / "T.zarr"))
+    for file in files(path / "channel_0"):
+        good = file.read_bytes()
+        if "variance" not in str(file):
+            file.write_bytes(good[:-1] + bytes([good[-1] ^ 128]))
+            with pytest.raises(FileError, match=r"T\.zarr: channel_0/"):
+                ltcl.load(path, on_dark="mask")
+            file.write_bytes(good)
+    (path / "channel_0" / "notes.txt").write_text("x")
+    refused(path, "channel_0/notes.txt")
+
+
+def forge(file: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Change a document and seal it again, as an enemy could."""
+    attributes = json.loads(file.read_bytes())["attributes"]
+    del attributes["checksum"]
+    change(attributes)
+    file.write_bytes(zarr_arrays.seal(attributes))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("schema", 3, "schema 3"),
+        ("schema", 1, "earlier"),
+        ("schema", "x" * 10**5, "schema"),
+        ("shape", [12, 1 << 40], "shape"),
+        ("shape", [12], "shape is"),
+        ("shape", "12 x 12", "shape is"),
+        ("grid", [1 << 20, 1 << 20], "1048576"),
+        ("channels", 1 << 40, "channels is"),
+        ("block_rows", -1, "block_rows is -1"),
+        ("block_rows", None, "block_rows is None"),
+        ("orientation", ["rows"], "orientation is"),
+        ("dtype", "float128", "dtype is"),
+        ("surprise", 1, "surprise"),
+    ],
+)
+def test_hostile_layouts(stores: dict[str, Path], tmp_path: Path, name: str, value: Any, text: str) -> None:
+    path = Path(shutil.copytree(stores["growing"], tmp_path / "T.zarr"))
+    forge(path / "zarr.json", lambda attributes: attributes["ltcl"].update({name: value}))
+    refused(path, text)
+
+
+def test_a_huge_shape_is_only_a_list_of_missing_blocks(stores: dict[str, Path], tmp_path: Path) -> None:
+    path, huge = Path(shutil.copytree(stores["growing"], tmp_path / "T.zarr")), (1 << 31) - 1
+    sizes = {"shape": [huge, huge], "grid": [1, huge], "block_rows": 1 << 12}
+    forge(path / "zarr.json", lambda attributes: attributes["ltcl"].update(sizes))
+    with pytest.raises(FileError, match="indptr"):
+        BlockStore.open(path).read(0, 0)
+    with pytest.raises(FileError, match=r"lacks 524285 block\(s\)"):
+        BlockStore.open(path, "a").finalize()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shape": [1 << 40]},
+        {"shape": [-1]},
+        {"shape": None},
+        {"data_type": "O"},
+        {"codecs": [{"name": "gzip"}]},
+        {"chunk_grid": {}},
+    ],
+)
+def test_declared_terabytes(stores: dict[str, Path], tmp_path: Path, change: dict[str, Any]) -> None:
+    """With all checksums right."""
+    path = Path(shutil.copytree(stores["final"], tmp_path / "T.zarr"))
+    name = "channel_0/block_000000.0/values/zarr.json"
+    (path / name).write_text(json.dumps(json.loads((path / name).read_bytes()) | change))
+    sums = zarr_arrays.manifest(path, ["channel_0", "extra"])
+    forge(path / "zarr.json", lambda attributes: attributes.update(files=sums))
+    with pytest.raises(FileError, match=r"T\.zarr: channel_0/block_000000"):
+        ltcl.load(path, on_dark="mask")
+
+
+@pytest.mark.parametrize("values", [lambda a: a + 100, lambda a: a - 1, lambda a: a[::-1]])
+def test_rows_that_are_none(stores: dict[str, Path], tmp_path: Path, values: Any) -> None:
+    """Written by zarr, with all checksums right."""
+    path = Path(shutil.copytree(stores["final"], tmp_path / "T.zarr"))
+    node = zarr.open_array(path / "channel_0" / "block_000000.0" / "indices_1", mode="a")
+    node[...] = values(np.asarray(node[...]))
+    sums = zarr_arrays.manifest(path, ["channel_0", "extra"])
+    forge(path / "zarr.json", lambda attributes: attributes.update(files=sums))
+    with pytest.raises(FileError, match=r"T\.zarr: channel_0/block_000000"):
+        ltcl.load(path, on_dark="mask")
+
+
+def test_stores_of_schema_1_load(tmp_path: Path) -> None:
+    """One that an earlier ltcl wrote: plain chunks, their SHA-256 in the document of their block."""
+    path = Path(__file__).with_name("schema-1.zarr.zip")
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path)
+    store = BlockStore.open(tmp_path / "T.zarr")
+    store.verify()
+    for channel in range(3):
+        np.testing.assert_array_equal(whole(store, channel), transport(12, 12, channel).toarray())
+    assert store.attributes == {"step": 3}
+    T = ltcl.load(store.path, on_dark="mask")
+    assert np.flatnonzero(T.masked).tolist() == [3]
+    for file in files(store.path):
+        good = file.read_bytes()
+        file.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
+        refused(store.path)
+        file.write_bytes(good)
