@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is known of a set-up once it has been measured (`measuring`): plain arrays in a store, and back."""
+"""What is known of a set-up once it has been measured (`calibrate`): plain arrays in a store, and back."""
 
 from __future__ import annotations
 
