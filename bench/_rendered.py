@@ -18,7 +18,7 @@ import numpy as np
 import scipy.ndimage
 
 import ltcl
-from ltcl.acquisition import Calibration, MitsubaRig, Report, acquire, mitsuba_scene
+from ltcl.acquisition import Calibration, MitsubaRig, Report, acquire
 from ltcl.device import Device
 
 ALBEDO = [(0.8, 0.8, 0.8), (0.4, 0.4, 0.4)]
@@ -42,16 +42,15 @@ def loop(n: int, samples: int, patterns: np.ndarray, device: Device) -> Loop:
     """Acquire a corner of 3 n / 4 x n pixels, and compensate a picture on it."""
     grid = patterns.shape[1:]
     camera = (round(SIZE * grid[0]), round(SIZE * n))
-    common: dict[str, Any] = {"channels": 1, "variant": "scalar_rgb"}
-    scene = mitsuba_scene("dihedral", grid, ALBEDO, camera_grid=camera, baseline=BASELINE)
-    rig = MitsubaRig(scene, grid, samples=samples, bits=12, **common)
+    common: dict[str, Any] = {"channels": 1, "albedo": ALBEDO}
+    place = {"camera_grid": camera, "baseline": BASELINE}
+    rig = MitsubaRig("dihedral", grid, samples=samples, bits=12, **place, **common)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "T.zarr"
         T = acquire(rig, strategy="pixel", store=path, device=device)
         found = Calibration.of(path)
-        own = mitsuba_scene("dihedral", grid, ALBEDO)
         linear = {"projector_response": "linear", "sensitivity": rig.describe()["sensitivity"]}
-        truth = MitsubaRig(own, grid, samples=FINE, seed=9, **linear, **common)
+        truth = MitsubaRig("dihedral", grid, samples=FINE, seed=9, **linear, **common)
         inner = scipy.ndimage.binary_erosion(found.resampling.coverage > 0.8, np.ones((3, 3)))
         unit = _unit(T, truth, inner)
         errors = [_off(unit * np.asarray(T @ p), truth.radiance(p), inner) for p in patterns]

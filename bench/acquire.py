@@ -56,7 +56,7 @@ class Found:
     cost: Cost
     held: float
     sums: float
-    beside_white: float
+    sum_deviation: float
     far: float
     weak: float
     decibels: float
@@ -134,7 +134,7 @@ def measured(truth: Truth, camera: str, strategy: str, device: Device, draws: in
         P = np.repeat(held(truth.n)[..., None], truth.channels, axis=-1)
         ratios, inside = of_bounces(path, T, truth, draws)
         return Found(
-            name, strategy, cost, apart(unit * shown(T, P), truth.seen(P)), sums, report.beside_white,
+            name, strategy, cost, apart(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
             *far(T, truth, unit), compensated(T, truth, unit), ratios, inside,
         )  # fmt: skip
 
@@ -249,7 +249,7 @@ def main() -> None:
         facts[f"{one.name}, far light row by row"] = one.far
         facts[f"{one.name}, direct part, error over forecast"] = one.bounces[0]
         if one.strategy != "adaptive":
-            facts[f"{one.name}, columns beside white before they added up to it"] = one.beside_white
+            facts[f"{one.name}, columns beside white before they added up to it"] = one.sum_deviation
     for cost in costs:
         facts[f"{cost.strategy}, {cost.pixels} pixels, photographs over plan"] = (
             cost.photographs / cost.planned

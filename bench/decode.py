@@ -71,7 +71,7 @@ def actions(code: GrayCode, images: list[np.ndarray], peer: Peer) -> dict[str, C
     """What is timed."""
     return {
         "opencv": peer,
-        "bits": lambda: code.decode(images),
+        "bits": lambda: code.decode(images, edges=False),
         "whole": lambda: decode(images, code.grid, subpixel=False),
         "fraction": lambda: decode(images, code.grid),
     }
@@ -105,7 +105,7 @@ def main() -> None:
     mega = camera[0] * camera[1] / 1e6
     theirs = 2 * mega / times["opencv"]
     questions = {
-        "bits": ("bits, coordinates and confidence", None),
+        "bits": ("bits and coordinates", None),
         "whole": ("and neighbours compared", TARGETS["whole"]),
         "fraction": ("and fractions of a pixel", TARGETS["fraction"]),
     }

@@ -8,7 +8,8 @@ exposed for a third of a stop more, or photographs from there on are JPEG of qua
 
 A fault counts where it moves T p by more than 1 %, relative to the same scan without it, noise included. All
 that count must be refused before their batch is kept, and 95 % of the refusals must name the photograph, or
-the one that it was exchanged with, among at most 4. Of scans without a fault none may be refused.
+the one that it was exchanged with, or one of the JPEGs (the first may be dark, and not changed by it), among
+at most 4. Of scans without a fault none may be refused.
 """
 
 from __future__ import annotations
@@ -219,8 +220,9 @@ class Scan:
                 shown, seen, _ = self.acquired(device, kind, at)
             except AcquisitionError as error:
                 early = not isinstance(error, ScanRefused)  # before anything was kept
-                right = {at, at + 1, at - 1} if kind == "one repeated" else {at, at + 1}
-                named = early and bool(right & numbers(str(error)))
+                first = at - 1 if kind == "one repeated" else at
+                last = count if kind.startswith("JPEG") else at + 1
+                named = early and any(first <= number <= last for number in numbers(str(error)))
                 results.append(Outcome(kind, name, at, count, np.nan, early, named, str(error)))
                 continue
             both = known & seen

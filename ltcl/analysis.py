@@ -75,19 +75,19 @@ class Analysis:
     channels: tuple[ChannelAnalysis, ...]
 
     def __repr__(self) -> str:
-        (h, w), radii = self.grid, ", ".join(f"{one.spectral_radius:.3g}" for one in self.channels)
+        (h, w), radii = self.grid, ", ".join(f"{channel.spectral_radius:.3g}" for channel in self.channels)
         return f"<ltcl Analysis grid {h} x {w}, rho(R) {radii}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.thumbnails import figures  # brings OpenCV
+        from ltcl.images.pictures import thumbnails  # brings OpenCV
 
         bars = {}
-        for one in self.channels:
-            counts = {name: n for name, n in one.products.items() if math.isfinite(n)}
+        for channel in self.channels:
+            counts = {name: n for name, n in channel.products.items() if math.isfinite(n)}
             label = "products: " + ", ".join(f"{name} {n:.0f}" for name, n in counts.items())
             lengths = np.array([*counts.values()])[:, None]
             bars[label] = np.repeat(np.linspace(0, lengths.max(), 64) <= lengths, 4, axis=0)
-        return figures(self, bars)
+        return thumbnails(self, bars)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and dicts for JSON; what is infinite or unknown is None."""

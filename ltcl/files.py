@@ -8,6 +8,7 @@ process: the next writer in a folder removes those of processes that were killed
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import platform
 import re
@@ -21,6 +22,7 @@ from typing import Any
 
 from ltcl.errors import FileError, InputTypeError, LtclError
 
+fcntl: Any = None if os.name == "nt" else importlib.import_module("fcntl")  # Windows: nothing is locked
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 _TEMPORARY = re.compile(rf"\..*-{_HOST}-(\d{{1,9}})-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
 
@@ -34,20 +36,18 @@ def input_file(path: Any) -> Path:
             path.open("rb").close()
     except FileNotFoundError:
         raise FileError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise _refusal(path, "cannot be read", error) from error
-    if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if path.is_dir() else "no regular file"
-        raise FileError(f"{path}: is {kind}; it must be a file")
-    if not status.st_size:
-        raise FileError(f"{path}: the file is empty")
+    if not stat.S_ISREG(status.st_mode) or not status.st_size:
+        kind = "a folder" if path.is_dir() else "empty" if stat.S_ISREG(status.st_mode) else "no regular file"
+        raise FileError(f"{path}: is {kind}; it must be a file with content")
     return path
 
 
 def as_path(path: Any, name: str = "path") -> Path:
-    """Return `path` (str or os.PathLike) as a Path; refuse everything else, and an empty text."""
-    if path == "":
-        raise FileError(f"{name} is ''; it must name a file or a folder")
+    """Return `path` (str or os.PathLike) as a Path; refuse everything else, an empty text, and NUL."""
+    if path == "" or "\0" in str(path):
+        raise FileError(f"{path or name} is {str(path)!r}; it must name a file or a folder")
     try:
         return Path(path)
     except TypeError:
@@ -63,14 +63,12 @@ def unknown_extension(path: Path) -> str:
 def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file under a temporary name; put it at `path` only when the block ends well.
 
-    The temporary lies beside `path` and has its extension. Missing parents are made, and removed on failure.
-    Links are followed; an earlier file's permissions stay. FileError where `path` is no file, or an OSError
-    comes up in the block.
+    The temporary lies next to `path`, with its extension. Missing parents are made, and removed on failure;
+    links are followed, permissions stay. FileError where `path` is no file, or of an OSError in the block.
     """
     with _written(path) as target:
         if target.exists() and not target.is_file():
-            kind = "a folder" if target.is_dir() else "no regular file"
-            raise FileError(f"{path}: is {kind}; a file cannot be written there")
+            raise FileError(f"{path}: is a folder, or no regular file; a file cannot be written there")
         temporary = _temporary(target.parent, target.stem, target.suffix)
         try:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -79,7 +77,7 @@ def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             if target.exists():
                 shutil.copymode(target, temporary)
             os.replace(temporary, target)
-            _flush_folder(target.parent)
+            _flush(target.parent)
         finally:
             temporary.unlink(missing_ok=True)
 
@@ -102,11 +100,11 @@ def fill_folder(path: str | os.PathLike[str], *, replace: bool = False) -> Itera
             files = flush_tree(temporary)
             if joins:
                 _move_into(target, temporary, files)
-            else:
-                if target.exists():
-                    os.replace(target, _earlier(target))
+            elif target.exists():
+                os.replace(target, _earlier(target))
+            if not joins:
                 os.replace(temporary, target)
-            _flush_folder(target.parent)
+            _flush(target.parent)
         finally:
             if replace:
                 restore(target)
@@ -119,6 +117,21 @@ def restore(target: Path) -> None:
     if not os.path.lexists(target) and earlier.exists():
         os.replace(earlier, target)
     shutil.rmtree(earlier, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
+    """One process at a time in a folder; without `wait` the second is refused."""
+    handle = os.open(folder, os.O_RDONLY) if fcntl else -1
+    try:
+        if fcntl:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        yield
+    except BlockingIOError:
+        raise FileError(f"{folder}: another run writes there; wait for it, or give another folder") from None
+    finally:
+        if fcntl:
+            os.close(handle)
 
 
 def sweep(folder: Path) -> None:
@@ -145,32 +158,27 @@ def _earlier(target: Path) -> Path:
 def _move_into(target: Path, temporary: Path, files: list[Path]) -> None:
     moves = [(file, target / file.relative_to(temporary)) for file in files]
     for _, final in moves:  # refuse every clash before the first file moves
-        inner = [p for p in final.parents if target in p.parents]
-        if final.is_dir() or any(p.exists() and not p.is_dir() for p in inner):
+        if final.is_dir() or any(p.exists() and not p.is_dir() for p in final.parents):
             name = final.relative_to(target)
-            raise FileError(f"{target}: {name} cannot be placed there, a name on its way is taken")
+            raise FileError(f"{target}: {name} cannot be placed there, a name in its path is used")
     for file, final in moves:
         final.parent.mkdir(parents=True, exist_ok=True)
         os.replace(file, final)
     for folder in {final.parent for _, final in moves}:
-        _flush_folder(folder)
+        _flush(folder)
 
 
 @contextlib.contextmanager
 def _written(path: str | os.PathLike[str]) -> Iterator[Path]:
     """The place that `path` means, its parents made; an OSError of the block becomes one line about it."""
-    shown, made = as_path(path), []
-    try:
-        target = Path(os.path.realpath(shown))
-    except (OSError, ValueError) as error:  # a NUL byte, a loop of links
-        raise _refusal(shown, "cannot be written", error) from error
+    target, created = Path(os.path.realpath(as_path(path))), []
     try:
         for folder in reversed([p for p in target.parents if not os.path.exists(p)]):
             folder.mkdir(exist_ok=True)
-            made.append(folder)
+            created.append(folder)
         yield target
     except BaseException as error:
-        for folder in reversed(made):
+        for folder in reversed(created):
             with contextlib.suppress(OSError):  # no longer empty: somebody else's by now
                 folder.rmdir()
         if not isinstance(error, OSError) or isinstance(error, LtclError):
@@ -178,33 +186,25 @@ def _written(path: str | os.PathLike[str]) -> Iterator[Path]:
         place = Path(error.filename) if isinstance(error.filename, (str, Path)) else target
         if not (place.is_relative_to(target.parent) or target.is_relative_to(place)):
             raise  # about another file, which the block read
-        raise _refusal(shown, "cannot be written", error) from error
+        raise _refusal(Path(path), "cannot be written", error) from error
 
 
-def _refusal(path: Path, what: str, error: Exception) -> FileError:
-    reason = " ".join(str(getattr(error, "strerror", None) or error).split())
-    return FileError(f"{path}: {what}: {reason}")
+def _refusal(path: Path, what: str, error: OSError) -> FileError:
+    return FileError(f"{path}: {what}: {' '.join((error.strerror or str(error)).split())}")
 
 
 def flush_tree(folder: Path) -> list[Path]:
     """Flush all in a folder to the disk; its files."""
-    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
-    for file in files:
-        _flush(file)
-    for inner in {file.parent for file in files}:
-        _flush_folder(inner)
-    return files
+    places = sorted(folder.rglob("*"))
+    for place in (*places, folder):
+        _flush(place)
+    return [place for place in places if place.is_file()]
 
 
 def _flush(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
-
-
-def _flush_folder(path: Path) -> None:
-    """Makes the rename itself survive a power cut; Windows cannot open a folder, and need not."""
-    with contextlib.suppress(OSError):
-        handle = os.open(path, os.O_RDONLY)
+    """Of a folder this makes a rename survive a power cut; Windows cannot open a folder, and need not."""
+    with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
+        handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
         try:
             os.fsync(handle)
         finally:

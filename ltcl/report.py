@@ -48,9 +48,9 @@ def solution(solved: Solution | tuple[Solution, ...]) -> list[dict[str, Any]]:
     """Facts of a solve, one entry per colour channel, without the solution itself."""
     names = ("method", "iterations", "products", "residual", "residuals", "seconds", "reason", "error")
     return [
-        {name: getattr(one, name) for name in names}
-        | {"status": one.status.name.lower(), "standard_error": _spread(one.standard_error)}
-        for one in (solved if isinstance(solved, tuple) else (solved,))
+        {name: getattr(channel, name) for name in names}
+        | {"status": channel.status.name.lower(), "standard_error": _spread(channel.standard_error)}
+        for channel in (solved if isinstance(solved, tuple) else (solved,))
     ]
 
 

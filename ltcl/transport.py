@@ -132,11 +132,12 @@ class Transport:
         return f"<ltcl Transport {text}>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.thumbnails import figures  # brings OpenCV
+        from ltcl.images.pictures import thumbnails  # brings OpenCV
 
         if self._F is None:
-            return figures(self, {"picture under white": self @ np.ones(self.grid)})
-        return figures(self, {"first bounce": np.moveaxis(self._F.reshape(-1, *self.grid), 0, -1).squeeze()})
+            return thumbnails(self, {"picture under white": self @ np.ones(self.grid)})
+        first_bounce = np.moveaxis(self._F.reshape(-1, *self.grid), 0, -1).squeeze()
+        return thumbnails(self, {"first bounce": first_bounce})
 
     def to_numpy(self) -> np.ndarray:
         """T on the host, dense: (M, N), (3, M, N) in colour, (3, 3, M, N) of blocks; `mixing` is left out."""

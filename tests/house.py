@@ -65,10 +65,7 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
 }
 
 # Where a budget is not met yet: what is reached, which nothing may exceed again.
-_NOT_YET = (
-    "acquisition 10300, store 2412, images 664, cli 2589, tests of these 13600, "
-    "acquire run, around the core 48"
-)
+_NOT_YET = "acquisition 6986, store 1611, tests of these 9777, acquire run, around the core 31"
 REACHED = {
     name: int(most) for name, most in (part.rsplit(" ", 1) for part in re.split(r"(?<=\d), ", _NOT_YET))
 }

@@ -40,9 +40,9 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
         _run(command, capsys)
     exec(from_photographs, names)  # noqa: S102
     rig = names["rig"]
-    seen, wanted = (rig.radiance(names["setup"].codes(names["c"].pattern)), names["wanted"])
-    scale = np.vdot(seen, wanted) / np.vdot(seen, seen)
-    assert np.linalg.norm(scale * seen - wanted) < 0.02 * np.linalg.norm(wanted)
+    seen, target = (rig.radiance(names["setup"].codes(names["c"].pattern)), names["target"])
+    scale = np.vdot(seen, target) / np.vdot(seen, seen)
+    assert np.linalg.norm(scale * seen - target) < 0.02 * np.linalg.norm(target)
 
 
 def _run(command, capsys):

@@ -8,22 +8,25 @@ compared with the radiance L of the others, at pixels where neither is saturated
 
 v is noise, (2 % of x)^2 for inexact exposures and response curves, and (0.1 % of full scale)^2 for the level
 of black. A photograph deviates where the mean of min(z^2, 100) is above 2.5, two pixels left out that may be
-defects; of fewer than 8 pixels, where it is above 27.5. In the same way a photograph is compared with one
-that was taken before (`known`), and sums of patterns and their inverses with each other: all are white.
+defects; of fewer than 8 pixels, where it is above 27.5. Or where the sum of t_k L (x_k - t_k L) over pixels
+exceeds 5 of its standard deviations: an exposure is wrong, and each pixel alone is dim. In the same way a
+photograph is compared with an earlier one (`known`), and sums of patterns and their inverses with each other.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from itertools import combinations, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ltcl.acquisition.radiometry import NoiseModel, Radiance, Response
+from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.errors import AcquisitionError
 
 _SCALE, _FLOOR = 0.02, 0.001  # systematic errors: of light, of full scale
+_BIAS = 0.2  # of the noise without light: common error of all pixels there
 _CLIP, _DEFECTS, _MEAN = 100.0, 2, 2.5
 _SINGLE = 25.0  # z^2 of each of a few pixels, which a single one has by noise once in a million
 _RANGE = 0.95  # of saturation; above, pixels may be clipped
@@ -32,7 +35,6 @@ _SUSPECTS = 4  # photographs with the largest scores
 _PIXELS = 1 << 13  # of a photograph, at most
 ROUGH = NoiseModel(electrons=500.0, read=0.01)
 """Noise of a camera that is not measured yet: more than most have."""
-_INVERSES = "a pattern and its inverse must add up to white, as the other ones do"
 ADVICE = "photographs must be in the order of the list, exposed as listed, and the set-up must not change"
 
 Name = Callable[[int], str]
@@ -47,259 +49,208 @@ class Sensor(NamedTuple):
     offset: Any = 0.0
 
 
-def find_inverses(
-    images: Sequence[np.ndarray], codes: Sequence[np.ndarray], sensor: Sensor
-) -> tuple[int, ...] | None:
-    """Which photographs of a pattern of 0 and 1 and its inverse do not add up as others do, or None."""
-    first = [
-        k
-        for k, (one, other) in enumerate(pairwise(codes))
-        if one.shape == other.shape and np.all(one + other == 1.0) and np.all(one * other == 0.0)
-    ]
-    if len(first) < 3:
-        return None
-    light = Light.of(images, sensor)
-    sums = light.at(first) + light.at([k + 1 for k in first])
-    deviation = _deviation(sums, np.ones(len(first)), len(first))
-    if deviation is None:
-        return None
-    pairs = (deviation.odd if len(deviation.odd) < 3 else ()) or (deviation.last,)
-    return tuple(first[k] + i for k in pairs for i in (0, 1))
-
-
-class Record:
-    """Photographs of a calibration, at some pixels, to be compared when its noise is known.
-
-    Examples
-    --------
-    >>> record, codes = Record(), np.ones((2, 2))
-    >>> for number, light in enumerate((0.2, 0.2, 0.5), 1):
-    ...     record.add(codes, 1.0, np.full((4, 4), light), number)
-    >>> record.check(Sensor(Response.identity()))  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-    ltcl.errors.AcquisitionError: photograph 3 is too bright nearly everywhere: ...
-    """
-
-    def __init__(self) -> None:
-        self._codes: list[np.ndarray] = []
-        self._seconds: list[float] = []
-        self._images: list[np.ndarray] = []
-        self._numbers: list[int] = []
-
-    def add(self, codes: np.ndarray, seconds: float, image: np.ndarray, number: int) -> None:
-        """One photograph, (H, W) or (H, W, c) in [0, 1]."""
-        pixels = spread(image.shape[0] * image.shape[1])
-        self._codes.append(codes)
-        self._seconds.append(seconds)
-        self._images.append(image.reshape(-1, 1, *image.shape[2:])[pixels])
-        self._numbers.append(number)
-
-    def check(self, sensor: Sensor, name: Name = name_number) -> None:
-        """Refuse photographs of one pattern, or of patterns and their inverses, that deviate from each other.
-
-        Where several do, those that deviate first are named.
-
-        Raises
-        ------
-        AcquisitionError
-            It names the photograph, or the few of which one must be wrong.
-        """
-        same: dict[bytes, list[int]] = {}
-        for k, codes in enumerate(self._codes):
-            same.setdefault(codes.tobytes(), []).append(k)
-        findings: list[tuple[int, str]] = []
-        for group in same.values():
-            images, seconds = [self._images[k] for k in group], [self._seconds[k] for k in group]
-            deviation = find_deviation(images, seconds, sensor)
-            if deviation is not None:
-                numbers = [self._numbers[k] for k in group]
-                findings.append((numbers[deviation.last], deviation.describe(numbers, name)))
-        for seconds in sorted(set(self._seconds)):
-            some = [k for k, t in enumerate(self._seconds) if t == seconds]
-            images, codes = [self._images[k] for k in some], [self._codes[k] for k in some]
-            pair = find_inverses(images, codes, sensor)
-            if pair is not None:
-                numbers = [self._numbers[some[k]] for k in pair]
-                both = " or ".join(map(name, numbers))
-                findings.append((numbers[-1], f"{both} deviates: {_INVERSES}"))
-        if findings:
-            raise AcquisitionError(f"{min(findings)[1]}; {ADVICE}")
-
-
-class Light(NamedTuple):
-    """Linear values above black (k, n, c) of k photographs, their variance, and which are not saturated.
-
-    `limit` (k, 1, c): from there on they are saturated.
-    """
-
-    x: np.ndarray
-    variance: np.ndarray
-    usable: np.ndarray
-    limit: np.ndarray
-
-    @classmethod
-    def of(cls, images: Sequence[np.ndarray], sensor: Sensor, pixels: np.ndarray | None = None) -> Light:
-        """Of photographs (H, W[, c]) at some pixels (n,); by default spread over all."""
-        response, noise, offset = sensor
-        pixels = spread(images[0].shape[0] * images[0].shape[1]) if pixels is None else pixels
-        channels = images[0].shape[2] if images[0].ndim == 3 else 1
-        codes = np.stack([np.asarray(image).reshape(-1, channels)[pixels] for image in images])
-        curve = codes if channels > 1 else codes[..., 0]
-        x = response.linear(curve).reshape(codes.shape) - offset
-        variance = noise.variance(x, response.derivative(curve).reshape(codes.shape))
-        variance = variance + (_SCALE * x) ** 2 + _FLOOR**2
-        limit = np.broadcast_to(_RANGE * (noise.saturation - np.asarray(offset)), (len(x), 1, channels))
-        return cls(x, variance, x < limit, limit)
-
-    def at(self, numbers: Sequence[int]) -> Light:
-        """Some of the photographs."""
-        return Light(*(values[list(numbers)] for values in self))
-
-    def __add__(self, other: Light) -> Light:  # pyright: ignore[reportIncompatibleMethodOverride]
-        usable = self.usable & other.usable
-        return Light(self.x + other.x, self.variance + other.variance, usable, self.limit + other.limit)
-
-    def with_known(self, known: Radiance, seconds: float, pixels: np.ndarray) -> Light:
-        """One more, as a photograph of so many seconds would show what is known."""
-        channels = self.x.shape[2]
-        value, variance, valid = (
-            np.asarray(part).reshape(-1, channels)[pixels]
-            for part in (known.value, known.variance, known.valid)
-        )
-        x = np.where(valid, seconds * value, 0.0)
-        variance = np.where(valid, seconds**2 * variance, 0.0) + (_SCALE * x) ** 2 + _FLOOR**2
-        more = (x, variance, valid, np.full(self.limit.shape[1:], np.inf))
-        return Light(*(np.concatenate([a, b[None]]) for a, b in zip(self, more, strict=True)))
-
-    def expected(
-        self, seconds: np.ndarray, use: np.ndarray, k: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What photographs `use` (k,) other than k predict for it, the variance, and where they do."""
-        use = use & (np.arange(len(use)) != k)
-        t = seconds[use][:, None, None]
-        weight = np.where(self.usable[use], t / self.variance[use], 0.0)
-        total = np.sum(weight * t, axis=0)
-        known = total > 0
-        total = np.where(known, total, 1.0)
-        return seconds[k] * np.sum(weight * self.x[use], axis=0) / total, seconds[k] ** 2 / total, known
-
-    def scores(self, seconds: np.ndarray, use: np.ndarray) -> np.ndarray:
-        """How far each photograph of `use` (k,) is from the others: it deviates above 1; 0 elsewhere."""
-        result = np.zeros(len(use))
-        for k in np.flatnonzero(use).tolist():
-            expected, variance, known = self.expected(seconds, use, k)
-            both = known & self.usable[k] & (expected < self.limit[k])
-            z2 = np.minimum((self.x[k] - expected)[both] ** 2 / (self.variance[k] + variance)[both], _CLIP)
-            dim = expected + _SIGMAS * np.sqrt(variance + self.variance[k]) < self.limit[k]
-            saturated = np.count_nonzero(known & ~self.usable[k] & dim)
-            count = z2.size + saturated
-            if count:
-                allowed = _MEAN * count + min(_DEFECTS * _CLIP, _SINGLE * count)
-                result[k] = (z2.sum() + _CLIP * saturated) / allowed
-        return result
-
-    def agree(self, seconds: np.ndarray, use: np.ndarray) -> bool:
-        """Whether photographs `use` (k,) agree."""
-        return bool(self.scores(seconds, use).max(initial=0.0) <= 1.0)
-
-    def change(self, seconds: np.ndarray) -> int:
-        """The first photograph that, with those before, does not agree."""
-        numbers = np.arange(len(seconds))
-        return next(
-            (k for k in range(1, len(seconds)) if not self.agree(seconds, numbers <= k)), len(seconds) - 1
-        )
-
-    def gain(self, seconds: np.ndarray, k: int) -> tuple[float, bool]:
-        """How bright photograph k is relative to the others, at bright pixels; and whether nearly all are."""
-        expected, _, known = self.expected(seconds, np.ones(len(seconds), bool), k)
-        both = known & self.usable[k]
-        if not both.any():
-            return 1.0, False
-        x, expected = self.x[k][both], expected[both]
-        bright = expected >= 0.3 * np.quantile(expected, 0.99)
-        gain = np.median(x[bright] / np.maximum(expected[bright], 1e-9))
-        return float(gain), bool(np.mean(x > expected) > 0.9)
-
-
 class Deviation(NamedTuple):
-    """Photographs `odd` (indices) of one pattern, each of which may be the one that deviates.
+    """Photographs (indices) of which one deviates, or two that are exchanged; and the likely cause."""
 
-    `since`: or all from there on, or None; `gain`: how bright the first is relative to the others, at bright
-    pixels; `uniform`: it is brighter nearly everywhere; `exchanged`: they agree when the two are exchanged.
-    """
-
-    odd: tuple[int, ...]
-    since: int | None = None
-    gain: float = 1.0
-    uniform: bool = False
+    suspects: tuple[int, ...]
+    cause: str
     exchanged: bool = False
 
-    @property
-    def last(self) -> int:
-        """The last photograph that may be the first that deviates."""
-        return max([*self.odd, *([] if self.since is None else [self.since])])
-
     def describe(self, numbers: Sequence[int], name: Name = name_number) -> str:
-        """In one line, with the likely cause."""
-        names = [name(numbers[k]) for k in self.odd]
-        if self.exchanged:
-            return f"{names[0]} and {names[1]} are exchanged"
-        since = None if self.since is None else f"all of its pattern from {name(numbers[self.since])} on"
-        if not names:
-            return f"{since} deviate from those before: the camera, the scene or the light changed"
-        some = " or ".join(names) if len(names) < 4 else f"one of {names[0]} to {names[-1]}"
-        if self.uniform and self.gain > 1.0:
-            cause = "is too bright nearly everywhere: another light was on, or the exposure was too long"
-        elif abs(self.gain - 1.0) > 3 * _SCALE:
-            cause = f"is {self.gain:.2g} times as bright as the others of its pattern"
-        else:
-            cause = "deviates from the others of its pattern: another pattern, or the camera or scene moved"
-        return f"{some} {cause}" + (f"; or {since}" if since else "")
-
-
-def find_deviation(
-    images: Sequence[np.ndarray],
-    seconds: Sequence[float],
-    sensor: Sensor,
-    *,
-    known: Radiance | None = None,
-    pixels: Sequence[np.ndarray] = (),
-) -> Deviation | None:
-    """Which photographs of one pattern deviate, if any; `pixels`: sets (n,) of them, each decides alone."""
-    if len(images) < 2 and known is None:
-        return None
-    for places in pixels or [spread(images[0].shape[0] * images[0].shape[1])]:
-        t = np.asarray(seconds, np.float64)
-        light = Light.of(images, sensor, places)
-        if known is not None:
-            light, t = light.with_known(known, float(t.min()), places), np.append(t, t.min())
-        deviation = _deviation(light, t, len(images))
-        if deviation is not None:
-            return deviation
-    return None
-
-
-def _deviation(light: Light, t: np.ndarray, count: int) -> Deviation | None:
-    """Which of the first `count` photographs deviate; what is known stands behind them."""
-    every = np.ones(len(t), bool)
-    scores = light.scores(t, every)
-    if scores.max(initial=0.0) <= 1.0:
-        return None
-    suspects = [k for k in np.argsort(-scores).tolist() if k < count][:_SUSPECTS]
-    for a, b in combinations(sorted(suspects), 2):
-        order = np.arange(len(t))
-        order[[a, b]] = b, a
-        if t[a] != t[b] and light.agree(t[order], every):
-            return Deviation((a, b), exchanged=True)
-    odd = [k for k in sorted(suspects) if light.agree(t, every & (np.arange(len(t)) != k))]
-    since = light.change(t) if count == len(t) > 2 else None
-    if not odd:
-        return Deviation((0,) if since is None else (), since)
-    gain, uniform = light.gain(t, odd[0])
-    return Deviation(tuple(odd), since if since not in odd else None, gain, uniform)
+        """In one line, of photographs with these numbers."""
+        names = [name(numbers[k]) for k in self.suspects]
+        return f"{(' and ' if self.exchanged else ' or ').join(names)} {self.cause}"
 
 
 def spread(pixels: int | np.ndarray) -> np.ndarray:
     """At most `_PIXELS` of so many pixels, or of an array of their numbers, evenly."""
     numbers = np.arange(pixels) if isinstance(pixels, int) else pixels
     return numbers[:: -(-max(len(numbers), 1) // _PIXELS)]
+
+
+def sample(image: np.ndarray, pixels: np.ndarray | None = None) -> np.ndarray:
+    """A photograph (H, W[, c]) at some pixels, (n, c); by default spread over all."""
+    pixels = spread(image.shape[0] * image.shape[1]) if pixels is None else pixels
+    return image.reshape(-1, image.shape[2] if image.ndim == 3 else 1)[pixels]
+
+
+def find_deviation(
+    samples: Sequence[np.ndarray],
+    seconds: Sequence[float],
+    sensor: Sensor,
+    known: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Deviation | None:
+    """Which photographs of one pattern deviate, if any; each is its codes at the same pixels (`sample`).
+
+    `known`: radiance (n, c) there, ambient light included, and its variance.
+    """
+    if known is None:
+        return _deviation(_Light.of(samples, seconds, sensor), len(samples))
+    return _deviation(_Light.of(samples, seconds, sensor, known[0]).with_known(*known), len(samples))
+
+
+class Record:
+    """Photographs of a calibration, at some pixels, to be compared when its noise is known."""
+
+    def __init__(self) -> None:
+        # Codes, seconds, samples and number of the photographs of one pattern (bytes) and of one exposure.
+        self._groups: dict[bytes | float, list[tuple[Any, ...]]] = defaultdict(list)
+
+    def add(self, codes: np.ndarray, seconds: float, image: np.ndarray, number: int) -> None:
+        """One photograph, (H, W) or (H, W, c) in [0, 1]."""
+        for key in (codes.tobytes(), seconds):
+            self._groups[key].append((codes, seconds, sample(image), number))
+
+    def check(self, sensor: Sensor, name: Name = name_number) -> None:
+        """Raise AcquisitionError where photographs of a pattern, or of it and its inverse, deviate.
+
+        It names the photograph, or the few of which one must be wrong; of several, the first.
+        """
+        findings: list[tuple[int, str]] = []
+        for key, group in self._groups.items():
+            codes, seconds, samples, numbers = zip(*group, strict=True)
+            one_pattern = isinstance(key, bytes)
+            deviation = (
+                find_deviation(samples, seconds, sensor)
+                if one_pattern
+                else _in_inverses(codes, samples, sensor)
+            )
+            if deviation is not None:
+                findings.append((numbers[max(deviation.suspects)], deviation.describe(numbers, name)))
+        if findings:
+            raise AcquisitionError(f"{min(findings)[1]}; {ADVICE}")
+
+
+def _in_inverses(
+    codes: Sequence[np.ndarray], samples: Sequence[np.ndarray], sensor: Sensor
+) -> Deviation | None:
+    """Which photographs of a pattern of 0 and 1 and its inverse, at one exposure, do not add up as others."""
+    first = [
+        k
+        for k, (a, b) in enumerate(pairwise(codes))
+        if a.shape == b.shape and np.all(a + b == 1.0) and np.all(a * b == 0.0)
+    ]
+    if len(first) < 3:
+        return None
+    light = _Light.of(samples, np.ones(len(samples)), sensor)
+    deviation = _deviation(light.at(first) + light.at([k + 1 for k in first]), len(first))
+    if deviation is None:
+        return None
+    pairs = deviation.suspects if len(deviation.suspects) < 3 else deviation.suspects[-1:]
+    cause = "deviates: a pattern and its inverse must add up to white, as the other ones do"
+    return Deviation(tuple(first[k] + i for k in pairs for i in (0, 1)), cause)
+
+
+class _Light(NamedTuple):
+    """Seconds (k, 1, 1) of photographs, linear values x above black (k, n, c) and their variance.
+
+    x is inf from `limit` (k, 1, c) on, where it is saturated; `bias`: common error of all pixels.
+    """
+
+    seconds: np.ndarray
+    x: np.ndarray
+    variance: np.ndarray
+    limit: np.ndarray
+    bias: np.ndarray
+
+    @classmethod
+    def of(cls, samples: Sequence[np.ndarray], seconds: Any, sensor: Sensor, L: Any = None) -> _Light:
+        """`L`: radiance (n, c), where it is known; that of all photographs determines their noise if not.
+
+        By its own value each pixel would have the less noise the darker it is by chance.
+        """
+        response, noise, offset = sensor
+        codes = np.stack(samples)
+        curve = codes if codes.shape[2] > 1 else codes[..., 0]
+        x = response.linear(curve).reshape(codes.shape) - offset
+        limit = np.broadcast_to(_RANGE * (noise.saturation - np.asarray(offset)), (len(x), 1, x.shape[2]))
+        t = np.asarray(seconds, np.float64)[:, None, None]
+        if L is None:
+            usable = x < limit
+            L = np.sum(x * usable, axis=0) / np.maximum(np.sum(t * usable, axis=0), 1e-30)
+        variance = noise.variance(t * L, response.derivative(curve).reshape(codes.shape))
+        variance = variance + (_SCALE * t * L) ** 2 + _FLOOR**2
+        bias = np.full(limit.shape, _BIAS * np.sqrt(noise.variance(0.0)))
+        return cls(t, np.where(x < limit, x, np.inf), variance, limit, bias)
+
+    def with_known(self, value: np.ndarray, variance: np.ndarray) -> _Light:
+        """One more, as the shortest photograph would show what is known."""
+        t = self.seconds.min(axis=0, keepdims=True)
+        x = t * value
+        v = t**2 * variance + (_SCALE * x) ** 2 + _FLOOR**2
+        known = t, x, v, np.full((1, 1, x.shape[2]), np.inf), np.zeros((1, 1, x.shape[2]))
+        return _Light(*(np.concatenate(pair) for pair in zip(self, known, strict=True)))
+
+    def at(self, numbers: Sequence[int]) -> _Light:
+        return _Light(*(values[list(numbers)] for values in self))
+
+    def without(self, k: int) -> _Light:
+        return self.at([other for other in range(len(self.x)) if other != k])
+
+    def __add__(self, other: _Light) -> _Light:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _Light(self.seconds, *(a + b for a, b in zip(self[1:], other[1:], strict=True)))
+
+    def mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Radiance (n, c) by all photographs, its variance and bias, and where any shows it."""
+        t, x, variance, _, bias = self
+        usable = np.isfinite(x)
+        weight = np.where(usable, t / variance, 0.0)
+        total = np.sum(weight * t, axis=0)
+        known = total > 0
+        total = np.where(known, total, 1.0)
+        L, bias = (np.sum(weight * values, axis=0) / total for values in (np.where(usable, x, 0.0), bias))
+        return L, 1.0 / total, bias, known
+
+    def scores(self) -> np.ndarray:
+        """How far each photograph is from the others: it deviates above 1."""
+        result = np.zeros(len(self.x))
+        whole = np.maximum(self.mean()[0], 0.0)
+        for k, (t, x, v, limit, bias) in enumerate(zip(*self, strict=True)):
+            L, v_L, bias_L, known = self.without(k).mean()
+            variance = v + t**2 * v_L
+            z2 = np.minimum((x - t * L) ** 2 / variance, _CLIP)
+            least = np.where(np.isfinite(x), t * whole, t * L + _SIGMAS * np.sqrt(variance))
+            use = known & (least < limit)
+            count = np.count_nonzero(use)
+            allowed = _MEAN * count + min(_DEFECTS * _CLIP, _SINGLE * count)
+            near = use & (z2 < _CLIP)
+            w, d, s = ((t * whole)[near], (x - t * L)[near], (bias + t * bias_L)[near])
+            together = (w @ d) ** 2 / max(w**2 @ variance[near] + (_SCALE * w @ w) ** 2 + (w @ s) ** 2, 1e-30)
+            result[k] = max(z2[use].sum() / max(allowed, 1.0), together / _SINGLE)
+        return result
+
+    def agrees(self) -> bool:
+        return bool(self.scores().max(initial=0.0) <= 1.0)
+
+    def cause(self, k: int) -> str:
+        """Why photograph k may deviate from the others: their ratio at bright pixels tells."""
+        L, _, _, known = self.without(k).mean()
+        both = known & np.isfinite(self.x[k])
+        if both.any():
+            x, expected = self.x[k][both], (self.seconds[k] * L)[both]
+            bright = expected >= 0.3 * np.quantile(expected, 0.99)
+            gain = float(np.median(x[bright] / np.maximum(expected[bright], 1e-9)))
+            if gain > 1.0 and np.mean(x > expected) > 0.9:
+                return "is too bright nearly everywhere: another light was on, or the exposure was too long"
+            if abs(gain - 1.0) > 3 * _SCALE:
+                return f"is {gain:.2g} times as bright as the others of its pattern"
+        return "deviates from the others of its pattern: another pattern, or the camera or scene moved"
+
+
+def _deviation(light: _Light, count: int) -> Deviation | None:
+    """Which of the first `count` photographs deviate; what is known stands behind them."""
+    scores, every = light.scores(), range(len(light.x))
+    if scores.max(initial=0.0) <= 1.0:
+        return None
+    worst = sorted(np.argsort(-scores[:count])[:_SUSPECTS].tolist())
+    for a, b in combinations(worst, 2):
+        order = [{a: b, b: a}.get(k, k) for k in every]
+        if light.seconds[a] != light.seconds[b] and light._replace(seconds=light.seconds[order]).agrees():
+            return Deviation((a, b), "are exchanged", exchanged=True)
+    alone = [k for k in worst if light.without(k).agrees()]
+    if count < len(every) or count < 3:
+        return Deviation(tuple(alone or [0]), light.cause((alone or [0])[0]))
+    since = next((k for k in every[1:] if not light.at(every[: k + 1]).agrees()), count - 1)
+    if alone:
+        return Deviation(tuple(sorted({*alone, since})), light.cause(alone[0]))
+    return Deviation((since,), "and those after it deviate: the camera or scene moved, or the light changed")

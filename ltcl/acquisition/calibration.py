@@ -1,50 +1,47 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What is known of a set-up once it has been measured (`calibrate`): plain arrays in a store, and back."""
+"""`Calibration`: what `calibrate` has measured, as arrays in a store; `Setup`: it on the pixels of T.
+
+With light p of a pattern in [0, 1], codes x that the projector is fed, its response g and ambient light a,
+
+    x = g^-1(p)                 for each channel, on the projector's own pixels
+    picture = T p + a           in linear sensor values a second
+
+T is for light relative to white less black: a includes what a black projector sends.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections import defaultdict
+from dataclasses import astuple, dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 
+from ltcl import checks
 from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.geometry import Resampling
+from ltcl.acquisition.geometry.resample import Blocks
 from ltcl.acquisition.geometry.sharpness import Sharpness
 from ltcl.acquisition.radiometry import NoiseModel, ProjectorResponse, Radiance, Response
-from ltcl.errors import FileError
+from ltcl.errors import FileError, InputError
 from ltcl.store import BlockStore
+from ltcl.transport import Transport
 
-PREFIX = "calibration."
-"""Of the names of the extra arrays that a calibration is kept in."""
-_SENSOR = ("electrons", "read", "black", "saturation", "levels")
+PREFIX = "calibration."  # of the names of the extra arrays that a calibration is kept in
+_VALID = 0.5  # of the camera pixels that see a projector pixel: with less its value is unknown
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Calibration:
-    """Result of `calibrate.measure`.
+    """What is known of a set-up.
 
-    Attributes
-    ----------
-    exposures : tuple of float
-        Seconds of the photographs of each pattern, ascending.
-    response, noise : Response, NoiseModel
-        Of the camera.
-    offset : (channels,)
-        Linear value without light.
-    ambient, white : Radiance, (H, W[, 3])
-        Under a black projector, and what a white one adds to that.
-    projector : ProjectorResponse
-    mixing : (3, 3) or None
-        Of the projector's colours, where there are three channels.
-    resampling : Resampling
-        From the camera's pixels to the projector's.
-    sharpness : Sharpness, optional
-        Of the camera on these; None of one that is aligned.
-    anchor : Anchor, optional
-        What the pattern of blocks showed; None of older stores, whose batches are not compared with it.
+    `exposures` in seconds, ascending; `offset`, the camera's linear value without light; `ambient`, `white`,
+    (H, W[, 3]), what a black projector shows and a white one adds; `mixing`, (3, 3), None of one channel;
+    `resampling` from the camera's pixels to the projector's. `sharpness` and `anchor` are None of an aligned
+    camera, and of older stores, whose photographs are not compared with the anchor.
     """
 
     exposures: tuple[float, ...]
@@ -64,87 +61,153 @@ class Calibration:
         """What each channel of T answers to when all of the projector's are at full code, (channels,)."""
         return np.ones(1) if self.mixing is None else self.mixing.sum(axis=1)
 
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Plain arrays by name, all finite, of which `from_arrays` makes the same again."""
+    @classmethod
+    def of(cls, store: str | os.PathLike[str] | BlockStore) -> Calibration:
+        """That of a store made by `ltcl.acquire`; FileError where it has none, or is damaged."""
+        scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        names = [name.removeprefix(PREFIX) for name in scan.extras if name.startswith(PREFIX)]
+        if not names:
+            raise FileError(f"{scan.path}: holds no calibration; ltcl.acquire writes one")
+        if "resampling.doubtful" not in names:
+            raise FileError(f"{scan.path}: its calibration is of an earlier ltcl; it must be acquired again")
+        arrays, groups = {name: np.array(scan.extra(PREFIX + name)) for name in names}, defaultdict(dict)
+        for name, array in arrays.items():
+            group, _, field = name.partition(".")
+            groups[group][field] = array
+        R, ambient, white, anchor = (groups[name] for name in ("resampling", "ambient", "white", "anchor"))
+        anchor.pop("shift", None)  # of earlier versions
+        for light in (ambient, white):
+            light["variance"] = np.where(light["valid"], light["variance"], np.float32(np.inf))
+        (h, w), (H, W) = R["coverage"].shape, R["camera_grid"].tolist()
+        weights = scipy.sparse.csr_array((R["data"], R["indices"], R["indptr"]), shape=(h * w, H * W))
+        *sensor, levels = arrays["noise"].tolist()
+        y, x, width = arrays.get("sharpness", np.zeros(3)).tolist()
+        return cls(
+            tuple(arrays["exposures"].tolist()),
+            Response(arrays["response"]),
+            NoiseModel(*sensor, levels=int(levels)),
+            arrays["offset"],
+            Radiance(**ambient),
+            Radiance(**white),
+            ProjectorResponse(arrays["projector"]),
+            arrays.get("mixing"),
+            Resampling(weights, R["coverage"], (h, w), (H, W), R["doubtful"]),
+            Sharpness((y, x), width) if "sharpness" in arrays else None,
+            Anchor(**anchor) if anchor else None,
+        )
+
+    def write(self, store: BlockStore) -> None:
+        """Commit it to a store, as extra arrays, all finite."""
         R = self.resampling
-        found = {
+        arrays = {
             "exposures": np.array(self.exposures),
             "response": self.response.values,
-            "noise": np.array([getattr(self.noise, name) for name in _SENSOR], np.float64),
+            "noise": np.array(astuple(self.noise), np.float64),
             "offset": self.offset,
             "projector": self.projector.values,
-            "resampling.data": R.weights.data,
-            "resampling.indices": R.weights.indices,
-            "resampling.indptr": R.weights.indptr,
             "resampling.coverage": R.coverage,
             "resampling.camera_grid": np.array(R.camera_grid),
             "resampling.doubtful": np.zeros(R.grid, bool) if R.doubtful is None else R.doubtful,
         }
+        arrays |= {f"resampling.{name}": getattr(R.weights, name) for name in ("data", "indices", "indptr")}
         if self.sharpness is not None:
-            found["sharpness"] = np.array([*self.sharpness.leak, self.sharpness.width])
+            arrays["sharpness"] = np.hstack(astuple(self.sharpness))
         if self.mixing is not None:
-            found["mixing"] = self.mixing
+            arrays["mixing"] = self.mixing
         if self.anchor is not None:
-            found |= {f"anchor.{name}": part for name, part in vars(self.anchor).items()}
-        for name, picture in (("ambient", self.ambient), ("white", self.white)):
-            found[f"{name}.value"], found[f"{name}.valid"] = picture.value, picture.valid
-            found[f"{name}.variance"] = np.where(picture.valid, picture.variance, np.float32(0.0))
-        return found
-
-    @classmethod
-    def of(cls, store: str | os.PathLike[str] | BlockStore) -> Calibration:
-        """That of a store which `ltcl.acquire` made, or of the folder of one.
-
-        `Calibration.of(path).projector.codes(pattern)` is what the projector is fed for a pattern of linear
-        light, such as `ltcl.compensate` finds.
-
-        Raises
-        ------
-        FileError
-            There is none, or it is damaged.
-        """
-        found = store if isinstance(store, BlockStore) else BlockStore.open(store)
-        names = [name for name in found.extras if name.startswith(PREFIX)]
-        if not names:
-            raise FileError(f"{found.path}: holds no calibration; ltcl.acquire writes one")
-        if PREFIX + "resampling.doubtful" not in names:
-            raise FileError(f"{found.path}: its calibration is of an earlier ltcl; it must be acquired again")
-        return cls.from_arrays({name.removeprefix(PREFIX): found.extra(name) for name in names})
-
-    def write(self, store: BlockStore) -> None:
-        """Commit it to a store, as extra arrays."""
-        for name, array in self.to_arrays().items():
+            arrays |= {f"anchor.{field}": array for field, array in vars(self.anchor).items()}
+        for name, light in {"ambient": self.ambient, "white": self.white}.items():
+            arrays |= {f"{name}.{field}": array for field, array in vars(light).items()}
+            arrays[f"{name}.variance"] = np.where(light.valid, light.variance, np.float32(0.0))
+        for name, array in arrays.items():
             store.extra(PREFIX + name, array)
 
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """A calibration on the pixels of T, which are `blocks` of projector pixels.
+
+    Examples
+    --------
+    >>> import tempfile, ltcl
+    >>> from ltcl.acquisition import VirtualRig
+    >>> rig, store = VirtualRig(np.eye(64) / 2, (8, 8), bits=12, ambient=0.1), f"{tempfile.mkdtemp()}/T.zarr"
+    >>> T = ltcl.acquire(rig, geometry="aligned", strategy="pixel", store=store)
+    >>> setup = Setup.of(store)
+    >>> setup.codes(np.full(T.grid, 0.214)).mean().round(2)  # sRGB, as this rig has by default
+    np.float32(0.5)
+    """
+
+    calibration: Calibration
+    blocks: Blocks
+
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Calibration:
-        """The calibration that `to_arrays` was called of."""
-        *sensor, levels = np.asarray(arrays["noise"]).tolist()
-        grid, camera = arrays["resampling.coverage"].shape, arrays["resampling.camera_grid"].tolist()
-        parts = tuple(np.array(arrays[f"resampling.{name}"]) for name in ("data", "indices", "indptr"))
-        weights = scipy.sparse.csr_array(parts, shape=(grid[0] * grid[1], camera[0] * camera[1]))
-        coverage, doubtful = (np.array(arrays[f"resampling.{name}"]) for name in ("coverage", "doubtful"))
-        *leak, width = np.asarray(arrays.get("sharpness", (0.0, 0.0, 0.0))).tolist()
-        return cls(
-            tuple(np.asarray(arrays["exposures"]).tolist()),
-            Response(np.array(arrays["response"])),
-            NoiseModel(*sensor, levels=int(levels)),
-            np.array(arrays["offset"]),
-            _radiance(arrays, "ambient"),
-            _radiance(arrays, "white"),
-            ProjectorResponse(np.array(arrays["projector"])),
-            np.array(arrays["mixing"]) if "mixing" in arrays else None,
-            Resampling(weights, coverage, (grid[0], grid[1]), (camera[0], camera[1]), doubtful),
-            Sharpness((leak[0], leak[1]), width) if "sharpness" in arrays else None,
-            _anchor(arrays) if "anchor.value" in arrays else None,
-        )
+    def of(cls, store: str | os.PathLike[str] | BlockStore) -> Setup:
+        """That of a store made by `ltcl.acquire`; FileError where it has no calibration, or is damaged."""
+        scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        calibration, facts = Calibration.of(scan), scan.attributes
+        side = facts["settings"]["block"] if facts.get("strategy") == "block" else 1
+        return cls(calibration, Blocks(calibration.resampling.grid, side))
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(h, w) of the transport."""
+        return self.blocks.grid
+
+    @property
+    def channels(self) -> int:
+        """1 or 3."""
+        return 1 if self.calibration.white.value.ndim == 2 else 3
+
+    @property
+    def ambient(self) -> np.ndarray:
+        """Light under a black projector, (h, w[, 3]) in the units of T; 0 where it is unknown."""
+        R, light = self.calibration.resampling, self.calibration.ambient
+        weight = R.apply(light.valid.astype(np.float32))
+        value = R.apply(np.where(light.valid, light.value, 0.0))
+        return self._mean(np.where(weight >= _VALID, value / np.maximum(weight, _VALID), 0.0))
+
+    def codes(self, pattern: Any) -> np.ndarray:
+        """Codes, float32 on the projector's pixels, for light (h, w[, 3]), clipped to [0, 1], 1 for white."""
+        light = np.clip(self._colours("pattern", pattern), 0.0, 1.0)
+        return self.blocks.enlarged(self.calibration.projector.codes(light))
+
+    def light(self, codes: Any) -> np.ndarray:
+        """Light of codes (h, w[, 3]) in [0, 1], relative to white."""
+        return self.calibration.projector.linear(self._colours("codes", codes))
+
+    def relative_error(self, rig: Any, T: Transport) -> tuple[float, ...]:
+        """||s T p - c|| / ||c|| of each channel for random p of 0 and 1, s = <T p, c> / ||T p||^2.
+
+        c is what `rig`, a `VirtualRig`, shows under p less black; the camera's unit of light is unknown.
+        """
+        patterns = (np.random.default_rng(0).random((4, *T.grid)) < 0.5).astype(np.float32)
+        pictures = [rig.radiance(self.blocks.enlarged(p)) for p in (0 * patterns[0], *patterns)]
+        if rig.camera_grid != rig.projector_grid:
+            pictures = [self.calibration.resampling.apply(picture) for picture in pictures]
+        light = patterns if T.channels == 1 else np.repeat(patterns[..., None], 3, axis=-1)
+        sides = [T @ p for p in light], [self._mean(c - pictures[0]) for c in pictures[1:]]
+        x, y = (np.reshape(side, (4, -1, T.channels))[:, ~T.masked].astype(np.float64) for side in sides)
+        scale = (x * y).sum(axis=(0, 1)) / np.maximum((x * x).sum(axis=(0, 1)), np.finfo(float).tiny)
+        error = np.sqrt(((scale * x - y) ** 2).sum(axis=(0, 1)) / (y * y).sum(axis=(0, 1)))
+        return tuple(error.tolist())
+
+    def _colours(self, name: str, picture: Any) -> np.ndarray:
+        """A checked picture of as many channels as the projector has."""
+        values = checks.finite(name, checks.real(name, picture)).astype(np.float32)
+        checks.shape(name, values, self.grid, (*self.grid, 3))
+        if values.ndim == 2 and self.calibration.projector.channels == 3:
+            return np.repeat(values[..., None], 3, axis=-1)
+        return values
+
+    def _mean(self, picture: np.ndarray) -> np.ndarray:
+        """Means over the pixels of the transport."""
+        return (self.blocks.sum(picture) / self.blocks.sum(np.ones_like(picture))).astype(np.float32)
 
 
-def _anchor(arrays: Mapping[str, np.ndarray]) -> Anchor:
-    return Anchor(**{field.name: np.array(arrays[f"anchor.{field.name}"]) for field in fields(Anchor)})
-
-
-def _radiance(arrays: Mapping[str, np.ndarray], name: str) -> Radiance:
-    value, valid = np.array(arrays[f"{name}.value"]), np.array(arrays[f"{name}.valid"])
-    variance = np.where(valid, np.asarray(arrays[f"{name}.variance"]), np.float32(np.inf))
-    return Radiance(value, variance, valid)
+def has_calibration(store: str | os.PathLike[str]) -> bool:
+    """Whether there is a store that `ltcl.acquire` made; whoever loads a damaged one says what is wrong."""
+    with contextlib.suppress(InputError):
+        scan = BlockStore.open(store)
+        return any(name.startswith(PREFIX) for name in scan.extras) and "strategy" in scan.attributes
+    return False

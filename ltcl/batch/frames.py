@@ -27,7 +27,7 @@ from ltcl.compensation import compensate, problem
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.files import as_path
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
-from ltcl.images.srgb import Encoding
+from ltcl.images.pictures import Encoding
 from ltcl.transport import Transport, error_note, require, resolve_reference
 
 _USUAL_FPS = 25.0

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,16 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import report
-from ltcl.acquisition.fingerprint import fingerprint
+from ltcl import files, report
+from ltcl.acquisition.rig import fingerprint
 from ltcl.errors import FileError, InputError
 from ltcl.files import input_file, replace_file
 from ltcl.transport import Transport
-
-try:
-    import fcntl
-except ImportError:  # Windows: nothing keeps two runs apart there
-    fcntl = None
 
 NAME = "frames.json"
 _FORMAT = 2
@@ -102,27 +96,19 @@ class Manifest:
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Make the folder, and refuse other runs in it until the block ends; an empty one is removed again."""
-    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    created = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY) if fcntl else -1
     except OSError as error:
         reason = "is a file; a folder cannot be written there" if folder.is_file() else error.strerror
         raise FileError(f"{folder}: {reason}") from error
     try:
-        if fcntl:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise FileError(f"{folder}: another run writes there; wait for it, or give another folder") from None
-    try:
-        yield
+        with files.locked(folder, wait=False):
+            yield
     finally:
-        for place in made:
+        for place in created:
             with contextlib.suppress(OSError):  # something is in it
                 place.rmdir()
-        if fcntl:
-            os.close(handle)
 
 
 def identity(T: Transport) -> dict[str, Any]:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `main` has the entry point; each command has a file of its own."""
+"""The command line: `main` has the entry point; `command` what all commands share."""

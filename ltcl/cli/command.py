@@ -1,20 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`command`: what all commands share: --json, --quiet and --verbose, progress, errors and exit codes."""
+"""What all commands share: --json, --quiet, --verbose, progress, tables, errors in one line, exit codes.
+
+Results are on stdout, tables for people or one JSON document; notes, warnings, errors, progress on stderr.
+"""
 
 from __future__ import annotations
 
 import functools
 import inspect
-import re
+import logging
+import math
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import rich.progress
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 from typer.models import ArgumentInfo
 
-from ltcl.cli import console
+from ltcl import report
 from ltcl.errors import LtclError
 
 FAILED, USAGE, WAITING, INTERNAL, INTERRUPTED = 1, 2, 3, 70, 130
@@ -24,7 +34,13 @@ EXIT_CODES = (
     'With **--json** stdout holds one JSON document, also of a command that fails: {"error": what is wrong, '
     '"type": its class in ltcl.errors, "exit_code": as above}. docs/cli.md lists the fields of the others.'
 )
-_SEVERAL = {"bounds": ["low", "high"]}  # options that are one argument of the library
+_NOTE = 25  # level of a note, between INFO and WARNING
+_PERIOD = 300.0  # seconds of the past from which the time left is estimated
+_logger = logging.getLogger(__name__)
+
+
+class UsageError(Exception):
+    """The command line cannot be understood."""
 
 
 @dataclass(frozen=True)
@@ -33,15 +49,15 @@ class Context:
 
     name: str
     options: dict[str, Any]
-    progress: console.Progress
+    progress: Progress
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a command found out: `data` for --json, `show()` prints the same for people."""
+    """Result of a command: `data` for --json; `lines`, texts and tables, are the same for people."""
 
     data: Any
-    show: Callable[[], object]
+    lines: Sequence[str | Table | None]
     exit_code: int = 0
 
 
@@ -54,64 +70,179 @@ def _shared(json: Json = False, quiet: Quiet = False, verbose: Verbose = False) 
     """The options of every command."""
 
 
-def command(function: Callable[..., Answer]) -> Callable[..., None]:
-    """A function of a `Context` and its arguments as a command of typer."""
-    own, shared = (inspect.signature(each, eval_str=True).parameters.values() for each in (function, _shared))
-    parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*list(own)[1:], *shared)]
-    positional = {p.name for p in parameters if isinstance(p.annotation.__metadata__[0], ArgumentInfo)}
+def command(*groups: Callable[..., None]) -> Callable[[Callable[..., Answer]], Callable[..., None]]:
+    """A function of a `Context` and its own arguments as a command of typer.
 
-    @functools.wraps(function)
-    def run(json: bool, quiet: bool, verbose: bool, **arguments: Any) -> None:
-        options = {name: value for name, value in arguments.items() if name not in positional}
-        with console.logging_to_stderr(quiet, verbose):
-            try:
-                with console.Progress(quiet) as progress:
-                    answer = function(Context(function.__name__, options, progress), **arguments)
-                if json:
-                    console.answer(answer.data)
-                else:
-                    answer.show()
-                code = answer.exit_code
-            except BrokenPipeError:  # nobody reads stdout any more: typer ends quietly
-                raise
-            except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - each becomes a line and a code
-                code = fail(error, json, verbose, options)
-        raise typer.Exit(code)
+    A group is a function whose parameters are options, too; they are in `Context.options` only.
+    """
 
-    vars(run)["__signature__"] = inspect.Signature(parameters)
-    run.__annotations__ = {p.name: p.annotation for p in parameters}
-    return run
+    def decorate(function: Callable[..., Answer]) -> Callable[..., None]:
+        signatures = [inspect.signature(each, eval_str=True) for each in (function, *groups, _shared)]
+        every = [parameter for signature in signatures for parameter in signature.parameters.values()]
+        parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in every[1:]]
+        positional = {p.name for p in parameters if isinstance(p.annotation.__metadata__[0], ArgumentInfo)}
+        own = [*signatures[0].parameters][1:]
+
+        @functools.wraps(function)
+        def run(json: bool, quiet: bool, verbose: bool, **values: Any) -> None:
+            options = {name: value for name, value in values.items() if name not in positional}
+            with _log_to_stderr(quiet, verbose):
+                try:
+                    with Progress(quiet) as progress:
+                        context = Context(function.__name__, options, progress)
+                        answer = function(context, **{name: values[name] for name in own})
+                    for line in [report.dumps(answer.data)] if json else answer.lines:
+                        _print(line)
+                    code = answer.exit_code
+                except BrokenPipeError:  # nobody reads stdout any more: typer ends quietly
+                    raise
+                except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - each becomes a line and a code
+                    code = fail(error, json, verbose)
+            raise typer.Exit(code)
+
+        vars(run)["__signature__"] = inspect.Signature(parameters)
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
+        return run
+
+    return decorate
 
 
-def fail(error: BaseException, json: bool, verbose: bool = False, options: Iterable[str] = ()) -> int:
+def fail(error: BaseException, json: bool, verbose: bool = False) -> int:
     """Print an error as one line, and as JSON; returns the exit code."""
-    code, message, kind = FAILED, str(error), type(error).__name__
-    if isinstance(error, LtclError):
-        message = _naming_options(message, options)
-    elif isinstance(error, MemoryError):
-        message = "the host has no memory left"
-    elif isinstance(error, KeyboardInterrupt):
+    code, kind, message = FAILED, type(error).__name__, " ".join(str(error).split())
+    if isinstance(error, KeyboardInterrupt):
         code, message = INTERRUPTED, message or "interrupted"
-    elif kind == "UsageError":
+    elif isinstance(error, UsageError):
         code = USAGE
-    else:
-        code, message = INTERNAL, f"internal error: {kind}: {error}; --verbose prints where it occurred"
+    elif isinstance(error, MemoryError) and not isinstance(error, LtclError):
+        message = "the host has no memory left"
+    elif not isinstance(error, LtclError):
+        code, message = INTERNAL, f"internal error: {kind}: {message}; --verbose prints where it occurred"
         if verbose:
             typer.echo("".join(traceback.format_exception(error)), err=True)
     if json:
-        console.answer({"error": message, "type": kind, "exit_code": code})
-    console.error(message)
+        typer.echo(report.dumps({"error": message, "type": kind, "exit_code": code}))
+    print_error(message)
     return code
 
 
-def _naming_options(message: str, options: Iterable[str]) -> str:
-    """The message as it is, followed by the options that set the arguments it names.
+def print_error(message: str) -> None:
+    """One line on stderr."""
+    typer.echo(f"ltcl: error: {message}", err=True)
 
-    >>> _naming_options("give grid=(h, w); bounds[0] is nan", ["grid", "on_dark", "low", "high"])
-    'give grid=(h, w); bounds[0] is nan (--grid, --low, --high)'
+
+def note(text: str) -> None:
+    """Print a line on stderr, unless ``--quiet``."""
+    _logger.log(_NOTE, "%s", text)
+
+
+class _Log(logging.Handler):
+    """Messages of the library as lines on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        typer.echo(f"ltcl: {level}{' '.join(record.getMessage().split())}", err=True)
+
+
+@contextmanager
+def _log_to_stderr(quiet: bool, verbose: bool) -> Iterator[None]:
+    """Show warnings and notes of ltcl; errors only if `quiet`, and what it is doing if `verbose`."""
+    logger, handler = logging.getLogger("ltcl"), _Log()
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.ERROR if quiet else logging.INFO if verbose else _NOTE)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
+
+
+def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> Table:
+    """A table, numbers right-aligned; nothing is cut off in a narrow terminal."""
+    cells = [[_cell(value) for value in row] for row in rows]
+    frame = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
+    for name, *values in zip(columns, *cells, strict=True):
+        right = all(value[:1] in "+-.0123456789" or value == "diverges" for value in values)
+        frame.add_column(name, justify="right" if right else "left", no_wrap=True)
+    for row in cells:
+        frame.add_row(*map(Text, row))
+    return frame
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float) and math.isfinite(value):
+        return f"{value:.4g}"
+    unknown = value is None or (isinstance(value, float) and not value > 0)
+    return "-" if unknown else "diverges" if isinstance(value, float) else str(value)
+
+
+def _print(line: str | Table | None) -> None:
+    if isinstance(line, Table):
+        with (console := Console(width=10_000)).capture() as capture:
+            console.print(line)
+        line = "\n".join(row.rstrip() for row in capture.get().splitlines())
+    if line is not None:
+        typer.echo(line)
+
+
+def percent(share: float | None, digits: int = 3) -> str | None:
+    """A share in percent, as a cell of a table."""
+    return None if share is None else f"{100 * share:.{digits}g} %"
+
+
+class Progress(rich.progress.Progress):
+    """`progress(step, done, total)`: a bar on stderr with elapsed time and time left, on a terminal only.
+
+    It runs from the start of a command to its end; without a total it shows that something is running.
     """
-    names = {name: [name] for name in options}
-    names |= {name: several for name, several in _SEVERAL.items() if names.keys() >= {*several}}
-    mentioned = [name for name in names if re.search(rf"(?<![-\w.]){name}(=| is |\[)", message)]
-    shown = ", ".join(f"--{each.replace('_', '-')}" for name in mentioned for each in names[name])
-    return f"{message} ({shown})" if shown else message
+
+    def __init__(self, quiet: bool = False) -> None:
+        console = Console(stderr=True)
+        super().__init__(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=24),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+            console=console,
+            transient=True,
+            disable=quiet or not console.is_terminal,
+            speed_estimate_period=_PERIOD,
+        )
+        self._item = self._step = ""
+        self.done: float = 0
+        self.add_task("", total=None)
+
+    def __call__(self, step: str, done: float = 0, total: float | None = None, *, detail: str = "") -> None:
+        """Show what is being done and how much of it is done."""
+        if step != self._step:
+            _logger.info("%s%s", self._item, step)
+        (task,), self._step, self.done = self.tasks, step, done
+        if task.total != total or done < task.completed:  # something else is counted, at another pace
+            self.remove_task(task.id)
+            self.add_task("", total=total)
+        self.update(self.task_ids[0], description=f"{self._item}{step}{detail}", completed=done)
+
+    def each(self, items: Sequence[Any]) -> Iterator[Any]:
+        """All items, with their names before the steps that follow."""
+        for number, item in enumerate(items, 1):
+            count = f"{number}/{len(items)} " if len(items) > 1 else ""
+            self._item, self._step = f"{count}{item}: ", ""
+            yield item
+        self._item = ""
+
+    def solve(self, rtol: float, solves: int) -> Callable[[int, float], None]:
+        """A `callback(iteration, residual)` that shows the digits gained towards `rtol` in so many solves."""
+        begun = 0
+
+        def callback(iteration: int, residual: float) -> None:
+            nonlocal begun
+            begun += iteration == 0
+            gained = math.log(residual) / math.log(rtol) if 0 < residual < 1 and 0 < rtol < 1 else 0.0
+            shown = "" if math.isnan(residual) else f", relative residual {residual:.1e}"
+            done = min(begun - 1 + min(gained, 1.0), solves)
+            self("solving", done, solves, detail=f": iteration {iteration}{shown}")
+
+        return callback

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+import dataclasses
+import inspect
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,14 +12,15 @@ import numpy as np
 import typer
 
 from ltcl import report
-from ltcl.cli import compensate_frames, console, options, pictures, results, transports
-from ltcl.cli.command import Answer, Context
+from ltcl.cli import options, pictures, transports
+from ltcl.cli.command import Answer, Context, command, note, percent, table
 from ltcl.cli.options import argument, file, option, writable_file
 from ltcl.compensation import Compensation
-from ltcl.errors import InputError
+from ltcl.errors import InputError, LtclError
 from ltcl.transport import Transport
 
-_MANY = 0.01  # part of a picture out of reach from which advice is given
+_MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
+_RESULTS = ("gain", "clipped", "error", "transport_error", "gap")
 _SHEET = 12  # pictures on a contact sheet, at most
 
 
@@ -29,66 +31,54 @@ def _gain(text: str) -> float | str:
         raise typer.BadParameter(f"{text!r} is no gain; write a number, or auto") from None
 
 
-_film = partial(option, rich_help_panel="Options of frames: a folder or a video")
-_Pictures = Annotated[list[Path], argument("PICTURE...", "Pictures; or one folder or one video of frames.")]
-_gain_help = (
-    "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
+_PICTURE = argument("PICTURE...", "Pictures; or one folder or one video of frames.")
+_GAIN = "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
+_LOSS = "Error that --gain auto may cost. Default: as little as possible."
+_CLAMP = "Clamp what exceeds that light, without making up for it."
+_BACKGROUND = "Picture of the light that stays. Default: as measured, else none."
+_WEIGHTS = "Picture of how much the error at each pixel counts."
+_VIDEO = "Also a video of the patterns: .mkv, .avi or .mp4."
+_FPS = "Frames a second of that video. Default: as the source, else 25."
+_FORMAT = "png: 16 bits (default); exr: the light as it is."
+_FILM: dict[str, Any] = {"rich_help_panel": "Options of frames: a folder or a video"}
+_MORE: dict[str, Any] = {"min": 1, **_FILM}
+
+
+def _film_options(
+    batch: Annotated[int | None, option("Frames solved at once. Default: 8.", **_MORE)] = None,
+    resume: Annotated[bool, option("Go on where the last run into DIR ended.", "--resume", **_FILM)] = False,
+    frames: Annotated[int | None, option("Only the first N frames.", metavar="N", **_MORE)] = None,
+    video: Annotated[Path | None, file(_VIDEO, callback=writable_file, **_FILM)] = None,
+    fps: Annotated[float | None, option(_FPS, **_FILM)] = None,
+    format: Annotated[Literal["png", "exr"] | None, option(_FORMAT, **_FILM)] = None,
+    appearance: Annotated[bool, option("Also how the scene will look.", "--appearance", **_FILM)] = False,
+) -> None:
+    """Of `ltcl.batch.compensate_frames`."""
+
+
+_FRAMES = tuple(inspect.signature(_film_options).parameters)
+
+
+@command(
+    options.file_options,
+    options.transport_options,
+    options.solve_options,
+    options.picture_options,
+    _film_options,
 )
-_Gain = Annotated[str | None, option(_gain_help, parser=_gain, metavar="FACTOR")]
-_Loss = Annotated[float | None, option("Error that --gain auto may cost. Default: as little as possible.")]
-_Calibration = Annotated[Path | None, file("The store of 'ltcl acquire' that TRANSPORT was made of.")]
-_Weights = Annotated[Path | None, file("Picture of how much the error at each pixel counts.")]
-_Low = Annotated[float, option("Darkest light of the projector.")]
-_High = Annotated[float, option("Brightest light of the projector.")]
-_Clamp = Annotated[bool, option("Clamp what exceeds that light, without making up for it.", "--clamp")]
-_Background = Annotated[
-    Path | None, file("Picture of the light that stays. Default: as measured, else none.")
-]
-_Batch = Annotated[int | None, _film("Frames solved at once; --resume needs the same. Default: 8.", min=1)]
-_Resume = Annotated[bool, _film("Go on where the last run into DIR ended.", "--resume")]
-_Frames = Annotated[int | None, _film("Only the first N frames.", min=1, metavar="N")]
-_Video = Annotated[
-    Path | None, file("Also a video of the patterns: .mkv, .avi or .mp4.", callback=writable_file)
-]
-_Fps = Annotated[float | None, _film("Frames a second of that video. Default: as the source, else 25.")]
-_Format = Annotated[Literal["png", "exr"] | None, _film("png: 16 bits (default); exr: the light as it is.")]
-_Appearance = Annotated[bool, _film("Write how the scene will look, too.", "--appearance")]
-
-
 def compensate(
     context: Context,
     transport: options.Matrix,
-    picture: _Pictures,
+    picture: Annotated[list[Path], _PICTURE],
     out: options.Out,
-    grid: options.Grid = None,
-    camera_grid: options.CameraGrid = None,
-    variable: options.Variable = None,
-    method: options.Method = "auto",
-    rtol: options.TaskRtol = None,
-    inverse: options.Inverse = None,
-    exact: options.Exact = None,
-    samples: options.Samples = None,
-    seed: options.Seed = None,
-    first_bounce: options.FirstBounce = None,
-    on_dark: options.OnDark = "auto",
-    gain: _Gain = None,
-    loss: _Loss = None,
-    low: _Low = 0.0,
-    high: _High = 1.0,
-    clamp: _Clamp = False,
-    background: _Background = None,
-    calibration: _Calibration = None,
-    weights: _Weights = None,
-    resize: options.Resize = False,
-    encoding: options.Encoding = "auto",
-    device: options.Device = None,
-    batch: _Batch = None,
-    resume: _Resume = False,
-    frames: _Frames = None,
-    video: _Video = None,
-    fps: _Fps = None,
-    format: _Format = None,
-    appearance: _Appearance = False,
+    gain: Annotated[str | None, option(_GAIN, parser=_gain, metavar="FACTOR")] = None,
+    loss: Annotated[float | None, option(_LOSS)] = None,
+    low: Annotated[float, option("Darkest light of the projector.")] = 0.0,
+    high: Annotated[float, option("Brightest light of the projector.")] = 1.0,
+    clamp: Annotated[bool, option(_CLAMP, "--clamp")] = False,
+    background: Annotated[Path | None, file(_BACKGROUND)] = None,
+    calibration: Annotated[Path | None, file("The store of 'ltcl acquire' behind TRANSPORT.")] = None,
+    weights: Annotated[Path | None, file(_WEIGHTS)] = None,
 ) -> Answer:
     """Find the projector patterns that make a scene look like PICTURE.
 
@@ -103,149 +93,160 @@ def compensate(
     gain for all; Ctrl-C keeps what is done, for --resume.
     """
     from ltcl.acquisition import Setup
-
-    sampled = options.sampling(context.options)
-    source = compensate_frames.source(picture, context.options)
-    setup = Setup.of(calibration) if calibration else transports.setup_of(transport)
-    T = transports.load(context, transport, "light")
-    if setup is not None:
-        _check_setup(setup, calibration, T, {"--low": low, "--high": high})
-    settings = _settings(context, T, setup) | sampled
-    measured = {"background": "measured"} if background is None and setup is not None else {}
-    resolved = {name: settings[name] for name in ("rtol", "gain", *sampled)}
-    text = transports.heading(context, transport, T, **resolved, **measured)
-    text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
-    notes = [transports.caveat("errors are", T, exact)]
-    notes += ["pattern .png holds the codes of the measured projector: show it pixel for pixel"] * bool(setup)
-    notes += ["the background is the ambient light that was measured"] * bool(measured)
-    note = "\n".join(filter(None, notes))
-    if source is not None:
-        return compensate_frames.run(
-            context, T, source, text, settings | {"codes": setup and setup.codes}, note
-        )
-    desired = pictures.Reader(T.camera_grid, "the camera", encoding, resize).read_all(picture)
-    with results.fill(out, text) as folder:
-        _write_all(
-            context, T, folder, dict(zip(desired, picture, strict=True)), desired, text, settings, setup
-        )
-    return Answer({"folder": out, **text}, partial(_show, out, text["pictures"], note))
-
-
-def _check_setup(setup: Any, calibration: Path | None, T: Transport, bounds: dict[str, float]) -> None:
-    """Refuse the calibration of other pixels than those of T, and light beyond its black and white."""
-    if (setup.grid, setup.channels) != (T.grid, T.channels):
-        raise InputError(
-            f"{calibration}: is of {setup.grid} pixels and {setup.channels} channel(s); TRANSPORT has "
-            f"{T.grid} and {T.channels}"
-        )
-    for name, bound in bounds.items():
-        if not 0.0 <= bound <= 1.0:
-            limits = "from 0 to 1, the black and the white of the projector that 'ltcl acquire' measured"
-            raise InputError(f"{name} is {bound:g}; it must be {limits}")
-
-
-def _settings(context: Context, T: Transport, setup: Any) -> dict[str, Any]:
-    """Arguments of `ltcl.compensate`, pictures and transports read from their files."""
     from ltcl.compensation import RTOL
-    from ltcl.transport import default_rtol
 
-    asked, judges = context.options, transports.load_judges(context, T)
-    rtol, gain = asked["rtol"], asked["gain"]
-    reader = pictures.Reader(T.camera_grid, "the camera", asked["encoding"], asked["resize"], upright=False)
-    seen = {name: asked[name] and reader.read(asked[name]) for name in ("background", "weights")}
-    if seen["background"] is None and setup is not None:
-        seen["background"] = setup.ambient
-    return {
-        "rtol": default_rtol(RTOL, T, judges["exact"], judges["inverse"]) if rtol is None else rtol,
-        "gain": gain if gain is not None else 1.0 if setup is None else "auto",
-        "bounds": (asked["low"], asked["high"]),
-        **{name: asked[name] for name in ("method", "loss", "clamp")},
-        **seen,
-        **judges,
-    }
+    film = _film(picture, context.options)
+    measured = calibration or (transport if transports.is_measured(transport) else None)
+    setup = Setup.of(measured) if measured else None
+    T = transports.load(context, transport)
+    if setup is not None and (setup.grid, setup.channels) != (T.grid, T.channels):
+        sizes = f"{setup.grid} and {setup.channels} channel(s); TRANSPORT has {T.grid} and {T.channels}"
+        raise InputError(f"{calibration}: is of {sizes}")
+    if setup is not None and not 0.0 <= low < high <= 1.0:
+        limits = "from 0 to 1, the black and the white of the projector that 'ltcl acquire' measured"
+        raise InputError(f"--low is {low:g} and --high is {high:g}; they must be {limits}")
+
+    def read(file: Path) -> np.ndarray:
+        return pictures.read(context, file, T.camera_grid, "the camera", upright=False)
+
+    settings = transports.solving(context, T, RTOL) | {"loss": loss, "clamp": clamp, "bounds": (low, high)}
+    settings["gain"] = gain if gain is not None else 1.0 if setup is None else "auto"
+    settings |= {"weights": weights and read(weights), "background": background and read(background)}
+    resolved = {"rtol": settings["rtol"], "gain": settings["gain"]}
+    notes = [transports.caveat("errors are", T, context.options["exact"])]
+    if setup is not None:
+        notes.append("pattern .png holds the codes of the measured projector: show it pixel for pixel")
+    if setup is not None and background is None:
+        settings["background"], resolved["background"] = setup.ambient, "measured"
+        notes.append("the background is the ambient light that was measured")
+    text = transports.heading(context, transport, T, **resolved)
+    text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
+    if film is None:
+        lines = _compensate_pictures(context, T, picture, out, text, settings, setup)
+    else:
+        lines = _compensate_frames(context, T, film, out, text, settings | {"codes": setup and setup.codes})
+    return Answer({"folder": out, **text}, [*lines, *notes])
 
 
-def _write_all(
-    context: Context,
-    T: Transport,
-    folder: Path,
-    files: dict[str, Path],
-    desired: dict[str, np.ndarray],
-    text: dict[str, Any],
-    settings: dict[str, Any],
-    setup: Any,
-) -> None:
-    """Compensate all pictures into `folder`; the report gets its entries."""
+def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
+    """The folder or video, which must be the only input; None where there are pictures."""
+    from ltcl.images.frames import is_frames
+
+    films = [path for path in paths if is_frames(path)]
+    if films and len(paths) > 1:
+        text = f"holds frames, and there are {len(paths) - 1} more inputs; it must be the only one"
+        raise InputError(f"{films[0]}: {text}")
+    for name in _FRAMES:
+        if not films and asked[name] not in (None, False):
+            raise InputError(f"--{name} is given, but {paths[0]} is a picture; it is for a folder or a video")
+    return films[0] if films else None
+
+
+def _compensate_pictures(
+    context: Context, T: Transport, paths: list[Path], out: Path, text: Any, settings: Any, setup: Any
+) -> list[Any]:
+    """Patterns of all pictures into a folder with their contact sheet; the lines of the answer."""
     from ltcl.compensation import compensate
 
+    desired = pictures.read_all(context, paths, T.camera_grid, "the camera")
+    files = dict(zip(desired, paths, strict=True))
     text["exposure"] = factor = pictures.exposure(*desired.values())
-    text["pictures"], rows = [], []
-    named = {name: context.options[name] for name in ("background", "weights")}
-    for name in context.progress.each(list(files)):
-        with pictures.naming({"desired": files[name], "gain": files[name], **named}):
-            solves = options.solves(settings["method"], T.channels)
-            callback = context.progress.solve(settings["rtol"], solves)
-            found = compensate(T, desired[name], callback=callback, **settings)
-        entry = {
-            "file": str(files[name]),
-            **{key: getattr(found, key) for key in ("gain", "clipped", "error", "transport_error", "gap")},
-            "too_dark": float(np.mean(found.out_of_reach > 0)),
-            "too_bright": float(np.mean(found.out_of_reach < 0)),
-            "channels": report.solution(found.solution),
-            "limited": report.solution(found.limited),
-        }
-        white = max(settings["bounds"][1], 0.0) or 1.0
-        written, panels = _write(folder, name, desired[name], found, factor, white, setup)
-        text["pictures"].append(entry | written)
-        rows += [panels] if len(rows) < _SHEET else []
-    pictures.contact_sheet(rows).save(folder / "compensate.png")
+    text["pictures"], sheet, rows = [], [], []
+    with pictures.fill(out, text) as folder:
+        for name in context.progress.each(list(desired)):
+            try:
+                callback = transports.callback(context, T, settings)
+                result = compensate(T, desired[name], callback=callback, **settings)
+            except LtclError as error:
+                error.args = (f"{error} (compensating {files[name]})",)
+                raise
+            written, panels = _write(
+                folder, name, desired[name], result, factor, settings["bounds"][1], setup
+            )
+            sheet.append(panels)
+            facts = {key: getattr(result, key) for key in _RESULTS}
+            facts |= {"too_dark": float(np.mean(result.out_of_reach > 0))}
+            facts |= {"too_bright": float(np.mean(result.out_of_reach < 0))}
+            facts |= {
+                "channels": report.solution(result.solution),
+                "limited": report.solution(result.limited),
+            }
+            text["pictures"].append({"file": str(files[name]), **facts, **written})
+            rows.append(_row(files[name], facts, f"{name}_pattern.png"))
+        pictures.contact_sheet(sheet[:_SHEET]).save(folder / "compensate.png")
+    columns = ("picture", "method", "products", "gain", "clipped", "error", "pattern")
+    where = f"\npatterns, appearances and what is out of reach as .exr and .png in {out}"
+    return [table(columns, rows), where, f"look at {out / 'compensate.png'}"]
 
 
 def _write(
-    folder: Path, name: str, desired: np.ndarray, found: Compensation, factor: float, white: float, setup: Any
+    folder: Path, name: str, desired: np.ndarray, result: Compensation, factor: float, high: float, setup: Any
 ) -> tuple[dict[str, Any], list[Any]]:
     """Files of one picture, and its row of the contact sheet.
 
-    Appearance / gain compares with the picture that was asked for, whatever the units of T.
+    Appearance / gain compares with the picture that was asked for, whatever the units of T. The .png of the
+    pattern has a pixel for each of the projector: codes of the measured one, else sRGB.
     """
-    scale, error = factor / found.gain, f"{100 * found.error:.2g} % relative error"
-    seen, missing = pictures.shades(found.appearance, scale), found.out_of_reach
-    shown = {
-        "desired": (f"{name}, desired", pictures.shades(desired, factor)),
-        "pattern": (f"{name}, pattern", pictures.shades(found.pattern, 1 / white)),
-        "appearance": (f"{name}, as seen, {error}", seen),
-        "out_of_reach": (
-            "out of reach: orange too dark, blue too bright",
-            pictures.mark(seen, missing * scale),
-        ),
+    from ltcl import images
+
+    scale, white = factor / result.gain, max(high, 0.0) or 1.0
+    seen, pattern = pictures.shades(result.appearance, scale), result.pattern
+    missing = pictures.mark(seen, result.out_of_reach * scale)
+    panels = {
+        "desired": pictures.panel(pictures.shades(desired, factor), f"{name}, desired"),
+        "pattern": pictures.panel(pictures.shades(pattern, 1 / white), f"{name}, pattern"),
+        "appearance": pictures.panel(seen, f"{name}, as seen, {100 * result.error:.2g} % relative error"),
+        "out_of_reach": pictures.panel(missing, "out of reach: orange too dark, blue too bright"),
     }
-    panels = {key: pictures.panel(codes, label) for key, (label, codes) in shown.items()}
-    written = {"pattern": pictures.write_pattern(folder, f"{name}_pattern", found.pattern, white, setup)}
+    images.write(folder / f"{name}_pattern.exr", pattern)
+    codes, encoding = (pattern / white, "srgb") if setup is None else (setup.codes(pattern), "linear")
+    images.write(folder / f"{name}_pattern.png", codes, encoding=encoding)
+    written = {"pattern": {suffix: f"{name}_pattern.{suffix}" for suffix in ("exr", "png")}}
     for key in ("appearance", "out_of_reach"):
-        written[key] = pictures.write(folder, f"{name}_{key}", getattr(found, key), panels[key])
+        written[key] = pictures.write(folder, f"{name}_{key}", getattr(result, key), panels[key])
     return written, list(panels.values())
 
 
-def _show(out: Path, entries: list[dict[str, Any]], note: str) -> None:
-    """Print what came out, and on stderr what would help."""
-    rows = []
-    for entry in entries:
-        solves = entry["channels"] + [each for each in entry["limited"] if each not in entry["channels"]]
-        methods = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
-        products = sum(solve["products"] for solve in solves)
-        clipped, error = f"{100 * entry['clipped']:.1f} %", f"{100 * entry['error']:.2f} %"
-        name, pattern = Path(entry["file"]).name, entry["pattern"]["png"]
-        rows.append((name, methods, products, entry["gain"], clipped, error, pattern))
-    console.table(("picture", "method", "products", "gain", "clipped", "error", "pattern"), rows)
-    typer.echo(f"\npatterns, appearances and what is out of reach as .exr and .png in {out}")
-    typer.echo(f"look at {out / 'compensate.png'}" + (f"\n{note}" if note else ""))
-    for entry in entries:
-        dark, bright = (
-            f"{entry['file']}: {100 * entry[name]:.0f} % of it stays" for name in ("too_dark", "too_bright")
-        )
-        if entry["too_dark"] > _MANY:
-            console.note(
-                f"{dark} too dark for the projector's light; --gain auto finds the largest gain for it"
-            )
-        if entry["too_bright"] > _MANY:
-            console.note(f"{bright} too bright, by bounces or the background; brighten its dark parts")
+def _row(file: Path, facts: dict[str, Any], pattern: str) -> tuple:
+    """Of the table; notes say what would help."""
+    solves = facts["channels"] + [each for each in facts["limited"] if each not in facts["channels"]]
+    methods = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
+    products = sum(solve["products"] for solve in solves)
+    reasons = {"dark": "; a lower --gain helps where the pattern is at 1"}
+    reasons["bright"] = ", by bounces or the background; brighten its dark parts"
+    for name, reason in reasons.items():
+        if (share := facts[f"too_{name}"]) > _MANY:
+            note(f"{file}: {100 * share:.0f} % of it stays too {name}{reason}")
+    shares = percent(facts["clipped"]), percent(facts["error"])
+    return (file.name, methods, products, facts["gain"], *shares, pattern)
+
+
+def _compensate_frames(
+    context: Context, T: Transport, film: Path, out: Path, text: Any, settings: Any
+) -> list[Any]:
+    """Patterns of all frames of a folder or a video into a folder; the lines of the answer."""
+    from ltcl.batch import compensate_frames
+
+    asked = {name: context.options[name] for name in (*_FRAMES, "resize", "encoding")} | settings
+    arguments = {name: value for name, value in asked.items() if value is not None}
+    try:
+        result = compensate_frames(T, film, out, progress=context.progress, **arguments)
+    except KeyboardInterrupt:
+        count = f"{context.progress.done:.0f} frame(s) are done and stay in {out}"
+        raise KeyboardInterrupt(f"interrupted; {count}; --resume goes on from there") from None
+    worst, most, records = result.worst, result.most_clipped, result.records
+    names = ("video", "gain", "solved", "seconds", "frames_per_second", "transport_error")
+    text |= {"source": film, **{name: getattr(result, name) for name in names}, "worst": worst}
+    text |= {"most_clipped": most, "frames": [dataclasses.asdict(record) for record in records]}
+    if most.clipped > _MANY:
+        count = sum(record.clipped > _MANY for record in records)
+        frame = f"frame {most.number} ({most.name}) most"
+        advice = "a lower --gain helps where patterns are at 1"
+        note(f"{count} frame(s) ask for light beyond the projector's range, {frame}; {advice}")
+    pace = f"{result.frames_per_second:.1f}" if result.solved else None
+    columns = ("frames", "of this run", "a second", "gain", "worst error", "most clipped")
+    error, clipped = percent(worst.error), percent(most.clipped)
+    frames = f"{error} in frame {worst.number}", f"{clipped} in frame {most.number}"
+    row = (len(records), result.solved, pace, result.gain, *frames)
+    also = "" if result.video is None else f", as a video in {result.video}"
+    return [table(columns, [row]), f"\npatterns and frames.json in {out}{also}"]

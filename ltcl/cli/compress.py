@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl compress`: a transport in few numbers, at a known cost to its solutions."""
+"""`ltcl compress` and `ltcl invert`: a transport in few numbers, or its inverse."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Annotated, Any
 
 import typer
 
-from ltcl import checks, report
-from ltcl.cli import console, options, transports
-from ltcl.cli.command import Answer, Context
+from ltcl import checks
+from ltcl.cli import options, transports
+from ltcl.cli.analyze import COLOURS
+from ltcl.cli.command import Answer, Context, command, table
 from ltcl.errors import InputError
-from ltcl.store import formats
+from ltcl.store import formats, save_inverse
 
-_COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
 _UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "ki": 1024, "mi": 1024**2, "gi": 1024**3}
 
 
@@ -28,25 +28,17 @@ def _bytes(text: str) -> int:
     return count
 
 
-_Out = Annotated[Path, options.out("The compressed transport: .npz or .zarr.")]
-_Budget = Annotated[
-    int | None,
-    options.option("Bytes that the numbers of R may take, such as 50MB.", parser=_bytes, metavar="SIZE"),
-]
+_BUDGET = "Bytes that the numbers of R may take, such as 50MB."
 
 
+@command(options.file_options, options.transport_options)
 def compress(
     context: Context,
     file: options.Matrix,
-    out: _Out,
+    out: Annotated[Path, options.out("The compressed transport: .npz or .zarr.")],
     rtol: options.SolutionRtol = 1e-2,
-    budget: _Budget = None,
+    budget: Annotated[int | None, options.option(_BUDGET, parser=_bytes, metavar="SIZE")] = None,
     basis: options.Basis = None,
-    grid: options.Grid = None,
-    variable: options.Variable = None,
-    first_bounce: options.FirstBounce = None,
-    on_dark: options.OnDark = "auto",
-    device: options.Device = None,
 ) -> Answer:
     """Write R in a basis where it is sparse; basis, threshold and precision are chosen by measurement."""
     from ltcl import store
@@ -60,40 +52,44 @@ def compress(
     if T.is_compressed and T.error:
         error = f"with an error of {T.error:.2g}"
         raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
-    C = compress(T, rtol, budget, basis=basis or None, progress=context.progress.share)
+    C = compress(T, rtol, budget, basis=basis or None, progress=partial(context.progress, total=1.0))
     store.save(out, C)
     transports.note_lost(file, out)
-    data = transports.heading(context, file, T)
-    data |= {"out": out, "bytes": C.compression.uncompressed, "bytes_compressed": C.nbytes}
-    data |= {
-        "bytes_on_disk": transports.on_disk(out),
-        "solution_error": C.error,
-        "compression": C.compression,
-    }
-    return Answer(data, partial(_show, report.plain(data)))
-
-
-def _show(data: dict[str, Any]) -> None:
-    """The bases that were tried, and what was chosen, by channel."""
-    found = data["compression"]
-    channels = list(zip(_COLOURS[len(found["channels"])], found["channels"], strict=True))
-    typer.echo(f"Tried on {'x'.join(map(str, found['window']))} pixels, errors in the 2-norm of R")
-    columns = ("channel", "basis", "core", "numbers a row", "bytes", "error")
-    rows = [
-        (colour, *_cells(trial), trial["left"] or ("chosen" if trial["basis"] == channel["basis"] else None))
-        for colour, channel in channels
-        for trial in channel["trials"]
-    ]
-    console.table((*columns, "chosen, or why not"), rows)
-    sizes = [checks.size(data[name]) for name in ("bytes", "bytes_compressed", "bytes_on_disk")]
-    within = checks.upwards(data["solution_error"])
-    text = "{} to {} with the first bounce, solutions within {}, {} on disk".format(
-        *sizes[:2], within, sizes[2]
+    facts: Any = C.compression
+    data = transports.heading(context, file, T) | {"out": out, "bytes": facts.uncompressed}
+    data |= {"bytes_compressed": C.nbytes, "bytes_on_disk": transports.on_disk(out)}
+    data |= {"solution_error": C.error, "compression": facts}
+    before, after, disk = (checks.size(data[f"bytes{name}"]) for name in ("", "_compressed", "_on_disk"))
+    columns = ("channel", "basis", "core", "numbers a row", "bytes", "error of R, 2-norm")
+    rows = []
+    for colour, channel in zip(COLOURS[T.channels], facts.channels, strict=True):
+        core = f"{channel.format} 1 x {channel.width} {channel.precision}"
+        rows.append((colour, channel.basis, core, channel.kept, checks.size(channel.nbytes), channel.error))
+    within = f"solutions within {checks.upwards(C.error)}, {disk} on disk, in {facts.seconds:.3g} s"
+    return Answer(
+        data, [table(columns, rows), f"\n{out}: {before} to {after} with the first bounce, {within}"]
     )
-    typer.echo(f"\n{data['out']}: {text}, in {found['seconds']:.3g} s")
 
 
-def _cells(facts: dict[str, Any]) -> tuple:
-    width = f" 1 x {facts['width']}" if facts["format"] == "tiles" else ""
-    core = f"{facts['format']}{width} {facts['precision']}"
-    return facts["basis"], core, f"{facts['kept']:.1f}", checks.size(facts["nbytes"]), facts["error"]
+@command(options.file_options, options.transport_options)
+def invert(
+    context: Context,
+    file: options.Matrix,
+    out: Annotated[Path, options.out("The inverse: .npz.")],
+    rtol: options.SolutionRtol = 1e-2,
+    basis: options.Basis = None,
+) -> Answer:
+    """Find A = I - S^-1, one physical bounce, so that each further picture costs one product."""
+    from ltcl.compression import INVERSE_NAMES, invert
+
+    formats.find(out, inverse=True)  # refused before a long computation
+    transports.refuse_same(out, file)
+    T = transports.load(context, file)
+    progress = partial(context.progress, total=1.0)
+    inverse = invert(T, rtol, basis=basis or INVERSE_NAMES, progress=progress)
+    save_inverse(out, inverse)
+    data = transports.heading(context, file, T)
+    data |= {"out": out, "bytes": inverse.nbytes, "bytes_on_disk": out.stat().st_size}
+    data |= {"errors": inverse.errors, "confidence": inverse.confidence}
+    sizes = f"{checks.size(data['bytes'])}, {checks.size(data['bytes_on_disk'])} on disk"
+    return Answer(data, [f"{out}: solutions within {checks.upwards(inverse.error)}, {sizes}"])

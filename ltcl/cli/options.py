@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Options and arguments that several commands share, each defined once, and the test of output places."""
+"""Options and arguments that several commands share, each defined once; output places are tested at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ltcl.errors import FileError
-from ltcl.solvers.solve import METHODS, SAMPLED
+from ltcl.solvers.solve import METHODS
 
 
 def grid(text: str) -> tuple[int, int]:
@@ -41,7 +41,7 @@ def writable_file(place: Path | None) -> Path | None:
 
 
 def _writable(place: Path, folder: Path) -> Path:
-    """`place`, if a nameless file can be made in the lowest folder above it that is there."""
+    """`place`, if a nameless file can be made in the lowest folder above it that exists."""
     try:
         above = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
         with tempfile.TemporaryFile(dir=above):
@@ -55,16 +55,6 @@ def _method(name: str) -> str:
     if name not in METHODS:
         raise typer.BadParameter(f"{name!r} is no method; choose one of {', '.join(METHODS)}")
     return name
-
-
-def sampling(options: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of a method that samples; the library refuses them with another."""
-    return {name: options[name] for name in ("samples", "seed") if options[name] is not None}
-
-
-def solves(method: str, channels: int) -> int:
-    """How often a callback counts from 0: once for all channels of a method that samples."""
-    return 1 if method in SAMPLED else channels
 
 
 def argument(metavar: str, help: str, **settings: Any) -> Any:
@@ -88,45 +78,60 @@ def out(help: str, callback: Any = writable_file, metavar: str = "FILE") -> Any:
     return file(help, "--out", "-o", callback=callback, metavar=metavar)
 
 
-FORMATS = "Light transport: .npz, .npy, .mtx or .zarr; with the extra hdf5 also .h5, .hdf5 and .mat."
+FORMATS = "Light transport: .npz, .npy, .mtx, .mat or .zarr; with the extra hdf5 also .h5, and .mat of v7.3."
 _DEVICE = "gpu, cpu, an index of 'ltcl devices', or part of a name. Default: LTCL_DEVICE, else the best."
-_RTOL = (
-    "Relative residual at which a solve ends. Default: 0.01 (separate: 0.001), or the error of T where more."
-)
+_GRID, _CAMERA = "Projector pixels, if the file lacks them.", "Camera pixels, if other ones."
+_METHOD = f"One of {', '.join(METHODS)}."
+_INVERSE = "From 'ltcl invert': each picture takes one product and no solve."
+_SEED = "Of monte_carlo and hybrid: the same numbers."
+_ENCODING = "Of pictures; auto: integers sRGB, floats linear."
+_RTOL = "Relative residual that ends a solve. Default: 0.01 (separate: 0.001), or the error of T where more."
 _EXACT = "What TRANSPORT was compressed from: corrects solves to any RTOL; errors are those with it."
 _SAMPLES = "Random walks from each pixel (monte_carlo, 256), or columns of a row (hybrid, 32)."
-_BASIS = (
-    "pixels or a wavelet (haar, db2, ...; of compress 'db2 rows', too); more than once: the best of them."
-)
-_FIRST = (
-    "Direct light: the diagonal of T, or 1 / diag(T^-1), dense or estimated. Default: as the file has it."
-)
-_DARK = (
-    "Projector pixels without direct light: refuse, or leave unlit; auto: unlit if 'ltcl acquire' measured T."
-)
+_BASIS = "pixels or a wavelet (haar, db2, ...; compress: 'db2 rows', too); more than once: the best of them."
+_FIRST = "Direct light: the diagonal of T, or 1 / diag(T^-1), dense or estimated. Default: as in the file."
+_DARK = "Projector pixels without direct light: refuse or leave unlit; auto: unlit if 'ltcl acquire' made T."
 Matrix = Annotated[Path, argument("TRANSPORT", FORMATS)]
 Matrices = Annotated[list[Path], argument("FILE...", FORMATS)]
 Pictures = Annotated[list[Path], argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")]
 Out = Annotated[Path, out("Folder for the results; filled only on success.", writable_folder, "DIR")]
 Acquisition = Annotated[Path, argument("DIR", "Folder with an acquisition.toml; 'ltcl simulate' makes one.")]
 Device = Annotated[str | None, option(_DEVICE)]
-Method = Annotated[str, option(f"One of {', '.join(METHODS)}.", callback=_method, metavar="NAME")]
 SolutionRtol = Annotated[float, option("Relative error that a solution may have.")]
-Rtol = Annotated[float, option("Relative residual at which a solve ends.")]
-TaskRtol = Annotated[float | None, option(_RTOL)]
-Inverse = Annotated[Path | None, file("From 'ltcl invert': each picture takes one product and no solve.")]
-Exact = Annotated[Path | None, file(_EXACT)]
-Samples = Annotated[int | None, option(_SAMPLES, min=1, max=2**32 - 1)]
-Seed = Annotated[int | None, option("Of monte_carlo and hybrid: the same numbers.", min=0, max=2**64 - 1)]
 Basis = Annotated[list[str] | None, option(_BASIS)]
-Grid = Annotated[
-    tuple | None, option("Projector pixels, if the file lacks them.", parser=grid, metavar="HxW")
-]
-CameraGrid = Annotated[tuple | None, option("Camera pixels, if other ones.", parser=grid, metavar="HxW")]
-FirstBounce = Annotated[Literal["diagonal", "exact", "estimate"] | None, option(_FIRST)]
 OnDark = Annotated[Literal["auto", "raise", "mask"], option(_DARK)]
-Resize = Annotated[bool, option("Scale pictures of another size to the grid.", "--resize")]
-Encoding = Annotated[
-    Literal["auto", "srgb", "linear"], option("Of pictures; auto: integers sRGB, floats linear.")
-]
 Variable = Annotated[str | None, option("Name of the matrix in a .mat, .h5 or .npz file.", metavar="NAME")]
+
+
+def file_options(
+    grid: Annotated[tuple | None, option(_GRID, parser=grid, metavar="HxW")] = None,
+    camera_grid: Annotated[tuple | None, option(_CAMERA, parser=grid, metavar="HxW")] = None,
+    variable: Variable = None,
+) -> None:
+    """What a transport file may not contain."""
+
+
+def transport_options(
+    first_bounce: Annotated[Literal["diagonal", "exact", "estimate"] | None, option(_FIRST)] = None,
+    on_dark: OnDark = "auto",
+    device: Device = None,
+) -> None:
+    """How a transport is loaded; with those of `file_options`."""
+
+
+def solve_options(
+    method: Annotated[str, option(_METHOD, callback=_method, metavar="NAME")] = "auto",
+    rtol: Annotated[float | None, option(_RTOL)] = None,
+    inverse: Annotated[Path | None, file(_INVERSE)] = None,
+    exact: Annotated[Path | None, file(_EXACT)] = None,
+    samples: Annotated[int | None, option(_SAMPLES, min=1, max=2**32 - 1)] = None,
+    seed: Annotated[int | None, option(_SEED, min=0, max=2**64 - 1)] = None,
+) -> None:
+    """How a task solves."""
+
+
+def picture_options(
+    resize: Annotated[bool, option("Scale pictures of another size to the grid.", "--resize")] = False,
+    encoding: Annotated[Literal["auto", "srgb", "linear"], option(_ENCODING)] = "auto",
+) -> None:
+    """How pictures are read."""

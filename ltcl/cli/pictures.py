@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pictures in and out: read on a transport's grid, written exactly as EXR and for the eye as labelled PNG.
+"""Pictures in and out: read on a grid; written as EXR, and for the eye as labelled PNG, with a report.
 
 What is written for the eye is enlarged to at least 512 pixels across, each pixel a square. All pictures of a
 run share one exposure, so that they can be compared: what they show is the linear picture times `exposure`.
@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from ltcl import report
+from ltcl.cli.command import Context
 from ltcl.errors import InputError
+from ltcl.files import fill_folder
 
 _WIDTH = 512  # pixels of a picture for the eye, at least
 _MARGIN, _TEXT = 8, 18  # of contact sheets and labels, in pixels
@@ -25,66 +27,53 @@ _VISIBLE = 0.5 / 255  # of white: the smallest difference that is marked
 _DIM = 0.25  # of white: what is darker is shown a second time on a contact sheet, amplified
 
 
-@dataclass(frozen=True)
-class Reader:
-    """How picture files become linear pictures on a `grid`: their encoding, and whether they are scaled.
-
-    Integers are codes for the projector of a `setup`, where there is one and nothing else is asked for.
-    Photographs, not `upright`, keep the camera's pixels.
-    """
-
-    grid: tuple[int, int]
-    whose: str
-    encoding: Literal["auto", "srgb", "linear"]
-    resize: bool
-    setup: Any = None
-    upright: bool = True
-
-    def read(self, path: Path) -> np.ndarray:
-        """The picture in `path`, linear float32, (h, w[, 3]); InputError where its size is another."""
-        from ltcl import images
-
-        codes = self.setup and self.encoding == "auto" and images.read_codes(path).dtype.kind == "u"
-        picture = images.read(path, encoding="linear" if codes else self.encoding, upright=self.upright)
-        if self.resize and picture.shape[:2] != self.grid:
-            picture = images.resize(picture, self.grid)
-        if picture.shape[:2] != self.grid:
-            has, needed = ("{} x {}".format(*size) for size in (picture.shape[:2], self.grid))
-            raise InputError(
-                f"{path}: has {has} pixels, but {self.whose} has {needed}; --resize scales the picture"
-            )
-        return self.setup.light(picture) if codes else picture
-
-    def read_all(self, paths: Sequence[Path]) -> dict[str, np.ndarray]:
-        """All pictures by the names of their results."""
-        return {name: self.read(path) for name, path in names(paths).items()}
-
-
-def names(paths: Sequence[Path]) -> dict[str, Path]:
-    """A name for the results of each file: its stem, with a number where an earlier one has it.
-
-    >>> list(names([Path("sky.png"), Path("sky.exr"), Path("a/sky.exr"), Path("sea.png")]))
-    ['sky', 'sky_2', 'sky_3', 'sea']
-    """
-    named: dict[str, Path] = {}
-    for path in paths:
-        name, number = path.stem, 1
-        while name.lower() in map(str.lower, named):  # some file systems ignore case
-            number += 1
-            name = f"{path.stem}_{number}"
-        named[name] = path
-    return named
-
-
 @contextmanager
-def naming(files: Mapping[str, Path | None]) -> Iterator[None]:
-    """Put the file in front of a refusal that begins with the name of the argument it was read for."""
-    try:
-        yield
-    except InputError as error:
-        if file := files.get(str(error).partition(" ")[0]):
-            error.args = (f"{file}: {error}",)
-        raise
+def fill(out: Path, text: dict[str, Any]) -> Iterator[Path]:
+    """Fill `out` as `fill_folder` does, with the report `text`, named after its command, of all files.
+
+    Other files in it stay. A second run that writes there is refused at once.
+    """
+    from ltcl.batch.manifest import locked
+
+    with locked(out), fill_folder(out) as folder:
+        yield folder
+        name, files = f"{text['command']}.json", [file for file in folder.rglob("*") if file.is_file()]
+        text["files"] = [*sorted(file.relative_to(folder).as_posix() for file in files), name]
+        report.write(folder / name, text)
+
+
+def read(
+    context: Context, path: Path, grid: tuple[int, int], whose: str, setup: Any = None, upright: bool = True
+) -> np.ndarray:
+    """A linear picture on a `grid`, float32 (h, w[, 3]), by --encoding and --resize.
+
+    Integers are codes for the projector of a `setup`, where there is one and no other encoding is asked for.
+    Photographs, not `upright`, keep the camera's pixels. InputError where the size is another.
+    """
+    from ltcl import images
+
+    encoding, is_code = context.options["encoding"], False
+    if setup is not None and encoding == "auto":
+        is_code = images.read_codes(path).dtype.kind == "u"
+    picture = images.read(path, encoding="linear" if is_code else encoding, upright=upright)
+    if picture.shape[:2] != grid and context.options["resize"]:
+        picture = images.resize(picture, grid)
+    if picture.shape[:2] != grid:
+        (h, w), (height, width) = picture.shape[:2], grid
+        size = f"has {h} x {w} pixels, but {whose} has {height} x {width}"
+        raise InputError(f"{path}: {size}; --resize scales the picture")
+    return setup.light(picture) if setup is not None and is_code else picture
+
+
+def read_all(context: Context, paths: Sequence[Path], *place: Any, **settings: Any) -> dict[str, np.ndarray]:
+    """All pictures, as `read` does, by names for their results: stems, longer where an earlier one has it."""
+    images: dict[str, np.ndarray] = {}
+    for path in paths:
+        name = path.stem
+        while name.lower() in map(str.lower, images):  # some file systems ignore case
+            name += "_2"
+        images[name] = read(context, path, *place, **settings)
+    return images
 
 
 def exposure(*pictures: np.ndarray) -> float:
@@ -106,21 +95,6 @@ def write(folder: Path, name: str, picture: np.ndarray, shown: Any) -> dict[str,
     return {"exr": f"{name}.exr", "png": f"{name}.png"}
 
 
-def write_pattern(folder: Path, name: str, light: np.ndarray, white: float, setup: Any) -> dict[str, str]:
-    """Write ``name.exr`` with the light, and ``name.png`` with the codes of the projector, pixel for pixel.
-
-    Codes are those of a measured projector, `setup`; else sRGB, with light `white` as white.
-    """
-    from ltcl import images
-
-    images.write(folder / f"{name}.exr", light)
-    if setup is None:
-        images.write(folder / f"{name}.png", light / white)
-    else:
-        images.write(folder / f"{name}.png", setup.codes(light), encoding="linear")
-    return {"exr": f"{name}.exr", "png": f"{name}.png"}
-
-
 def shades(picture: np.ndarray, factor: float) -> np.ndarray:
     """A linear picture times `factor` in sRGB, (h, w, 3) in [0, 1]."""
     from ltcl import images
@@ -132,12 +106,11 @@ def shades(picture: np.ndarray, factor: float) -> np.ndarray:
 def mark(codes: np.ndarray, missing: np.ndarray) -> np.ndarray:
     """sRGB values in grey, and over it orange where light is `missing`, blue where there is too much."""
     grey = 0.15 + 0.55 * codes.mean(axis=-1, keepdims=True)
-    if missing.ndim == 3:  # of the colour that deviates most
-        largest = np.argmax(np.abs(missing), axis=-1)[..., None]
-        missing = np.take_along_axis(missing, largest, axis=-1)[..., 0]
-    amount = np.abs(missing)[..., None]
-    share = np.where(amount > _VISIBLE, np.clip(0.4 + 2.0 * amount, 0.0, 1.0), 0.0)
-    return (1 - share) * grey + share * np.where(missing[..., None] > 0, _ORANGE, _BLUE)
+    missing = missing.reshape(*codes.shape[:2], -1)
+    largest = np.argmax(np.abs(missing), axis=-1)[..., None]  # the colour that deviates most
+    missing = np.take_along_axis(missing, largest, axis=-1)
+    share = np.where(np.abs(missing) > _VISIBLE, np.clip(0.4 + 2.0 * np.abs(missing), 0.0, 1.0), 0.0)
+    return (1 - share) * grey + share * np.where(missing > 0, _ORANGE, _BLUE)
 
 
 def panel(codes: np.ndarray, label: str) -> Any:
@@ -168,10 +141,10 @@ def contact_sheet(rows: Sequence[Sequence[Any]]) -> Any:
     return sheet
 
 
-def amplified(parts: Mapping[str, np.ndarray], factor: float) -> list[Any]:
+def amplified(components: Mapping[str, np.ndarray], factor: float) -> list[Any]:
     """Panels of what is too dark to be seen at this exposure, times powers of two that their labels name."""
     panels = []
-    for name, picture in parts.items():
+    for name, picture in components.items():
         times = 2 ** int(np.log2(max(exposure(picture) / factor, 1.0)))
         if times * _DIM >= 1:
             panels.append(panel(shades(picture, factor * times), f"{name}, {times} times as bright"))

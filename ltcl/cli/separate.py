@@ -1,42 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl separate`: each bounce of light of a picture as a picture of its own."""
+"""`ltcl separate`: each bounce of light of a picture as a picture; `ltcl relight`: light under patterns."""
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 
 from ltcl import checks, report
-from ltcl.cli import console, options, pictures, results, transports
-from ltcl.cli.command import Answer, Context
-from ltcl.separation import Separation
-
-_Bounces = Annotated[int, options.option("Indirect bounces to tell apart.", min=0)]
+from ltcl.cli import options, pictures, transports
+from ltcl.cli.command import Answer, Context, command, percent, table
 
 
+@command(options.file_options, options.transport_options, options.solve_options, options.picture_options)
 def separate(
     context: Context,
     transport: options.Matrix,
     picture: options.Pictures,
     out: options.Out,
-    bounces: _Bounces = 4,
-    grid: options.Grid = None,
-    variable: options.Variable = None,
-    method: options.Method = "auto",
-    rtol: options.TaskRtol = None,
-    inverse: options.Inverse = None,
-    exact: options.Exact = None,
-    samples: options.Samples = None,
-    seed: options.Seed = None,
-    first_bounce: options.FirstBounce = None,
-    on_dark: options.OnDark = "auto",
-    resize: options.Resize = False,
-    encoding: options.Encoding = "auto",
-    device: options.Device = None,
+    bounces: Annotated[int, options.option("Indirect bounces to separate.", min=0)] = 4,
 ) -> Answer:
     """Split PICTURE, taken of the scene under projector light, into direct light and bounces.
 
@@ -45,69 +28,89 @@ def separate(
     separate.png with all of them. Several pictures get a folder each.
     """
     from ltcl.separation import RTOL, separate
-    from ltcl.transport import default_rtol
 
-    sampled = options.sampling(context.options)
     T = transports.load(context, transport)
-    judges = transports.load_judges(context, T)
-    rtol = default_rtol(RTOL, T, judges["exact"], judges["inverse"]) if rtol is None else rtol
-    images = pictures.Reader(T.grid, "the camera", encoding, resize, upright=False).read_all(picture)
-    factor, solves = pictures.exposure(*images.values()), options.solves(method, T.channels) * (bounces + 1)
-    text = transports.heading(context, transport, T, rtol=rtol, **sampled) | {"exposure": factor}
-    text["pictures"], rows = [], []
-    with results.fill(out, text) as folder:
-        for name, file in zip(context.progress.each(list(images)), picture, strict=True):
-            solving = {"method": method, "rtol": rtol, "callback": context.progress.solve(rtol, solves)}
-            found = separate(T, images[name], bounces, **solving, **judges, **sampled)
-            parts, panels = _write(folder, f"{name}/" * (len(images) > 1), found, images[name], factor)
-            error = found.transport_error
-            text["pictures"].append({"file": str(file), "transport_error": error, "parts": parts})
-            first = [pictures.panel(pictures.shades(images[name], factor), name), *panels[:2]]
-            rows += [row for row in (first, panels[2:], pictures.amplified(_parts(found), factor)) if row]
-        pictures.contact_sheet(rows).save(folder / "separate.png")
-    note = transports.caveat("all of this is", T, exact)
-    return Answer({"folder": out, **text}, partial(_show, out, text["pictures"], note))
+    settings = transports.solving(context, T, RTOL)
+    images = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
+    files = dict(zip(images, picture, strict=True))
+    factor, entries, sheet, rows, errors = pictures.exposure(*images.values()), [], [], [], []
+    text = transports.heading(context, transport, T, rtol=settings["rtol"])
+    text |= {"exposure": factor, "pictures": entries}
+    with pictures.fill(out, text) as folder:
+        for name in context.progress.each(list(images)):
+            callback = transports.callback(context, T, settings, bounces + 1)
+            result = separate(T, images[name], bounces, callback=callback, **settings)
+            light = {"direct": result.direct, "indirect": result.indirect}
+            light |= {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)} | {
+                "rest": result.rest
+            }
+            solutions = iter(result.solutions)
+            panels, facts = [pictures.panel(pictures.shades(images[name], factor), name)], []
+            for component, picture_of in light.items():
+                panels.append(pictures.panel(pictures.shades(picture_of, factor), component))
+                place = f"{name}/{component}" if len(images) > 1 else component
+                written = pictures.write(folder, place, picture_of, panels[-1])
+                solves = [] if component in ("indirect", "rest") else report.solution(next(solutions))
+                share = _share(picture_of, images[name])
+                facts.append(
+                    {"part": component, **written, "share": share, "lowest": float(picture_of.min())}
+                )
+                facts[-1]["channels"] = solves
+                errors += [solve["error"] for solve in solves if solve["error"] is not None]
+                residual = max((each["residual"] for each in solves if each["error"] is None), default=None)
+                products = sum(each["products"] for each in solves) or None
+                rows.append((files[name].name, component, percent(share, 4), products, residual))
+            entries.append(
+                {"file": str(files[name]), "transport_error": result.transport_error, "parts": facts}
+            )
+            sheet += [panels[:3], panels[3:], pictures.amplified(light, factor)]
+        pictures.contact_sheet([row for row in sheet if row]).save(folder / "separate.png")
+    lines: list[Any] = [table(("picture", "part", "share of light", "products", "residual"), rows)]
+    lines.append(f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}")
+    if errors:
+        worst = 100 * float(checks.upwards(max(errors)))
+        lines.append(f"the relative error of each part by the inverse is at most {worst:.2g} %")
+    lines.append(transports.caveat("all of this is", T, context.options["exact"]))
+    return Answer({"folder": out, **text}, lines)
 
 
-def _parts(found: Separation) -> dict[str, np.ndarray]:
-    bounces = {f"bounce_{k}": part for k, part in enumerate(found.bounces, 1)}
-    return {"direct": found.direct, "indirect": found.indirect, **bounces, "rest": found.rest}
+def _share(light: np.ndarray, picture: np.ndarray) -> float | None:
+    """Of the light of a picture, over pixels and three colours."""
+    sums = [float(np.sum(each, dtype=np.float64)) * (1 if each.ndim == 3 else 3) for each in (light, picture)]
+    return sums[0] / sums[1] if sums[1] else None
 
 
-def _write(
-    folder: Path, place: str, found: Separation, image: np.ndarray, factor: float
-) -> tuple[list[dict[str, Any]], list[Any]]:
-    """All parts of one picture as files, with their share of the light and their solves; and their panels."""
-    entries, panels, whole = [], [], _light(image)
-    names = ["direct", *(f"bounce_{k}" for k, _ in enumerate(found.bounces, 1))]
-    solutions = dict(zip(names, found.solutions, strict=True))
-    for name, part in _parts(found).items():
-        panels.append(pictures.panel(pictures.shades(part, factor), name))
-        entry = {"part": name, **pictures.write(folder, place + name, part, panels[-1])}
-        entry |= {"share": _light(part) / whole if whole else None, "lowest": float(part.min())}
-        entries.append(entry | {"channels": report.solution(solutions[name]) if name in solutions else []})
-    return entries, panels
+@command(options.file_options, options.picture_options)
+def relight(
+    context: Context,
+    transport: options.Matrix,
+    pattern: Annotated[list[Path], options.argument("PATTERN...", "Pictures of patterns.")],
+    out: options.Out,
+    on_dark: options.OnDark = "auto",
+    device: options.Device = None,
+) -> Answer:
+    """Show what the camera will see when PATTERN is projected.
 
+    With a TRANSPORT of 'ltcl acquire' a PATTERN of integers, as .png, holds the codes for its projector, and
+    the result is what the pattern adds to the ambient light.
 
-def _light(part: np.ndarray) -> float:
-    """The sum over pixels and three colours."""
-    return float(np.sum(part, dtype=np.float64)) * (1 if part.ndim == 3 else 3)
+    Writes pictures exactly as .exr, and for the eye as .png at one exposure, which relight.json names.
+    """
+    from ltcl.acquisition import Setup
+    from ltcl.relighting import relight
 
-
-def _show(out: Path, entries: list[dict[str, Any]], note: str) -> None:
-    rows = []
-    for entry in entries:
-        for part in entry["parts"]:
-            share = None if part["share"] is None else f"{100 * part['share']:.2f} %"
-            products = sum(channel["products"] for channel in part["channels"]) or None
-            residual = max((c["residual"] for c in part["channels"] if c["error"] is None), default=None)
-            rows.append((Path(entry["file"]).name, part["part"], share, products, residual))
-    console.table(("picture", "part", "share of light", "products", "residual"), rows)
-    typer.echo(
-        f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}"
-        + (f"\n{note}" if note else "")
-    )
-    channels = [channel for entry in entries for part in entry["parts"] for channel in part["channels"]]
-    if bounds := [channel["error"] for channel in channels if channel["error"] is not None]:
-        worst = 100 * float(checks.upwards(max(bounds)))
-        typer.echo(f"the relative error of each part by the inverse is at most {worst:.2g} %")
+    T = transports.load(context, transport, dark_note=False)
+    setup = Setup.of(transport) if transports.is_measured(transport) else None
+    patterns = pictures.read_all(context, pattern, T.grid, "the projector", setup)
+    light = {name: relight(T, each) for name, each in patterns.items()}
+    factor, entries = pictures.exposure(*light.values()), []
+    text = transports.heading(context, transport, T) | {"exposure": factor, "pictures": entries}
+    with pictures.fill(out, text) as folder:
+        for (name, picture), file in zip(light.items(), pattern, strict=True):
+            panel = pictures.panel(pictures.shades(picture, factor), f"{file.name}, relit")
+            facts = {"file": str(file), "brightest": float(picture.max())}
+            entries.append(facts | pictures.write(folder, f"{name}_relit", picture, panel))
+    rows = [(Path(entry["file"]).name, entry["brightest"], entry["exr"]) for entry in entries]
+    lines = [table(("pattern", "brightest in picture", "picture"), rows)]
+    lines += [f"\npictures as .exr and .png in {out}", transports.caveat("they are", T)]
+    return Answer({"folder": out, **text}, lines)

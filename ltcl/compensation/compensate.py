@@ -118,10 +118,10 @@ class Compensation:
         return f"<ltcl Compensation {shape}, {error}, {self.clipped:.2%} clipped>"
 
     def _repr_html_(self) -> str:
-        from ltcl.images.thumbnails import figures  # brings OpenCV
+        from ltcl.images.pictures import thumbnails  # brings OpenCV
 
         names = ("pattern", "appearance", "target", "out_of_reach")
-        return figures(self, {name: getattr(self, name) for name in names})
+        return thumbnails(self, {name: getattr(self, name) for name in names})
 
 
 def compensate(
@@ -320,7 +320,7 @@ def _within(
                 raise ConvergenceError(str(solution), solution)
             limited.append(solution)
             at_bound = (nearest <= limits.low) | (nearest >= limits.high)
-            beyond = solution.held & at_bound & ~limits.masked[:, None]
+            beyond = solution.saturated & at_bound & ~limits.masked[:, None]
         light.append(nearest)
         if beyond is not None:
             counts = np.reshape([np.count_nonzero(column) for column in beyond.T], (frames, -1))
@@ -340,7 +340,7 @@ def _result(
 ) -> Compensation:
     target, frames = problem.scaled(start.gain), len(frame_clipped)
     clipped = float(np.mean(frame_clipped))
-    missing, seen = [one.rest for one in start.solutions if one.rest is not None], None
+    missing, seen = [solution.rest for solution in start.solutions if solution.rest is not None], None
     if clipped or limited or len(missing) < T.channels or problem.limits.masked.any():
         seen = [A.apply(A.device.upload(p)) for A, p in zip(T.operators, light, strict=True)]
     pattern = shape.pack(light, T.grid)  # while the device works

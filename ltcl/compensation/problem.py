@@ -271,7 +271,7 @@ def _alike(name: str, value: Any, T: Transport, shape: layout.Layout, like: Colu
     columns, own = layout.unpack(name, value, T.camera_grid, T.channels)
     # (M, frames, colours): one frame or one grey serves all.
     have, want = (
-        (len(like[0]), one.frames or 1, 3 if one.colour and T.channels == 1 else 1) for one in (own, shape)
+        (len(like[0]), size.frames or 1, 3 if size.colour and T.channels == 1 else 1) for size in (own, shape)
     )
     try:
         return [np.broadcast_to(c.reshape(have), want).reshape(c.shape[0], -1) for c in columns]

@@ -177,7 +177,7 @@ def validate_inputs(
     F, _ = _first_bounce.find(rows, "diagonal" if first_bounce is None else first_bounce, lambda: device)
     F, _ = _first_bounce.mask_dark(F, grid, may_mask=False)
     R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
-    return Inputs([Problem(one, Host(device, one), grid) for one in R], F, grid, _dense_nbytes(F))
+    return Inputs([Problem(r, Host(device, r), grid) for r in R], F, grid, _dense_nbytes(F))
 
 
 def of_transport(T: Transport, memory: int | None = None) -> Inputs:
@@ -190,8 +190,8 @@ def of_transport(T: Transport, memory: int | None = None) -> Inputs:
     try:
         operators, nbytes = [S.R for S in T.systems], T.nbytes or _dense_nbytes(F)
     except MemoryError:  # of the device, or of the host
-        operators, nbytes = [Host(T.device, one) for one in R], _dense_nbytes(F)
-    problems = [Problem(one, product, T.grid) for one, product in zip(R, operators, strict=True)]
+        operators, nbytes = [Host(T.device, rows) for rows in R], _dense_nbytes(F)
+    problems = [Problem(rows, product, T.grid) for rows, product in zip(R, operators, strict=True)]
     return Inputs(problems, F, T.grid, nbytes, bool(T.masked.any()), T.mixing)
 
 

@@ -132,7 +132,7 @@ def _reachable(scene: Scene, T: Transport) -> tuple[np.ndarray, float, float]:
     # Thickest in the middle, where the walls meet and most light comes back.
     thickness = np.exp(-(place**2 + place[:, None] ** 2) / _RADIUS**2)[..., None]
     mist = (_OUTSIDE + (1 - _OUTSIDE) * thickness) * np.array(_MIST) * (1.0 - sunset)
-    sides = [scene.sample(part) for part in (sunset, mist)]
+    sides = [scene.sample(picture) for picture in (sunset, mist)]
     columns = np.stack(sides, axis=-1).reshape(-1, 3, 2).transpose(1, 0, 2).astype(np.float64)  # (3, N, 2)
     light = [solve(S, b, rtol=RTOL).x.astype(np.float64) for S, b in zip(T.systems, columns, strict=True)]
     low, high = 0.0, 1.0
@@ -142,4 +142,4 @@ def _reachable(scene: Scene, T: Transport) -> tuple[np.ndarray, float, float]:
         enough = np.linalg.norm(np.stack(lost)) < _LOST * np.linalg.norm(columns @ (1.0, b))
         low, high = (low, b) if enough else (b, high)
     pattern = [x @ (1.0, high) / F for x, F in zip(light, T.first_bounce, strict=True)]
-    return sides[0] + np.float32(high) * sides[1], high, max(float(part.max()) for part in pattern)
+    return sides[0] + np.float32(high) * sides[1], high, max(float(colour.max()) for colour in pattern)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from ltcl.images.io import BITS, read, read_codes, write
-from ltcl.images.resize import resize
-from ltcl.images.srgb import from_srgb, to_srgb
+from ltcl.images.pictures import BITS, from_srgb, read, read_codes, resize, to_srgb, write
 
 __all__ = ["BITS", "from_srgb", "read", "read_codes", "resize", "to_srgb", "write"]

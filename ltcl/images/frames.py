@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Many pictures in a row, a folder of them or a video, read as linear light; videos written.
 
-Videos are decoded by OpenCV's FFmpeg to 8 bits a channel, in order: seeking is not exact in all formats.
-Where one is damaged, FFmpeg leaves frames out without an error, so they are counted. Formats of `_COUNTED`
-keep their number, and fewer are an error; others, as Matroska, keep a duration, which a sound track may
-stretch: a warning. Known limit: a frame of wrong pixels, as a decoder conceals damage.
+OpenCV's FFmpeg decodes videos to 8 bits a channel and leaves damaged frames out: they are counted. `_COUNTED`
+formats keep their number; others, as Matroska, a duration, which sound may stretch: a warning. Known limits:
+a decoder may replace damaged pixels by others, and FFmpeg itself also writes to stderr about damage.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
 import os
 import re
-from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,15 +23,12 @@ import numpy as np
 from ltcl import checks
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
-from ltcl.images.io import BITS, as_picture, quiet, read
-from ltcl.images.srgb import ENCODINGS, Encoding, from_linear, to_linear
+from ltcl.images.pictures import BITS, ENCODINGS, Encoding, as_picture, decoding, from_linear, read, to_linear
 
 _COUNTED = (".mp4", ".m4v", ".mov", ".3gp", ".avi")
 EXTENSIONS = (*_COUNTED, ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv", ".flv", ".ogv")  # of videos
 CODECS = {".mkv": "FFV1", ".avi": "FFV1", ".mp4": "mp4v"}  # of videos that can be written
 _logger = logging.getLogger(__name__)
-# FFmpeg writes about damage to stderr, and OpenCV has no other switch for that; read at the first video.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,30 +50,23 @@ class Frame:
         """Linear float32, (h, w) or (h, w, 3); FileError where it cannot be read."""
         if isinstance(self.stored, Path):
             return read(self.stored, encoding=self.encoding)
-        b, g, r = np.moveaxis(self.stored, -1, 0)
+        b, g, r = cv2.split(self.stored)
         is_grey = np.array_equal(b, g) and np.array_equal(g, r)  # which costs a third
-        return to_linear(b if is_grey else np.stack([r, g, b], axis=-1), self.encoding)
+        return to_linear(b if is_grey else cv2.cvtColor(self.stored, cv2.COLOR_BGR2RGB), self.encoding)
 
 
 class Source:
-    """The frames of a folder or a video, in order: `count` of them, or None; of a video an estimate.
-
-    `fps` are a video's frames a second, None where they are not known.
-    """
+    """The frames of a folder or a video, in order: `count`, an estimate of a video, and `fps`, or None."""
 
     def __init__(self, path: Path, encoding: Encoding) -> None:
-        self.path = path
+        self.path, self.fps = path, None
         self.encoding: Encoding = encoding
-        self.count: int | None = None
-        self.fps: float | None = None
         self._files = _pictures(path) if path.is_dir() else []
-        if self._files:
-            self.count = len(self._files)
-            return
-        with _opened(input_file(path)) as capture:
-            count, fps = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
-        self.count = int(count) if 0 < count < 1e12 else None
-        self.fps = fps if 0 < fps < 1e6 else None
+        self.count: int | None = len(self._files)
+        if not self._files:
+            capture = _opened(path)
+            self.count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0) or None
+            self.fps = max(capture.get(cv2.CAP_PROP_FPS), 0.0) or None
 
     def __iter__(self) -> Iterator[Frame]:
         """All frames from the first one on; FileError where one is missing."""
@@ -86,20 +74,15 @@ class Source:
             for number, file in enumerate(self._files, start=1):
                 yield Frame(number, file.name, file, self.encoding)
             return
-        number = 0
-        with _opened(self.path) as capture:
-            while True:
-                with quiet():
-                    success, stored = capture.read()
-                if not success:
-                    break
-                number += 1
-                yield Frame(number, f"{self.path.name}:{number}", stored, self.encoding)
+        number, capture = 0, _opened(self.path)
+        while (decoded := capture.read())[0]:
+            number += 1
+            yield Frame(number, f"{self.path.name}:{number}", decoded[1], self.encoding)
         if number < (self.count or 1):
-            text = f"{self.path}: {number} of {self.count or 'its'} frames can be read"
+            text = f"{self.path}: {number} of {self.count or 'its'} frames can be read; the video is damaged"
             if not number or self.path.suffix.lower() in _COUNTED:
-                raise FileError(f"{text}; the video is damaged or cut off")
-            _logger.warning("%s; in this format their number is an estimate, or the video is damaged", text)
+                raise FileError(text)
+            _logger.warning("%s, or their number is an estimate, as this format may keep it", text)
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -110,29 +93,24 @@ def _pictures(folder: Path) -> list[Path]:
         return [int(piece) if place % 2 else piece for place, piece in enumerate(pieces)], file.name
 
     try:
-        visible = sorted((file for file in folder.iterdir() if not file.name.startswith(".")), key=order)
+        visible = [file for file in folder.iterdir() if not file.name.startswith(".")]
     except OSError as error:
         raise FileError(f"{folder}: cannot be read: {error.strerror}") from error
-    files = [file for file in visible if file.suffix.lower() in BITS and file.is_file()]
+    files = sorted((file for file in visible if file.suffix.lower() in BITS and file.is_file()), key=order)
     if not files:
         raise FileError(f"{folder}: holds no pictures; frames are {', '.join(BITS)}")
-    stem, times = Counter(file.stem for file in files).most_common(1)[0]
-    if times > 1:
-        twins = " and ".join(file.name for file in files if file.stem == stem)
-        raise FileError(f"{folder}: holds {twins}; each frame must be one file")
+    for file, other in itertools.pairwise(files):
+        if file.stem == other.stem:
+            raise FileError(f"{folder}: holds {file.name} and {other.name}; each frame must be one file")
     return files
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
-    with quiet():
+def _opened(path: Path) -> cv2.VideoCapture:
+    with decoding(input_file(path)):
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    try:
         if not capture.isOpened():
-            raise FileError(f"{path}: is no video that can be decoded, or a damaged or truncated one")
-        yield capture
-    finally:
-        capture.release()
+            raise FileError("is no video that can be decoded, or a damaged or truncated one")
+        return capture
 
 
 def is_frames(path: str | os.PathLike[str]) -> bool:
@@ -141,27 +119,15 @@ def is_frames(path: str | os.PathLike[str]) -> bool:
 
 
 def open_frames(path: str | os.PathLike[str], *, encoding: Encoding = "auto") -> Source:
-    """Open a folder of pictures or a video file as an iterable of `Frame`.
+    """Open a folder of pictures, in natural order, or a video, upright as a player shows it.
 
-    Pictures of a folder are taken in natural order, frame2 before frame10, hidden and other files left out; a
-    video is upright, as a player shows it. `encoding` is that of `ltcl.images.read`. FileError for no picture
-    in the folder, two files of one name in it, an unknown extension, no readable video.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from ltcl import images
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> for number in (10, 9):
-    ...     images.write(folder / f"sky{number}.exr", np.full((2, 3), number))
-    >>> [(frame.number, frame.name, frame.picture().max()) for frame in open_frames(folder)]
-    [(1, 'sky9.exr', np.float32(9.0)), (2, 'sky10.exr', np.float32(10.0))]
+    Hidden and other files are left out; `encoding` is that of `ltcl.images.read`. FileError for no picture in
+    the folder, two files of one name in it, an unknown extension, no readable video.
     """
     checks.one_of("encoding", encoding, ENCODINGS)
     path = as_path(path)
-    if path.is_file() and path.suffix.lower() not in EXTENSIONS:
-        kinds = ", ".join(EXTENSIONS)
-        raise FileError(f"{path}: {unknown_extension(path)}; frames are a folder, or a video: {kinds}")
+    if path.is_file() and not is_frames(path):
+        raise FileError(f"{path}: {unknown_extension(path)}; videos are {', '.join(EXTENSIONS)}")
     return Source(path, encoding)
 
 
@@ -175,44 +141,32 @@ def check_video(path: str | os.PathLike[str], grid: tuple[int, int]) -> None:
 
 
 def write_video(path: str | os.PathLike[str], pictures: Iterable[np.ndarray], fps: float = 25.0) -> int:
-    """Write linear pictures as a video; an earlier file is replaced whole or not at all.
+    """Write linear pictures as a video, which replaces another whole or not at all; their number.
 
     `path` ends in .mkv or .avi (lossless) or .mp4; 8 bits in sRGB. `pictures`, (h, w) or (h, w, 3), are cut
-    to [0, 1]; h and w are even and the same for all. Their number is returned. InputError for other sizes, no
-    frames or NaN; FileError for another extension or a file that cannot be written.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp()) / "grey.mkv"
-    >>> write_video(path, [np.full((4, 6), level) for level in (0.0, 0.5, 1.0)])
-    3
-    >>> [float(frame.picture().mean().round(1)) for frame in open_frames(path)]
-    [0.0, 0.5, 1.0]
+    to [0, 1]; h and w are even and the same for all. InputError for other sizes, no frames or NaN; FileError
+    for another extension or a file that cannot be written.
     """
     path, fps = as_path(path), checks.number("fps", fps, above=0.0)
     check_video(path, (0, 0))
-    writer, codec, grid, count = cv2.VideoWriter(), CODECS[path.suffix.lower()], (0, 0), 0
+    writer, codec, shape, count = cv2.VideoWriter(), CODECS[path.suffix.lower()], (), 0
     with replace_file(path) as temporary:
         try:
             for count, picture in enumerate(pictures, start=1):
                 codes = from_linear(as_picture("a frame", picture), "srgb", 8, is_float=False)
+                codes = cv2.cvtColor(codes, cv2.COLOR_GRAY2BGR if codes.ndim == 2 else cv2.COLOR_RGB2BGR)
                 if count == 1:
-                    grid = h, w = codes.shape[:2]
-                    check_video(path, grid)
-                    with quiet():
-                        writer.open(str(temporary), cv2.CAP_FFMPEG, writer.fourcc(*codec), fps, (w, h))
-                    if not writer.isOpened():
-                        raise FileError(f"{path}: OpenCV cannot write {codec} there")
-                if codes.shape[:2] != grid:
-                    raise InputError(f"frame {count} is {codes.shape[:2]}; it must be {grid} as the first")
-                to_bgr = cv2.COLOR_GRAY2BGR if codes.ndim == 2 else cv2.COLOR_RGB2BGR
-                writer.write(cv2.cvtColor(codes, to_bgr))
+                    shape = h, w, _ = codes.shape
+                    check_video(path, (h, w))
+                    writer.open(str(temporary), cv2.CAP_FFMPEG, writer.fourcc(*codec), fps, (w, h))
+                if codes.shape != shape:
+                    raise InputError(f"frame {count} is {codes.shape[:2]}; the first is {shape[:2]}")
+                writer.write(codes)
         finally:
             writer.release()
         if not count:
             raise InputError(f"{path}: there are no frames to write")
-        written = Source(temporary, "auto").count  # OpenCV says nothing about a full disk
-        if written != count:
-            raise FileError(f"{path}: {written} of {count} frames could be written; is the disk full?")
+        written = int(cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT))
+        if written != count:  # of which OpenCV says nothing
+            raise FileError(f"{path}: holds {written} of {count} frames in {codec}; is the disk full?")
     return count

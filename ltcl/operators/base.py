@@ -79,8 +79,8 @@ class Operator(scipy.sparse.linalg.LinearOperator):
 
     def arrays(self) -> set[Array]:
         """All that it keeps on the device."""
-        parts = (part for part in self._parts if part is not None)
-        return set[Array]().union(*({part} if isinstance(part, Array) else part.arrays() for part in parts))
+        members = (x for x in self._parts if x is not None)
+        return set[Array]().union(*({x} if isinstance(x, Array) else x.arrays() for x in members))
 
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         """Queue ``out = a (A x) + b y + c x``, or with A^T. `out` is never `x`."""

@@ -165,14 +165,14 @@ class RowBlocks(CSR):
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """Read again; neighbouring ones in one, up to `_SLAB` bytes."""
-        some: list[Any] = []
+        gathered: list[Any] = []
         start = 0
         for first, block in self._blocks():
-            if some and 8 * (sum(part.nnz for part in some) + block.nnz) > _SLAB:
-                yield start, _joined(start, some)
-                some, start = [], first
-            some.append(block)
-        yield start, _joined(start, some)
+            if gathered and 8 * (sum(rows.nnz for rows in gathered) + block.nnz) > _SLAB:
+                yield start, _joined(start, gathered)
+                gathered, start = [], first
+            gathered.append(block)
+        yield start, _joined(start, gathered)
 
     @cached_property
     def _host(self) -> scipy.sparse.csr_array:

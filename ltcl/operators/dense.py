@@ -36,7 +36,7 @@ class Dense(RowOperator):
     """
 
     file = "dense"
-    given: tuple[np.ndarray, ...] | None = None  # (A, d, e): it is A / d - diag(e), rounded to float32
+    exact: tuple[np.ndarray, ...] | None = None  # (A, d, e): it is A / d - diag(e), rounded to float32
 
     def __init__(self, device: Device, matrix: Any) -> None:
         host = checks.real("matrix", matrix)

@@ -64,14 +64,14 @@ def maskable(matrix: Any) -> bool:
     return entries or made_with(matrix) is not None
 
 
-def device_of(rows: Sequence[Sequence[Any]], wanted: Device | str | None) -> Device | None:
-    """The device that all operators in `rows` lie on, None where there are none; `wanted` must be that."""
+def device_of(rows: Sequence[Sequence[Any]], requested: Device | str | None) -> Device | None:
+    """The device that all operators in `rows` lie on, None where there are none; `requested` must be that."""
     devices = {A.device for row in rows for A in row if isinstance(A, Operator)}
     if len(devices) > 1:
         raise InputError("matrix has operators on several devices; all must be on one")
     device = devices.pop() if devices else None
-    if device is not None and wanted is not None and open_device(wanted) is not device:
-        raise InputError(f"device is {wanted!r}, but operators lie on {device}; all must be on one device")
+    if device is not None and requested is not None and open_device(requested) is not device:
+        raise InputError(f"device is {requested!r}, but operators lie on {device}; all must be on one device")
     return device
 
 
@@ -89,7 +89,7 @@ def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Patter
     divisor = np.where(lit, F, np.inf)
     if isinstance(matrix, np.ndarray):
         R = Dense(device, _dense_R(matrix, divisor, lit))
-        R.given = matrix, divisor, lit
+        R.exact = matrix, divisor, lit
         return R
     if isinstance(matrix, scipy.sparse.csr_array):
         return CSR(device, _sparse_R(matrix, divisor, lit), pattern)

@@ -106,8 +106,8 @@ class Relaxation:
                 weights = rows.inverse_diagonal(method)
             weights = weights.astype(np.float32)
         # A CPU reads them as one array, a GPU block by block.
-        parts = np.split(weights, 1 if device.is_cpu else range(self.block, n, self.block))
-        self.weights = [device.upload(part[..., : len(part)]) for part in parts]
+        runs = np.split(weights, 1 if device.is_cpu else range(self.block, n, self.block))
+        self.weights = [device.upload(run[..., : len(run)]) for run in runs]
         self.windows = [s.arguments[1] if isinstance(M, Dense) else self._windows(s) for s in M.slabs]
 
     def _windows(self, slab: Slab) -> Array:
@@ -165,10 +165,10 @@ class Sweeps:
 def relaxation(S: Operator, method: str, block: int | None = None, omega: float | None = 1.0) -> Relaxation:
     """Gauss-Seidel and SOR, or block Gauss-Seidel without omega; kept with the matrix of S, for one omega."""
     rows = readable(S, method)
-    kept, key = rows.M.relaxations, (rows.shift, rows.scale, block, omega is None)
-    if key not in kept or kept[key].omega != omega:
-        kept[key] = Relaxation(rows, method, block, omega)
-    return kept[key]
+    relaxations, key = rows.M.relaxations, (rows.shift, rows.scale, block, omega is None)
+    if key not in relaxations or relaxations[key].omega != omega:
+        relaxations[key] = Relaxation(rows, method, block, omega)
+    return relaxations[key]
 
 
 def readable(S: Operator, method: str) -> Rows:

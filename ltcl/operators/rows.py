@@ -70,7 +70,7 @@ class RowOperator(Operator):
 
     def arrays(self) -> set[Array]:
         """Of all slabs, and of the transpose once it was asked for."""
-        arrays = {part for slab in self.slabs for part in slab.arguments if isinstance(part, Array)}
+        arrays = {x for slab in self.slabs for x in slab.arguments if isinstance(x, Array)}
         return arrays if self._transposed is None else arrays | self._transposed.arrays()
 
     def blocks(self) -> Iterator[tuple[int, Any]]:

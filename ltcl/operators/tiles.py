@@ -72,7 +72,7 @@ class Packed:
         """The same numbers transposed, without scales, in tiles of the width that takes fewest bytes."""
         matrix, precision = scipy.sparse.csr_array(self.matrix().T), _EXACT[self.precision]
         packed = (_packed(matrix, width, precision, self.unit) for width in WIDTHS)
-        return dataclasses.replace(min(packed, key=lambda one: one.nbytes), difference=self.difference)
+        return dataclasses.replace(min(packed, key=lambda tiles: tiles.nbytes), difference=self.difference)
 
 
 def pack(matrix: Any, width: int = 8, precision: str = "float16") -> Packed:
@@ -96,8 +96,8 @@ def smallest(matrix: Any, tolerance: float) -> Packed:
     matrix = _nonzeros(matrix)
     most = checks.number("tolerance", tolerance, least=0) * float(np.linalg.norm(matrix.data))
     all_kinds = (_packed(matrix, width, kind) for width in reversed(WIDTHS) for kind in PRECISIONS)
-    allowed = (one for one in all_kinds if one.precision == "float32" or one.difference[0] <= most)
-    return min(allowed, key=lambda one: one.nbytes)
+    allowed = (tiles for tiles in all_kinds if tiles.precision == "float32" or tiles.difference[0] <= most)
+    return min(allowed, key=lambda tiles: tiles.nbytes)
 
 
 class Tiles(RowOperator):

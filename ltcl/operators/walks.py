@@ -139,23 +139,23 @@ class Linked(Tables):
 
 def tables(M: CSR | Dense) -> Tables:
     """The alias tables of M, made at the first call and kept with it."""
-    return kept(M, "alias", lambda: Tables(M))
+    return cached(M, "alias", lambda: Tables(M))
 
 
 def tables_of_columns(M: CSR | Dense) -> Tables:
     """Alias tables of M^T, with room for one more row of as many entries as M has rows; kept with M."""
-    return kept(M, "columns", lambda: Tables(_like(M, host(M).T), spare=M.shape[0]))
+    return cached(M, "columns", lambda: Tables(_like(M, host(M).T), spare=M.shape[0]))
 
 
 def linked(Rs: Sequence[CSR | Dense], signs: Sequence[float]) -> Linked:
     """The tables of walks over sign R of three (N, N), made at the first call, kept with the first."""
     key = f"linked {tuple(signs)} {[id(R) for R in Rs]}"
-    return kept(Rs[0], key, lambda: Linked(Rs, signs))
+    return cached(Rs[0], key, lambda: Linked(Rs, signs))
 
 
 def squares(M: CSR | Dense) -> CSR | Dense:
     """M_ij^2, which carry variances; made at the first call and kept with M, as much memory again."""
-    return kept(M, "squares", lambda: _like(M, host(M) * host(M)))
+    return cached(M, "squares", lambda: _like(M, host(M) * host(M)))
 
 
 def rows_of_R(S: Operator, method: str) -> tuple[CSR | Dense, float]:
@@ -167,10 +167,10 @@ def rows_of_R(S: Operator, method: str) -> tuple[CSR | Dense, float]:
     M = rows.M
     if rows.shift == 1.0:
         return M, rows.scale
-    return kept(M, "R", lambda: _like(M, host(M) - scipy.sparse.eye_array(M.shape[0]))), 1.0
+    return cached(M, "R", lambda: _like(M, host(M) - scipy.sparse.eye_array(M.shape[0]))), 1.0
 
 
-def kept(M: CSR | Dense, key: str, make: Callable[[], Any]) -> Any:
+def cached(M: CSR | Dense, key: str, make: Callable[[], Any]) -> Any:
     """What `make` makes of M, at the first call with this key."""
     if key not in M.tables:
         M.tables[key] = make()
@@ -259,7 +259,7 @@ class Walker:
 
         All right-hand sides b, (N,) or (N, k), share the walks; of three channels column j is of j % 3.
         """
-        made, device, channels = self.tables, self.tables.device, self.tables.channels
+        tables, device, channels = self.tables, self.tables.device, self.tables.channels
         steps = device.upload(self.lengths.steps(), np.uint32)
         sums = np.zeros((len(pixels), b.columns, 2))
         chunks, units = -(-samples // CHUNK), max(1, min(_UNITS, self._walks() // CHUNK))
@@ -272,19 +272,19 @@ class Walker:
                     here = slice(channels * offset, channels * (offset + width))
                     out = device.empty((place.size * count, channels * width, 2))
                     numbers = (*bounds, self.seed, stream, b.columns, here.start)
-                    arrays = (place, made.records, made.entries, made.links, steps, b, out)
+                    arrays = (place, tables.records, tables.entries, tables.links, steps, b, out)
                     self._launch("walk_rows", place.size * count, channels * width, *numbers, *arrays)
-                    found = out.get().reshape(place.size, count, -1, 2).astype(np.float64)
+                    partial = out.get().reshape(place.size, count, -1, 2).astype(np.float64)
                     # One chunk after the other, so that no split changes a bit.
-                    found = np.concatenate([sums[some, None, here], found], axis=1)
-                    sums[some, here] = np.add.accumulate(found, axis=1)[:, -1]
+                    partial = np.concatenate([sums[some, None, here], partial], axis=1)
+                    sums[some, here] = np.add.accumulate(partial, axis=1)[:, -1]
                     self.watch()
         total, squares = np.moveaxis(sums, -1, 0).reshape(2, len(pixels), *b.shape[1:])
         return Sums(samples, total, squares)
 
     def columns(self, samples: int, stream: int = 0) -> Sums:
         """Sums of every pixel, (N,), of walks from b, which was appended to `tables_of_columns`, `from_b`."""
-        made, device, n = self.tables, self.tables.device, self.tables.shape[0]
+        tables, device, n = self.tables, self.tables.device, self.tables.shape[0]
         steps = device.upload(self.lengths.steps(), np.uint32)
         total, squares = np.zeros((2, n))
         source = device.upload(np.array([n]), np.uint32)
@@ -292,7 +292,7 @@ class Walker:
             count = piece.stop - piece.start
             ends, scores = device.empty((count,), np.uint32), device.empty((count,))
             numbers = (piece.start, piece.stop, self.seed, stream)
-            arrays = (source, made.records, made.entries, steps, ends, scores)
+            arrays = (source, tables.records, tables.entries, steps, ends, scores)
             self._launch("walk_columns", -(-count // CHUNK), 1, *numbers, *arrays)
             score = scores.get().astype(np.float64)
             where = np.where(score == 0.0, 0, ends.get())  # a walk that died may stand in the row of b

@@ -54,7 +54,7 @@ def convergence(solutions: Mapping[str, Solution], rtol: float, title: str = "Co
     return figure
 
 
-def analysis(found: Mapping[str, Analysis]) -> Figure:
+def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     """Bounds on rho(R) of every transport by name, per channel, and its forecast per method.
 
     Left the interval that holds rho(R), with the 1 beyond which the paper's series diverges; right the
@@ -68,18 +68,18 @@ def analysis(found: Mapping[str, Analysis]) -> Figure:
     >>> [axes.get_title("left") for axes in figure.axes]
     ['spectral radius of R', 'products to 1 %']
     """
-    if not found:
-        raise InputError("found is empty; there must be at least one analysis to draw")
+    if not analyses:
+        raise InputError("analyses is empty; there must be at least one analysis to draw")
     channels = {
-        name + (f" {colour}" if len(one.channels) == 3 else ""): channel
-        for name, one in found.items()
-        for colour, channel in zip(("red", "green", "blue"), one.channels, strict=False)
+        name + (f" {colour}" if len(transport.channels) == 3 else ""): channel
+        for name, transport in analyses.items()
+        for colour, channel in zip(("red", "green", "blue"), transport.channels, strict=False)
     }
     figure = figure_of(1300, 330 + 46 * len(channels))
     heading(figure, 34, 26, "Before solving", 17)
     left, right = figure.add_axes((0.16, 0.2, 0.33, 0.58)), figure.add_axes((0.58, 0.2, 0.38, 0.58))
     labels = "rho(R), between its bounds", "products with S, sweeps of Gauss-Seidel"
-    titles = "spectral radius of R", f"products to {100 * next(iter(found.values())).rtol:g} %"
+    titles = "spectral radius of R", f"products to {100 * next(iter(analyses.values())).rtol:g} %"
     for axes, title, label in zip((left, right), titles, labels, strict=True):
         _dress(axes, label)
         axes.set_title(title, color=INK, fontsize=13, loc="left", fontweight="bold")

@@ -193,8 +193,8 @@ def trihedral(n: int, albedo: Any = 0.7, angle: float = 90.0) -> Scene:
     # Of the edges' horizontal parts, whose length is sin: cos = cos^2 + sin^2 cos(turn).
     turn = math.acos(cos / (1 + cos))
     left, right = (
-        np.array([sin * math.cos(way), sin * math.sin(way), cos])
-        for way in (math.pi / 4 - turn / 2, math.pi / 4 + turn / 2)
+        np.array([sin * math.cos(azimuth), sin * math.sin(azimuth), cos])
+        for azimuth in (math.pi / 4 - turn / 2, math.pi / 4 + turn / 2)
     )
     up = np.array([0.0, 0.0, 1.0])
     walls = (

@@ -85,8 +85,8 @@ def _congruent(first: Wall, second: Wall) -> tuple[bytes, int, int, bool]:
     quarter turns of both pictures the first in order. Mirror images have rows for columns.
     """
     edges = [np.array([wall.down, wall.right], np.float64) for wall in (first, second)]
-    way = np.subtract(second.corner, first.corner) + (edges[1].sum(axis=0) - edges[0].sum(axis=0)) / 2
-    vectors = np.array([*edges[0], first.normal, *edges[1], second.normal, way])
+    offset = np.subtract(second.corner, first.corner) + (edges[1].sum(axis=0) - edges[0].sum(axis=0)) / 2
+    vectors = np.array([*edges[0], first.normal, *edges[1], second.normal, offset])
     vectors[[0, 1, 3, 4, 6]] /= np.linalg.norm(edges[0][0])
     gram = (vectors @ vectors.T).round(9)
     keys = []

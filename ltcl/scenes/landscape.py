@@ -47,8 +47,8 @@ def landscape(h: int, w: int) -> np.ndarray:
     stored = images.read(_FILE)
     height, width = stored.shape[:2]
     cut: list[Any] = []
-    for side, wanted, sun in ((height, h * width / w, SUN[1]), (width, w * height / h, SUN[0])):
-        size = min(side, max(1, round(wanted)))
+    for side, ideal, sun in ((height, h * width / w, SUN[1]), (width, w * height / h, SUN[0])):
+        size = min(side, max(1, round(ideal)))
         start = round(sun * (side - size))
         cut.append(slice(start, start + size))
     return np.clip(images.resize(stored[tuple(cut)], (h, w)), 0, 1).astype(np.float32)

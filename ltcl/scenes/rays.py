@@ -143,7 +143,7 @@ def sight(name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks
     towards = place - patches.centre
     towards = np.einsum("nij,nj->ni", patches.frames, towards / np.linalg.norm(towards, axis=1)[:, None])
     step = (np.arange(_SIGHT_POINTS) + 0.5) / _SIGHT_POINTS - 0.5
-    v, u = (part.ravel()[:, None] for part in np.meshgrid(step, step, indexing="ij"))
+    v, u = (coordinate.ravel()[:, None] for coordinate in np.meshgrid(step, step, indexing="ij"))
     origins = patches.centre[:, None] + u * patches.right[:, None] + v * patches.down[:, None]
     free = clear(walls, origins.reshape(-1, 3), place, boxes).reshape(len(patches), -1)
     share = np.where(towards[:, 2] > 0, free.mean(axis=1), 0.0)

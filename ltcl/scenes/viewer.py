@@ -113,7 +113,7 @@ def draw(
     parts = np.split(np.asarray(picture, dtype=np.float32), len(walls), axis=1)
     black = np.zeros_like(parts[0][:1, :1])
     pictured = [*zip(walls, parts, strict=True), *((screen, black) for screen in screens)]
-    seen = [(viewer.homography(wall), part) for wall, part in pictured if viewer.sees(wall)]
+    seen = [(viewer.homography(wall), painting) for wall, painting in pictured if viewer.sees(wall)]
     image = np.zeros((height, width, *picture.shape[2:]), dtype=np.float32)
     x = (np.arange(width * supersample) + 0.5 - width * supersample / 2) / scale + visible.centre[0]
     y = (np.arange(height * supersample) + 0.5 - height * supersample / 2) / scale + visible.centre[1]
@@ -167,12 +167,12 @@ def _draw_points(seen: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray, y: np
     points = _lattice(x, y)
     values = np.zeros((len(y), len(x), *seen[0][1].shape[2:]), dtype=np.float32)
     nearest = np.zeros((len(y), len(x)))
-    for homography, part in seen:
+    for homography, painting in seen:
         place, nearness = _hit(homography, points)
         shown = nearness > nearest
         if shown.any():
             nearest[shown] = nearness[shown]
-            values[shown] = _interpolate(part, place * part.shape[1::-1] - 0.5)[shown]
+            values[shown] = _interpolate(painting, place * painting.shape[1::-1] - 0.5)[shown]
     return values
 
 

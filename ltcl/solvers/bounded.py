@@ -47,7 +47,7 @@ class Bounded(Solution):
     ----------
     errors, least : (k,) float64
         ``||w (A x - b)||`` of every column, and what no x within the bounds is below.
-    held : (N, k) bool
+    saturated : (N, k) bool
         Where x is at a bound or all but there, and a step beyond would lower the error.
     gap : float
         Largest ``(errors - least) / ||w b||``; `residuals` holds the largest ``errors / ||w b||``.
@@ -55,7 +55,7 @@ class Bounded(Solution):
 
     errors: np.ndarray
     least: np.ndarray
-    held: np.ndarray
+    saturated: np.ndarray
     gap: float
 
     def __str__(self) -> str:
@@ -117,14 +117,14 @@ def minimise(
             break
         descent.step(unsolved)
     x, worse = descent.x.get(), ~(errors <= initial)  # rounding alone can do that
-    errors, held = np.where(worse, initial, errors), np.where(worse, False, descent.held(x))
+    errors, saturated = np.where(worse, initial, errors), np.where(worse, False, descent.saturated(x))
     excess = np.where(worse, np.maximum(initial - least + 2.0 * hidden, _ROUNDING * scale), excess)
     x = (np.where(worse, first, x) * unit).astype(np.float32)
     x = np.clip(x, *(bound[:, None] for bound in inwards(lower, upper)))
     history = len(residuals) - 1, descent.products, tuple(residuals), time.perf_counter() - start
     least = np.maximum(least - hidden, 0.0) * unit * unit_w
     certificate = {"errors": errors * unit * unit_w, "least": least, "gap": float(np.max(excess / scale))}
-    return Bounded(x, status, *history, "bounded", held=held, **certificate)
+    return Bounded(x, status, *history, "bounded", saturated=saturated, **certificate)
 
 
 def inwards(lower: ArrayLike, upper: ArrayLike) -> Box:
@@ -206,7 +206,7 @@ class _Descent:
         """What rounding of w A x hides of the errors, where columns of A are of size 1 at most."""
         return _ROUNDING * self._largest_weight * np.asarray(vectors.norm(self.x))
 
-    def held(self, x: np.ndarray) -> np.ndarray:
+    def saturated(self, x: np.ndarray) -> np.ndarray:
         """Entries that a step along -g takes beyond a bound; some come close to it without touching."""
         lower, upper = (bound[:, None] for bound in self._box)
         beyond = x - self._alpha * self.g.get()

@@ -313,7 +313,7 @@ class Hybrid(Sampler):
 
 def _largest_radius(channels: Channels) -> float:
     """Of the spectra of R, kept with each."""
-    return max(walks.kept(c.R, "radius", lambda R=c.R: theory.spectral_radius(R).value) for c in channels)
+    return max(walks.cached(c.R, "radius", lambda R=c.R: theory.spectral_radius(R).value) for c in channels)
 
 
 def of_channel(channel: int, f: Callable[..., Any], *arguments: Any, **options: Any) -> Any:

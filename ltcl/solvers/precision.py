@@ -51,8 +51,8 @@ def _numbers(S: Operator, read: bool = False) -> tuple[Any, Any, Any] | None:
         if isinstance(S, IdentityPlus):
             return A, S.sign * d, S.sign * e + 1.0
         return A, d * S.d, e * S.d - S.shift
-    if isinstance(S, Dense) and S.given is not None:
-        A, d, e = S.given
+    if isinstance(S, Dense) and S.exact is not None:
+        A, d, e = S.exact
         return (A, 1.0 / d, 0.0 - e) if np.all(np.abs(d) > 1e-300) else None
     if isinstance(S, Dense) or (read and isinstance(S, RowBlocks)):
         A = S.to_dense()

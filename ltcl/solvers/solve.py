@@ -300,7 +300,7 @@ def _operator(S: Any, device: Device | None = None) -> Operator:
     """`as_operator`, which remembers the numbers of an array as they were before they became float32."""
     A = as_operator(S, device)
     if isinstance(A, Dense) and A is not S:
-        A.given = np.asarray(S), np.ones(A.shape[1]), np.zeros(A.shape[0])
+        A.exact = np.asarray(S), np.ones(A.shape[1]), np.zeros(A.shape[0])
     return A
 
 

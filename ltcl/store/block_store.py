@@ -11,13 +11,15 @@ the same again makes the same files.
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import io
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -25,111 +27,82 @@ import scipy.sparse
 
 from ltcl import checks, first_bounce
 from ltcl.errors import FileError, InputError, InputTypeError
-from ltcl.files import as_path, fill_folder, flush_tree, replace_file, restore, sweep
+from ltcl.files import as_path, fill_folder, flush_tree, locked, replace_file, restore, sweep
 from ltcl.store import zarr_arrays
-from ltcl.store.array_log import ArrayLog, check_name, locked
-from ltcl.store.headers import about
-from ltcl.store.zarr_arrays import Block
+from ltcl.store.record import CSR, Parts, Record, StoredRows, about
+from ltcl.store.zarr_arrays import Layout, ZarrArrays, write_group, write_rows
 
-SCHEMA = 2
-ORIENTATIONS = ("rows", "columns")
-_FILL = 1 << 26  # bytes of a block of rows, were they full
-_LARGEST = (1 << 31) - 1  # column indices are of 32 bits
-_MOST_BLOCKS = 1 << 20
+_SCHEMA = 2
 _PER_ENTRY = 64  # bytes: places, values and variance, as cut, joined and turned
+_CHECKSUM = 64  # bytes at the end of a file of a log
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,120}")
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Sizes of a stored transport; refused where they do not fit each other.
+class Block(NamedTuple):
+    """Rows (or columns) of T, and the variance of each stored entry where it is known."""
 
-    `shape` (M, N); `grid` and `camera_grid` (h, w), None for a camera on the projector's grid; 1 or 3
-    `channels`; a block is `block_rows` rows of T, or as many columns in the log. Of the kind "compressed" all
-    of T is in extra arrays, as `ltcl.transport` names them. `dtype` is that of the values.
-    """
+    matrix: scipy.sparse.csr_array
+    variance: np.ndarray | None
 
-    shape: tuple[int, int]
-    grid: tuple[int, int]
-    camera_grid: tuple[int, int] | None = None
-    channels: int = 1
-    block_rows: int = 1
-    orientation: str = "columns"
-    kind: str = "blocks"
-    dtype: str = "float32"
 
-    def __post_init__(self) -> None:
-        checks.grid("shape", self.shape)
-        checks.grid("grid", self.grid, self.shape[1])
-        if self.camera_grid is not None or self.shape[0] != self.shape[1]:
-            checks.grid("camera_grid", self.camera_grid, self.shape[0])
-        if max(self.shape) > _LARGEST:
-            raise InputError(f"shape is {self.shape}; a store holds at most {_LARGEST} rows and columns")
-        checks.one_of("channels", self.channels, (1, 3))
-        checks.one_of("orientation", self.orientation, ORIENTATIONS)
-        checks.one_of("kind", self.kind, ("blocks", "compressed"))
-        checks.one_of("dtype", self.dtype, ("float32", "float64"))
-        checks.count("block_rows", self.block_rows, least=-(-max(self.shape) // _MOST_BLOCKS))
+class ArrayLog:
+    """Sets of arrays by name in the folder `path`, which the first makes: an .npz and its SHA-256 each."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
     @property
-    def is_square(self) -> bool:
-        """Whether camera and projector have the same pixels, so that T has a first bounce."""
-        return self.camera_grid in (None, self.grid)
+    def names(self) -> list[str]:
+        """Of what is committed, by whatever process."""
+        with about(self.path):
+            files = os.listdir(self.path) if self.path.exists() else []
+        return sorted(file[:-4] for file in files if file.endswith(".npz") and _NAME.fullmatch(file[:-4]))
 
-    def blocks(self, orientation: str = "rows") -> int:
-        """Number of blocks of a channel."""
-        return -(-self.shape[ORIENTATIONS.index(orientation)] // self.block_rows)
+    def put(self, name: str, **arrays: Any) -> None:
+        """Commit arrays of numbers or texts; what has that name already is replaced whole, or stays."""
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            allowed = "letters, digits, _, - and . with a letter first"
+            raise InputError(f"name is {name!r:.60}; it must be {allowed}")
+        if wrong := [array for array in map(np.asarray, arrays.values()) if array.dtype.kind not in "fiubU"]:
+            raise InputTypeError(f"{name} holds {wrong[0].dtype}; it must hold numbers")
+        stream = io.BytesIO()
+        np.savez(stream, **arrays)
+        stream.write(hashlib.sha256(stream.getbuffer()).hexdigest().encode())
+        with replace_file(self.path / f"{name}.npz") as temporary:
+            temporary.write_bytes(stream.getbuffer())
 
-    def span(self, block: int, orientation: str = "rows") -> tuple[int, int]:
-        """First row (or column) of a block, and the one behind its last."""
-        length = self.shape[ORIENTATIONS.index(orientation)]
-        return block * self.block_rows, min((block + 1) * self.block_rows, length)
+    def get(self, name: str) -> dict[str, np.ndarray]:
+        """The arrays under a name, whose checksum is compared."""
+        with about(self.path, reading=True):
+            raw = zarr_arrays.read_file(self.path, f"{name}.npz")
+            if hashlib.sha256(raw[:-_CHECKSUM]).hexdigest().encode() != raw[-_CHECKSUM:]:
+                raise FileError(f"{name}.npz is damaged: its checksum is not that of its bytes")
+            with np.load(io.BytesIO(raw), allow_pickle=False) as arrays:
+                return dict(arrays)
 
-    def block_shape(self, block: int, orientation: str = "rows") -> tuple[int, int]:
-        """(rows, N), or (columns, M) of one that holds columns of T as rows."""
-        start, stop = self.span(block, orientation)
-        return stop - start, self.shape[1 - ORIENTATIONS.index(orientation)]
-
-    @classmethod
-    def from_json(cls, sizes: Any) -> Layout:
-        """Refuses another schema, and whatever makes no sense."""
-        if not isinstance(sizes, Mapping) or "schema" not in sizes:
-            raise FileError("zarr.json describes no store of ltcl")
-        if sizes["schema"] not in (1, SCHEMA):
-            raise FileError(f"zarr.json is of schema {sizes['schema']!r:.40}; this ltcl reads 1 and {SCHEMA}")
-        fields: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in sizes.items() if k != "schema"
-        }
-        try:
-            return cls(**fields)
-        except TypeError as error:
-            raise FileError(f"zarr.json describes a store that makes no sense: {str(error)!a:.100}") from None
+    def verify(self) -> None:
+        """Read all."""
+        for name in self.names:
+            self.get(name)
 
 
 class BlockStore:
     """A transport that grows by batches of its columns, made by `create` or opened by `open`.
 
-    Any number of processes may write at once; what they write is committed when the call returns.
-
-    Attributes
-    ----------
-    path : Path
-    layout : Layout
-    provenance : dict
-        What `create` was given.
+    Any number of processes may write at once; what they write is committed when the call returns. `final`
+    tells whether `finalize` has ended: all of T is there by rows, and nothing will be written any more.
 
     Examples
     --------
     >>> import tempfile, scipy.sparse
-    >>> path = Path(tempfile.mkdtemp()) / "T.zarr"
-    >>> store = BlockStore.create(path, shape=(4, 4), grid=(2, 2), block_rows=2)
-    >>> store.write(0, 1, scipy.sparse.csr_array([[0.0, 0.0, 0.5, 0.0], [0.0, 0.1, 0.0, 0.5]]))
-    >>> sorted(BlockStore.open(path).written), store.missing()
+    >>> store = BlockStore.create(tempfile.mkdtemp(), shape=(4, 4), grid=(2, 2), block_rows=2)
+    >>> store.write(0, 1, scipy.sparse.eye_array(2, 4, k=2))
+    >>> sorted(store.written), store.missing()
     ([(0, 1)], [(0, 0)])
     """
 
     def __init__(self, path: Path, mode: str) -> None:
-        self.path, self.mode = path, mode
-        self._log = ArrayLog(path / "log")
+        self.path, self.mode, self._log = path, mode, ArrayLog(path / "log")
         self._read_document()
 
     @classmethod
@@ -142,29 +115,17 @@ class BlockStore:
         camera_grid: tuple[int, int] | None = None,
         channels: int = 1,
         block_rows: int | None = None,
-        orientation: str = "columns",
         provenance: Mapping[str, Any] | None = None,
         overwrite: bool = False,
     ) -> BlockStore:
         """An empty store at `path`, where nothing is yet, or a store to `overwrite`.
 
-        Parameters
-        ----------
-        path, shape, grid, camera_grid, channels
-            As in `Layout`.
-        block_rows : int, optional
-            Columns of a batch, and rows of a block of the finished T; about 64 MiB of full ones if not given.
-        orientation : "columns"
-            How T arrives.
-        provenance : dict
-            Plain JSON: rig, settings, hashes; the versions of ltcl, NumPy and SciPy join it.
+        Sizes are those of `Layout`; a batch has `block_rows` columns. `provenance` is plain JSON, such as rig
+        and settings; the versions of ltcl, NumPy and SciPy join it.
         """
         path = as_path(path)
-        shape, grid = checks.grid("shape", shape), checks.grid("grid", grid)
-        camera_grid = None if camera_grid is None else checks.grid("camera_grid", camera_grid)
-        checks.one_of("orientation", orientation, ("columns",))
-        rows = rows_at_once(shape) if block_rows is None else block_rows
-        raw = document(Layout(shape, grid, camera_grid, channels, rows), provenance or {}, {}, None)
+        layout = Layout(shape, grid, camera_grid, channels, block_rows)
+        raw = _document(layout, provenance or {}, {})
         check_place(path, overwrite)
         with fill_folder(path, replace=True) as folder:
             (folder / "zarr.json").write_bytes(raw)
@@ -180,9 +141,6 @@ class BlockStore:
             if not path.is_dir():
                 raise FileError("is no folder, as a store is" if path.exists() else "no such folder")
             store = cls(path, mode)
-            for name, checksum in (store._files or {}).items():
-                if name.count("/") == 1:  # of a group: blocks and arrays are checked when they are read
-                    zarr_arrays.read_file(path, name, checksum=checksum)
             if mode == "a":
                 for folder in (path.parent, path, store._log.path):
                     sweep(folder)
@@ -190,205 +148,139 @@ class BlockStore:
         return store
 
     @property
-    def final(self) -> bool:
-        """Whether `finalize` has ended: all of T is there by rows, and nothing will be written any more."""
-        return self._files is not None
-
-    @property
     def written(self) -> frozenset[tuple[int, int]]:
         """(channel, block) of all that is committed; asked of the disk, so other writers' blocks count."""
-        pattern, names = r"columns_(\d)\.(\d+)", self._log.names
-        if self.final:
-            pattern, names = r"channel_(\d)/block_(\d+)", list(self._places)
-        return frozenset((int(m[1]), int(m[2])) for m in (re.fullmatch(pattern, n) for n in names) if m)
+        pattern = re.compile(rf"{self._orientation}_(\d)\.(\d+)")
+        return frozenset((int(m[1]), int(m[2])) for m in map(pattern.fullmatch, self._arrays.names) if m)
 
-    def missing(self, orientation: str | None = None) -> list[tuple[int, int]]:
+    def missing(self) -> list[tuple[int, int]]:
         """(channel, block) of all that is not committed, in order."""
         if self.layout.kind != "blocks":
             return []
-        there, blocks = self.written, self.layout.blocks(orientation or self._orientation)
+        written, blocks = self.written, self.layout.blocks(self._orientation)
         every = ((c, b) for c in range(self.layout.channels) for b in range(blocks))
-        return [which for which in every if which not in there]
+        return [which for which in every if which not in written]
 
     def write(self, channel: int, block: int, matrix: Any, variance: Any = None) -> None:
         """Commit a batch: when this returns it is on the disk, whole; if it raises, what was there still is.
 
-        Parameters
-        ----------
-        channel, block : int
-            One that is there already is replaced.
-        matrix : scipy.sparse, (columns, M)
-            Each row of it a column of T. Kept as float32.
-        variance : sparse of the same pattern, or (nnz,), optional
-            Of each stored entry; NaN where unknown.
+        Each row of `matrix`, sparse (columns, M), is a column of T, kept as float32; `variance` (nnz,) is
+        that of its entries, NaN where unknown.
         """
         name = self._name(channel, block)
-        matrix, variance = _checked(matrix, variance, self.layout.block_shape(block, "columns"))
-        arrays = {"data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr}
+        C = _checked(matrix, variance, self.layout.block_shape(block, "columns"))
+        arrays = {array: getattr(C.matrix, array) for array in CSR}
         with self._writing():
-            self._log.put(name, **arrays, **({} if variance is None else {"variance": variance}))
+            self._log.put(name, **arrays, **({} if C.variance is None else {"variance": C.variance}))
 
-    def read(self, channel: int, block: int) -> scipy.sparse.csr_array:
+    def block(self, channel: int, block: int) -> Block:
         """Rows of T of a final store, else a batch as `write` took it; its checksums are compared."""
-        return self.block(channel, block).matrix
-
-    def variance(self, channel: int, block: int) -> np.ndarray | None:
-        """Variance (nnz,) of the entries of a block; None where none was written."""
-        return self.block(channel, block).variance
-
-    def block(self, channel: int, block: int, orientation: str | None = None) -> Block:
-        """Both at once; refused where the store does not hold T by the `orientation` that is asked for."""
-        name = self._name(channel, block)
-        with about(self.path):
-            if orientation not in (None, self._orientation):
-                raise FileError(f"holds {self._orientation} of T, not {orientation}")
-            shape = self.layout.block_shape(block, self._orientation)
-            if self._files is not None:
-                place = self._place(f"channel_{channel}/block_{block:06d}")
-                return zarr_arrays.read_rows(self.path, place, shape, self.layout.dtype, self._files)
-            arrays = self._log.get(name)
-            if not {"data", "indices", "indptr"} <= arrays.keys():
-                raise FileError(f"log/{name}.npz holds no block")
-            parts = (arrays["data"], arrays["indices"], arrays["indptr"])
-            checks.compressed(name, parts[2], parts[1], parts[0], shape)
-            return Block(scipy.sparse.csr_array(parts, shape=shape), arrays.get("variance"))
+        name, shape = self._name(channel, block), self.layout.block_shape(block, self._orientation)
+        with about(self.path, reading=True):
+            arrays = self._arrays.get(name)
+            data, indices, indptr = (arrays[array] for array in CSR)
+            checks.compressed(name, indptr, indices, data, shape)
+            matrix = scipy.sparse.csr_array((data, indices, indptr), shape=shape)
+            if not matrix.has_canonical_format:
+                raise FileError(f"{name} has indices that do not ascend")
+            return Block(matrix, arrays.get("variance"))
 
     def extra(self, name: str, array: Any = None) -> np.ndarray:
         """A small array by name: committed where `array` is given, else read and checked."""
-        check_name(name)
         if array is not None:
-            array = np.asarray(array)
-            if array.dtype.kind not in "fiub":
-                raise InputTypeError(f"{name} holds {array.dtype}; it must hold real numbers")
+            array = checks.real(name, array)
             with self._writing():
                 self._log.put(f"extra.{name}", array=array)
             return array
-        with about(self.path):
-            if self._files is not None:
-                return zarr_arrays.read_array(self.path, f"{self._place(f'extra/{name}')}/array", self._files)
-            return self._log.get(f"extra.{name}")["array"]
+        with about(self.path, reading=True):
+            return self._arrays.get(f"extra.{name}")["array"]
 
     @property
     def extras(self) -> list[str]:
         """Names of the extra arrays."""
-        prefix, names = ("extra/", self._places) if self.final else ("extra.", self._log.names)
-        return sorted(name.removeprefix(prefix) for name in names if name.startswith(prefix))
+        return [n.removeprefix("extra.") for n in self._arrays.names if n.startswith("extra.")]
 
     @property
     def attributes(self) -> dict[str, Any]:
         """Whatever the writer keeps with the store, plain JSON; read from the disk. See `update`."""
-        with about(self.path):
-            return dict(self._read_document())
+        return self._read_document()
 
     def update(self, **attributes: Any) -> None:
         """Change some of the `attributes`, at once or not at all; other processes' changes are kept."""
         with self._writing():
-            self._write_document(self.layout, self.attributes | attributes, None)
+            self._write_document(self.layout, self.attributes | attributes)
 
     def finalize(
         self,
         *,
-        memory: int = 1 << 28,
         sigmas: float = 0.0,
-        change: Any = None,
-        layout: Layout | None = None,
-        extras: Mapping[str, np.ndarray] | None = None,
-        state: Mapping[str, Any] | None = None,
+        change: Callable[[int, int, Any, Any], tuple[Any, Any]] | None = None,
+        compressed: Parts | None = None,
+        memory: int = 1 << 28,
     ) -> None:
         """Turn columns into rows, out of core; find the first bounce; close the store for good.
 
         Ended at any moment, it makes the same when called again. FileError names blocks that are missing.
-
-        Parameters
-        ----------
-        memory : int
-            Bytes for the entries that are turned at once.
-        sigmas : float
-            Standard deviations by which the diagonal has to be above 0 to be a first bounce.
-        change : function, optional
-            Of channel, first row, rows (rows, N) and the variance of their entries: what is kept of the two.
-        layout, extras, state : Layout, dict, dict, optional
-            Of the store from then on; arrays and attributes that join those it has. A layout of the kind
-            "compressed" has extra arrays only.
+        The diagonal is a first bounce where it is above 0 by `sigmas` standard deviations; `change`, of
+        channel, first row, rows (rows, N) and the variance of their entries, returns the last two anew. A
+        transport `compressed` takes the place of all columns. `memory` is bytes for what is turned at once.
         """
-        self._refuse_reader()
-        layout, more = layout or self.layout, extras or {}
-        with about(self.path), locked(self.path):
-            self._read_document()
+        with self._writing(finished=True):
+            state = self._read_document()
             if not self.final:
-                missing = self.missing() if layout.kind == "blocks" else []
-                if missing:
-                    listed = ", ".join(map(str, missing[:6])) + (" ..." if len(missing) > 6 else "")
-                    raise FileError(
-                        f"lacks {len(missing)} block(s) (channel, block) {listed}; resume the scan"
-                    )
-                rows = self._turned(memory, change) if layout.kind == "blocks" else ()
-                there = ((name, self.extra(name)) for name in self.extras if name not in more)
-                files = write_finished(self.path, layout, rows, (*more.items(), *there), sigmas)
-                self._write_document(layout, self.attributes | dict(state or {}), files)
+                extras = {name: self.extra(name) for name in self.extras}
+                layout, rows = self.layout, self._rows(memory, change)
+                if compressed is not None:
+                    layout, arrays, texts = _compressed(compressed, layout.block_rows)
+                    rows, extras, state = (), extras | arrays, state | texts
+                elif missing := self.missing():
+                    numbers = ", ".join(map(str, missing[:6])) + (" ..." if len(missing) > 6 else "")
+                    text = f"lacks {len(missing)} block(s) (channel, block) {numbers}; resume the scan"
+                    raise FileError(text)
+                files = _write_finished(self.path, layout, rows, extras, sigmas)
+                self._write_document(layout, state, files=files)
         self._clear()
 
     def verify(self) -> None:
         """Read everything and compare all checksums; the first thing that is wrong is raised as FileError."""
-        with about(self.path):
-            self._read_document()
-            if self._files is not None:
-                zarr_arrays.verify(self.path, self._files, passed=("log",))
-            for name in self.extras:
-                self.extra(name)
-            for channel, block in sorted(self.written):
-                self.block(channel, block)
-
-    @property
-    def _orientation(self) -> str:
-        return "rows" if self.final else "columns"
+        self._read_document()
+        with about(self.path, reading=True):
+            self._arrays.verify()
 
     def _name(self, channel: int, block: int) -> str:
-        most = {"channel": self.layout.channels - 1, "block": self.layout.blocks(self._orientation) - 1}
-        for name, value in (("channel", channel), ("block", block)):
-            checks.count(name, value, least=0, most=most[name])
-        return f"columns_{channel}.{block:06d}"
-
-    def _place(self, name: str) -> str:
-        if name not in self._places:
-            raise FileError(f"{name} is missing")
-        return self._places[name]
-
-    def _refuse_reader(self) -> None:
-        if self.mode != "a":
-            raise FileError(f"{self.path}: is open to read; open it with mode 'a' to write")
+        checks.count("channel", channel, least=0, most=self.layout.channels - 1)
+        checks.count("block", block, least=0, most=self.layout.blocks(self._orientation) - 1)
+        return f"{self._orientation}_{channel}.{block:06d}"
 
     @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """One process at a time, none once the store is final."""
-        self._refuse_reader()
+    def _writing(self, *, finished: bool = False) -> Iterator[None]:
+        """One process at a time; none once the store is final, unless `finished`."""
+        if self.mode != "a":
+            raise FileError(f"{self.path}: is open to read; open it with mode 'a' to write")
         with about(self.path), locked(self.path):
             self._read_document()
-            if self.final:
+            if self.final and not finished:
                 raise FileError("is final; nothing is written to it any more")
             yield
 
     def _read_document(self) -> dict[str, Any]:
         """Everything that zarr.json says; returns the attributes of the writer."""
-        attributes = zarr_arrays.unseal(zarr_arrays.read_file(self.path, "zarr.json"), "zarr.json")
-        self.layout = Layout.from_json(attributes.get("ltcl"))
-        parts = [attributes.get(name) or {} for name in ("provenance", "state", "final", "files")]
-        if not all(isinstance(part, dict) for part in parts):
-            raise FileError("zarr.json has provenance, state or files that are no objects")
-        self.provenance: dict[str, Any] = parts[0]
-        self._files: dict[str, str] | None = attributes.get("files")
-        if attributes["ltcl"]["schema"] == 1:
-            if not parts[2]:
-                raise FileError(
-                    "was begun by an earlier ltcl and is not finished; finish it with that version"
-                )
-            self._files = zarr_arrays.manifest_1(self.path, parts[2])
-        folders = {"/".join(name.split("/")[:2]) for name in self._files or () if name.count("/") > 1}
-        self._places = {name.rpartition(".")[0]: name for name in folders}
-        return parts[1]
+        with about(self.path, reading=True):
+            attributes = zarr_arrays.unseal(zarr_arrays.read_file(self.path, "zarr.json"), "zarr.json")
+            sizes, files = dict(attributes["ltcl"]), attributes.get("files")
+            if (schema := sizes.pop("schema")) not in (1, _SCHEMA):
+                raise FileError(f"schema is {schema!r:.40}; this ltcl reads 1 and {_SCHEMA}")
+            if schema == 1:
+                files = zarr_arrays.manifest_1(self.path, attributes.get("final") or {})
+            sizes.pop("orientation", None)  # of earlier stores
+            self.layout, self.provenance = Layout(**sizes), attributes["provenance"]
+            self._arrays = self._log if files is None else ZarrArrays(self.path, files)
+            self.final = files is not None
+            self._orientation = "rows" if self.final else "columns"
+            return attributes["state"]
 
-    def _write_document(self, layout: Layout, state: Mapping[str, Any], files: Any) -> None:
-        raw = document(layout, self.provenance, state, files)
+    def _write_document(self, layout: Layout, state: Mapping[str, Any], **files: Any) -> None:
+        raw = _document(layout, self.provenance, state, **files)
         with replace_file(self.path / "zarr.json") as temporary:
             temporary.write_bytes(raw)
         self._read_document()
@@ -397,87 +289,70 @@ class BlockStore:
         if self.final:
             shutil.rmtree(self._log.path, ignore_errors=True)
 
-    def _turned(self, memory: int, change: Any) -> Iterator[tuple[int, int, Block]]:
-        """All blocks of rows; as many as fit the memory are gathered in one pass over the columns."""
-        most = checks.count("memory", memory, least=_PER_ENTRY) // _PER_ENTRY
+    def _rows(self, memory: int, change: Callable | None) -> Iterator[tuple[int, int, Block]]:
+        """All blocks of rows; as many as fit the memory are gathered in a pass over the columns."""
+        span, batches = self.layout.span, range(self.layout.blocks("columns"))
         for channel in range(self.layout.channels):
-            for first, last in _batches(self._entries(channel), most):
-                start, stop = self.layout.span(first)[0], self.layout.span(last)[1]
-                T, V = self._gathered(channel, start, stop)
-                for block in range(first, last + 1):
-                    top, bottom = (place - start for place in self.layout.span(block))
-                    rows, variance = T[top:bottom], None if V is None else V[top:bottom].data
+            entries = np.zeros(self.layout.blocks(), np.int64)
+            for batch in batches:
+                rows = self.block(channel, batch).matrix.indices // self.layout.block_rows
+                entries += np.bincount(rows, minlength=len(entries))
+            passes = np.cumsum(entries) * _PER_ENTRY // memory
+            for number in np.unique(passes):
+                blocks, columns, known = np.flatnonzero(passes == number).tolist(), [], False
+                first, stop = span(blocks[0])[0], span(blocks[-1])[1]
+                for C, variance in (self.block(channel, batch) for batch in batches):
+                    known |= variance is not None
+                    data = np.empty(C.nnz, np.complex64)  # T + i V, NaN where V is unknown
+                    data.real, data.imag = C.data, np.nan if variance is None else variance
+                    columns.append(
+                        scipy.sparse.csr_array((data, C.indices, C.indptr), C.shape)[:, first:stop]
+                    )
+                T = scipy.sparse.vstack(columns, "csr").T.tocsr()
+                for block in blocks:
+                    R = T[span(block)[0] - first : span(block)[1] - first]
+                    rows, variance = R.real, R.data.imag.copy() if known else None
                     if change is not None:
-                        rows, variance = change(channel, start + top, rows, variance)
+                        rows, variance = change(channel, span(block)[0], rows, variance)
                     yield channel, block, _checked(rows, variance, self.layout.block_shape(block))
 
-    def _entries(self, channel: int) -> np.ndarray:
-        """Entries of each block of rows."""
-        counts = np.zeros(self.layout.blocks(), np.int64)
-        for block in range(self.layout.blocks("columns")):
-            rows = self.read(channel, block).indices // self.layout.block_rows
-            counts += np.bincount(rows, minlength=len(counts))
-        return counts
 
-    def _gathered(self, channel: int, start: int, stop: int) -> tuple[Any, Any]:
-        """Rows start .. stop - 1 of T, and their variance: NaN of columns without one, None if none has."""
-        values, variances, known = [], [], False
-        for block in range(self.layout.blocks("columns")):
-            C, variance = self.block(channel, block)
-            known |= variance is not None
-            values.append(C[:, start:stop])
-            V = np.full(C.nnz, np.nan, np.float32) if variance is None else variance
-            variances.append(scipy.sparse.csr_array((V, C.indices, C.indptr), shape=C.shape)[:, start:stop])
-        T, V = (scipy.sparse.vstack(parts, "csr").T.tocsr() for parts in (values, variances))
-        return T, V if known else None
+def read(path: Path) -> Record | Parts:
+    """The transport in a store, none of it in memory yet; each block is checked once, here."""
+    store = BlockStore.open(path)
+    if not store.final:
+        raise FileError("is a scan that is not finished; finalize it first")
+    if store.layout.kind == "compressed":
+        arrays = {name: store.extra(name) for name in store.attributes["arrays"]}  # others are no part of it
+        return Parts(arrays | {name: np.array(str(text)) for name, text in store.attributes["texts"].items()})
+    F, mixing = (store.extra(n) if n in store.extras else None for n in ("first_bounce", "mixing"))
+    matrices = tuple(StoredRows(store, channel) for channel in range(store.layout.channels))
+    F = F[0] if F is not None and len(F) == 1 else F
+    return Record(matrices, store.layout.grid, store.layout.camera_grid, F, mixing)
 
 
-def write_finished(
-    root: Path,
-    layout: Layout,
-    rows: Iterable[tuple[int, int, Block]],
-    extras: Iterable[tuple[str, np.ndarray]],
-    sigmas: float = 0.0,
-) -> dict[str, str]:
-    """Write T and all small arrays by zarr into `root`, flushed; returns their manifest."""
-    groups = ["extra", *(f"channel_{c}" for c in range(layout.channels))]
-    for group in groups:
-        shutil.rmtree(root / group, ignore_errors=True)  # of a process that ended here
-        zarr_arrays.write_group(root / group, {}, {})
-    F = np.zeros((layout.channels, layout.shape[1]))
-    for channel, block, part in rows:
-        zarr_arrays.write_rows(root, channel, block, part, layout.dtype)
-        if layout.is_square:
-            F[channel, slice(*layout.span(block))] = _diagonal(part, layout.span(block)[0], sigmas)
-    small = dict(extras)
-    if layout.kind == "blocks" and layout.is_square and "first_bounce" not in small:
-        small |= {"first_bounce": F, "masked": np.asarray((F <= 0).any(axis=0))}
-    for name, array in small.items():
-        zarr_arrays.write_group(root / "extra" / f"{name}.0", {"array": array}, {})
-    for group in groups:
-        flush_tree(root / group)
-    return zarr_arrays.manifest(root, groups)
-
-
-def document(
-    layout: Layout, provenance: Mapping[str, Any], state: Mapping[str, Any], files: Mapping[str, str] | None
-) -> bytes:
-    """The zarr.json of a store; `files` of a final one."""
-    from ltcl import __version__  # here, because it is set after this module is imported
-
-    versions = {"ltcl": __version__, "numpy": np.__version__, "scipy": scipy.__version__}
-    attributes = {
-        "ltcl": {"schema": SCHEMA, **asdict(layout)},
-        "provenance": {"versions": versions, **provenance},
-        "state": dict(state),
-    }
-    return zarr_arrays.seal(attributes if files is None else attributes | {"files": dict(files)})
+def write(path: Path, content: Record | Parts) -> None:
+    """Write a store in a temporary folder and put it at `path` when it is whole; float64 stays float64."""
+    if content.grid is None:
+        raise FileError("a store keeps the grid, which is unknown for this transport; give grid=(h, w)")
+    check_place(path, overwrite=True)
+    rows, state = (), {}
+    if isinstance(content, Parts):
+        layout, extras, state = _compressed(content)
+    else:
+        T, sizes = content.matrices, (content.shape, content.grid, content.camera_grid)
+        layout = Layout(*sizes, len(T), dtype=np.result_type(*(M.dtype for M in T), np.float32).name)
+        known, rows = {"first_bounce": content.first_bounce, "mixing": content.mixing}, _blocks(T, layout)
+        extras = {name: np.atleast_2d(array) for name, array in known.items() if array is not None}
+    with fill_folder(path, replace=True) as folder:
+        files = _write_finished(folder, layout, rows, extras)
+        (folder / "zarr.json").write_bytes(_document(layout, {}, state, files=files))
 
 
 def check_place(path: Path, overwrite: bool) -> None:
     """Refuse at once, before there is anything to keep, a place where no store can be made."""
-    target = Path(os.path.realpath(path))
     with about(path):
+        target = Path(os.path.realpath(path))
         restore(target)
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             own = target / "zarr.json"
@@ -490,13 +365,60 @@ def check_place(path: Path, overwrite: bool) -> None:
             raise FileError(f"cannot be written: {parent} may not be written")
 
 
-def rows_at_once(shape: tuple[int, int]) -> int:
-    """Rows of a block unless told otherwise: 64 MiB if none of its entries were 0.
+def _blocks(matrices: Iterable[Any], layout: Layout) -> Iterator[tuple[int, int, Block]]:
+    for channel, T in enumerate(matrices):
+        for block in range(layout.blocks()):
+            start, stop = layout.span(block)
+            rows = T.rows(start, stop) if isinstance(T, StoredRows) else T[start:stop]
+            yield channel, block, Block(scipy.sparse.csr_array(rows), None)
 
-    >>> rows_at_once((4096, 4096)), rows_at_once((3, 5))
-    (2048, 3)
-    """
-    return max(1, min(shape[0], _FILL // (8 * shape[1])))
+
+def _compressed(parts: Parts, block_rows: int = 1) -> tuple[Layout, dict[str, Any], dict[str, Any]]:
+    """Of the store of `parts`: layout, arrays, and the attributes that hold the rest."""
+    sizes: dict[str, Any] = {"channels": len(parts.first_bounce), "block_rows": block_rows}
+    texts = {name: str(array) for name, array in parts.arrays.items() if array.dtype.kind in "SU"}
+    arrays = {name: parts.arrays[name] for name in sorted(parts.arrays.keys() - texts.keys())}
+    layout = Layout(parts.shape, parts.grid, **sizes, kind="compressed")
+    return layout, arrays, {"texts": texts, "arrays": list(arrays)}
+
+
+def _write_finished(
+    root: Path,
+    layout: Layout,
+    rows: Iterable[tuple[int, int, Block]],
+    extras: Mapping[str, np.ndarray],
+    sigmas: float = 0.0,
+) -> dict[str, str]:
+    """Write T and all small arrays by zarr into `root`, flushed; returns their manifest."""
+    groups = ["extra", *(f"channel_{c}" for c in range(layout.channels))]
+    for group in groups:
+        shutil.rmtree(root / group, ignore_errors=True)  # of a process that ended here
+        write_group(root / group, {}, {})
+    F = np.zeros((layout.channels, layout.shape[1]))
+    for channel, number, (T, variance) in rows:
+        write_rows(root / f"channel_{channel}/block_{number:06d}.0", T, variance, layout.dtype)
+        if layout.is_square:
+            start, stop = layout.span(number)
+            F[channel, start:stop] = T.diagonal(start)
+            if variance is not None and sigmas > 0:
+                V = scipy.sparse.csr_array((variance, T.indices, T.indptr), shape=T.shape).diagonal(start)
+                F[channel, start:stop] = first_bounce.certain(T.diagonal(start), V, sigmas)
+    if layout.kind == "blocks" and layout.is_square:
+        extras = {"first_bounce": F, **extras}
+    for name, array in extras.items():
+        write_group(root / "extra" / f"{name}.0", {"array": np.asarray(array)}, {})
+    for group in groups:
+        flush_tree(root / group)
+    return zarr_arrays.manifest(root, groups)
+
+
+def _document(layout: Layout, provenance: Mapping[str, Any], state: Mapping[str, Any], **files: Any) -> bytes:
+    """The zarr.json of a store; `files` of a final one."""
+    from ltcl import __version__  # here, because it is set after this module is imported
+
+    versions = {"ltcl": __version__, "numpy": np.__version__, "scipy": scipy.__version__}
+    known = {"provenance": {"versions": versions, **provenance}, "state": dict(state), **files}
+    return zarr_arrays.seal({"ltcl": {"schema": _SCHEMA, **asdict(layout)}, **known})
 
 
 def _checked(matrix: Any, variance: Any, shape: tuple[int, int]) -> Block:
@@ -505,36 +427,9 @@ def _checked(matrix: Any, variance: Any, shape: tuple[int, int]) -> Block:
     checks.shape("matrix", matrix, shape)
     with np.errstate(over="ignore"):
         values = checks.finite("matrix as float32", matrix.data.astype(np.float32))
-    if scipy.sparse.issparse(variance):
-        other = checks.csr("variance", variance)
-        if not (
-            np.array_equal(other.indptr, matrix.indptr) and np.array_equal(other.indices, matrix.indices)
-        ):
-            raise InputError("variance has its entries in other places than matrix; it must have the same")
-        variance = other.data
     if variance is not None:
         variance = checks.shape("variance", checks.real("variance", variance), (matrix.nnz,))
         if np.any(variance < 0) or np.any(np.isinf(variance)):
             raise InputError("variance is negative or infinite; it must be at least 0, or NaN where unknown")
         variance = variance.astype(np.float32)
     return Block(scipy.sparse.csr_array((values, matrix.indices, matrix.indptr), shape=shape), variance)
-
-
-def _diagonal(rows: Block, start: int, sigmas: float) -> np.ndarray:
-    """First bounce of the pixels whose rows start at `start`; 0 where it does not stand out of the noise."""
-    T, F = rows.matrix, rows.matrix.diagonal(start)
-    if rows.variance is None or sigmas <= 0:
-        return F
-    V = scipy.sparse.csr_array((rows.variance, T.indices, T.indptr), shape=T.shape)
-    return first_bounce.certain(F, V.diagonal(start), sigmas)
-
-
-def _batches(sizes: np.ndarray, most: int) -> Iterator[tuple[int, int]]:
-    """Runs (first, last) of blocks that together have at most `most` entries, or one block."""
-    first, total = 0, 0
-    for block, size in enumerate(sizes.tolist()):
-        if block > first and total + size > most:
-            yield first, block - 1
-            first, total = block, 0
-        total += size
-    yield first, len(sizes) - 1

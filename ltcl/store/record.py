@@ -1,38 +1,161 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Transports as files hold them: `Record`, plain host arrays, and `Parts`, of a compressed one."""
+"""Transports as files hold them, and the checks of what a file declares before memory is taken for it.
+
+`Record` has matrices, in memory or on the disk (`StoredRows`); `Parts` arrays of a compressed transport or an
+inverse. SciPy, NumPy, h5py and zarr allocate what a header asks for, and raise nearly everything where bytes
+are damaged: so their callers call `declared` first, inside of `about`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy.sparse
+import scipy.sparse.linalg
 
 from ltcl import checks, layout
-from ltcl.errors import FileError, InputError, InputTypeError
-from ltcl.store import headers
-from ltcl.store.rows import StoredRows
+from ltcl.errors import FileError, InputError, InputTypeError, LtclError, MemoryLimitError
+
+EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
+CSR = ("data", "indices", "indptr")
+CHANNELS = ("T_0", "T_1", "T_2")
+EXPANSION = 1032
+"""What deflate can reach, the only compression that is read."""
+_FREE_ROWS = 1 << 24  # 128 MiB of pointers; a matrix of more rows must have entries to show for them
+_ROWS_PER_ENTRY = 64
+
+
+@contextlib.contextmanager
+def about(path: Any, *, reading: bool = False) -> Iterator[None]:
+    """Put the name of `path` in front of each refusal in the block; in `reading`, any exception is one.
+
+    >>> with about("T.npz"):
+    ...     raise InputError("is empty")
+    Traceback (most recent call last):
+    ltcl.errors.FileError: T.npz: is empty
+    """
+    try:
+        yield
+    except (InputError, InputTypeError) as error:
+        if isinstance(error, FileError) and str(error).startswith(str(path)):
+            raise
+        raise FileError(f"{path}: {error}") from error.__cause__
+    except MemoryError as error:
+        raise MemoryLimitError(f"{path}: {error or 'the host has no memory left'}") from None
+    except Exception as error:
+        if isinstance(error, LtclError) or not (reading or isinstance(error, OSError)):
+            raise
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        damage = "" if isinstance(error, OSError) else "is damaged or truncated: "
+        raise FileError(f"{path}: {damage}{reason:.150}") from error
+
+
+def declared(what: str, dtype: np.dtype, shape: tuple[int, ...], most: int, least: int = 0) -> None:
+    """Refuse an array whose declared bytes are not `least` .. `most`, or too many for the host."""
+    nbytes = math.prod(shape) * dtype.itemsize
+    if min(shape, default=0) < 0 or not least <= nbytes <= most:
+        size = f"{dtype.newbyteorder('=')} {shape}, {checks.size(nbytes)}"
+        raise FileError(f"{what} is declared as {size}, but {checks.size(most)} ({most} bytes) are stored")
+    checks.fits_host(f"{what} {shape}", 2 * nbytes)
+
+
+def floats(what: str, array: np.ndarray) -> np.ndarray:
+    """Real values as float32 where that is exact by type (16 bits and fewer, float32), else as float64."""
+    dtype = np.float32 if np.result_type(array.dtype, np.float32) == np.float32 else np.float64
+    return np.ascontiguousarray(checks.real(what, array), dtype)
+
+
+def sparse(make: Callable[[], Any], shape: Sequence[int], entries: int) -> scipy.sparse.csr_array:
+    """A matrix of SciPy in any layout as checked rows of floats, made after its sizes are checked."""
+    most = _FREE_ROWS + _ROWS_PER_ENTRY * entries  # as the conversion allocates all rows
+    if min(shape) < 1 or max(shape) > most:
+        sizes = f"{tuple(shape)} with {entries} entries"
+        raise FileError(f"the matrix is declared as {sizes}; rows and columns must be 1..{most}")
+    matrix = make()
+    if matrix.format == "bsr":
+        matrix.check_format(full_check=True)  # the others are checked in `checks.csr`, or when they are made
+    csr = checks.csr("the matrix", matrix)
+    return scipy.sparse.csr_array((floats("data", csr.data), csr.indices, csr.indptr), shape=csr.shape)
+
+
+class StoredRows(scipy.sparse.linalg.LinearOperator):
+    """T (M, N) of channel `channel` of a final `BlockStore`, read block by block; all are checked once, here.
+
+    On a device it becomes compressed sparse rows, a block at a time; everything else may use it as a SciPy
+    `LinearOperator`. `nbytes` are those of the blocks on the disk.
+    """
+
+    dtype: np.dtype
+    shape: tuple[int, int]
+
+    def __init__(self, store: Any, channel: int) -> None:
+        super().__init__(np.dtype(store.layout.dtype), store.layout.shape)
+        self.store, self.channel = store, channel
+        self._latest: tuple[int, Any] = (-1, None)
+        self.nnz = sum(block.nnz for _, block in self.row_blocks())
+        self.nbytes = (4 + self.dtype.itemsize) * self.nnz + 8 * (self.shape[0] + store.layout.blocks())
+
+    def row_blocks(self) -> Iterator[tuple[int, scipy.sparse.csr_array]]:
+        """Each block with its first row; gone from memory when the next one comes."""
+        for block in range(self.store.layout.blocks()):
+            yield self.store.layout.span(block)[0], self._read(block)
+
+    def rows(self, start: int, stop: int) -> np.ndarray:
+        """Rows start .. stop - 1, (stop - start, N)."""
+        size = self.store.layout.block_rows
+        blocks = range(start // size, -(-stop // size))
+        slices = (self._read(k)[max(start - k * size, 0) : stop - k * size].toarray() for k in blocks)
+        return np.concatenate(list(slices))
+
+    def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """The entries where ascending `rows` meet `columns`, (len(rows), len(columns)) float64."""
+        limits = ((rows, *self.store.layout.span(k)) for k in range(self.store.layout.blocks()))
+        inside = (rows[(rows >= first) & (rows < stop)] - first for rows, first, stop in limits)
+        blocks = (B[of][:, columns].toarray() for of, (_, B) in zip(inside, self.row_blocks(), strict=True))
+        return np.concatenate(list(blocks)).astype(np.float64)
+
+    def diagonal(self) -> np.ndarray:
+        """The main diagonal."""
+        diagonals = [block.diagonal(first) for first, block in self.row_blocks() if first < self.shape[1]]
+        return np.concatenate(diagonals)[: min(self.shape)]
+
+    def tocsr(self) -> scipy.sparse.csr_array:
+        """All of it in memory."""
+        checks.fits_host(f"T of {self.nnz} entries", 2 * self.nbytes)
+        return scipy.sparse.csr_array(scipy.sparse.vstack([block for _, block in self.row_blocks()], "csr"))
+
+    def _read(self, block: int) -> Any:
+        if self._latest[0] != block:  # neighbouring rows are asked for a few at a time
+            self._latest = (-1, None)
+            self._latest = (block, self.store.block(self.channel, block).matrix)
+        return self._latest[1]
+
+    def _matmat(self, X: Any) -> np.ndarray:
+        return np.concatenate([block @ X for _, block in self.row_blocks()])
+
+    def _rmatmat(self, X: Any) -> np.ndarray:
+        blocks = (block.T @ X[first : first + len(block.indptr) - 1] for first, block in self.row_blocks())
+        return sum(blocks, np.zeros((self.shape[1], X.shape[1])))
+
+    def _rmatvec(self, x: Any) -> np.ndarray:
+        return self._rmatmat(x.reshape(-1, 1))
+
 
 Matrix = np.ndarray | scipy.sparse.csr_array | StoredRows
-EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
-_MAY_BE_INFINITE = ".solution_error"
 
 
 @dataclass(frozen=True)
 class Record:
     """Contents of a transport file, `picture = T @ pattern`; InputError where they do not fit each other.
 
-    Attributes
-    ----------
-    matrices
-        One matrix, or three for red, green and blue, each (M, N): M camera pixels, N projector pixels, both
-        row-major. All dense, all `csr_array` or all `StoredRows`, real.
-    grid, camera_grid
-        (h, w) of projector and camera, or None where the file does not tell.
-    first_bounce, mixing
-        Direct light per pixel, (N,) or (3, N), and the mixing (3, 3) of the projector's colours, or None.
+    `matrices` are one, or three for red, green and blue, each (M, N), real: M camera pixels, N projector
+    pixels, both row-major; all dense, all `csr_array` or all `StoredRows`. Perhaps `grid` and `camera_grid`
+    (h, w) of projector and camera, `first_bounce` (N,) or (3, N), and `mixing` (3, 3) of colours.
 
     Examples
     --------
@@ -47,17 +170,14 @@ class Record:
     mixing: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        if len(self.matrices) not in (1, 3):
-            raise InputError(f"matrices are {len(self.matrices)}; they must be one, or three for RGB")
-        kinds, shapes = {type(T) for T in self.matrices}, {tuple(T.shape or ()) for T in self.matrices}
-        if len(kinds) > 1 or not isinstance(self.matrices[0], Matrix):
+        types, shapes = {type(T) for T in self.matrices}, {tuple(T.shape or ()) for T in self.matrices}
+        if len(self.matrices) not in (1, 3) or len(types) > 1 or not isinstance(self.matrices[0], Matrix):
             names = ", ".join(type(T).__name__ for T in self.matrices)
-            raise InputTypeError(f"matrices are {names}; they must be all arrays or all csr_array")
+            raise InputTypeError(f"matrices are {names}; they must be one or three arrays or csr_array")
         if len(shapes) > 1 or any(len(shape) != 2 or 0 in shape for shape in shapes):
             raise InputError(f"matrices have the shapes {sorted(shapes)}; they must be one (M, N), not empty")
         if self.first_bounce is not None:
-            columns = self.shape[1]
-            checks.shape("first_bounce", self.first_bounce, (columns,), (3, columns))
+            checks.shape("first_bounce", self.first_bounce, (self.shape[1],), (3, self.shape[1]))
         if self.mixing is not None:
             layout.mixing(self.mixing, len(self.matrices), None)
 
@@ -77,112 +197,97 @@ class Record:
         """Whether the matrices are in a store, and not in memory."""
         return isinstance(self.matrices[0], StoredRows)
 
-    @property
-    def bounces_from_diagonal(self) -> bool:
-        """Whether a first bounce taken from the diagonal of T, the default on loading, would be the same."""
-        if self.first_bounce is None or self.shape[0] != self.shape[1]:
-            return True
-        diagonals = np.stack([T.diagonal() for T in self.matrices])
-        return np.allclose(self.first_bounce, diagonals, rtol=1e-6, atol=0)
-
     def in_memory(self) -> Record:
         """The same, of a store's blocks all loaded."""
-        matrices = tuple(T.tocsr() if isinstance(T, StoredRows) else T for T in self.matrices)
-        return replace(self, matrices=matrices)
+        T: Any = self.matrices
+        return replace(self, matrices=tuple(channel.tocsr() for channel in T)) if self.stored else self
+
+    def arrays(self) -> dict[str, Any]:
+        """Named arrays: `EXTRAS`, and T (M, N) or (3, M, N) where that is dense."""
+        T: Any = self.matrices
+        values = {"T": (T[0] if len(T) == 1 else np.stack(T)) if self.dense else None}
+        values |= {name: getattr(self, name) for name in EXTRAS}
+        return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 
-def choose(
-    shapes: Mapping[str, tuple[int, ...]], variable: str | None, name: str, channels: Sequence[str] = ()
-) -> tuple[str, ...]:
-    """Names of what holds T: `variable`, else `name`, else three `channels`, else the only matrix."""
-    if variable is not None or name in shapes:
-        return (variable or name,)
-    if channels and all(channel in shapes for channel in channels):
-        return tuple(channels)
+def assemble(
+    shapes: Mapping[str, tuple[int, ...]],
+    load: Callable[[str], Any],
+    variable: str | None = None,
+    name: str = "T",
+    channels: Sequence[str] = CHANNELS,
+    reverse: bool = False,
+) -> Record:
+    """A record of what a file holds by name: T is `variable`, else `name`, `channels`, or the only matrix.
+
+    `reverse`: the axes of `shapes` are in the reverse order of those that the user knows.
+    """
     others = {other: shape for other, shape in shapes.items() if other not in EXTRAS}
-    names = tuple(other for other, shape in others.items() if headers.is_matrix_shape(shape))
-    if len(names) != 1:
-        listed = ", ".join(f"{other!r} {shape}" for other, shape in others.items()) or "no array of numbers"
-        raise FileError(
-            f"holds {listed:.300}; it must hold {name} of (M, N) or with three channels, or one matrix by "
-            "another name; variable= names one of several"
-        )
-    return names
-
-
-def from_arrays(matrices: Sequence[Any], extras: Mapping[str, np.ndarray]) -> Record:
-    """A record of matrices, or of one array (k, M, N), and the small arrays that stand with them."""
-    small: dict[str, Any] = {}
-    for name, array in extras.items():
-        if name not in EXTRAS[:2]:
-            small[name] = headers.floats(name, array)
-        elif array.size != 2:
-            raise FileError(f"array {name!r} has shape {array.shape}; it must be (h, w)")
-        else:
-            small[name] = checks.grid(f"array {name!r}", array.ravel().tolist())
+    names: Sequence[str] = [variable or name]
+    if variable is None and name not in shapes:
+        names = [other for other, shape in others.items() if _is_matrix(shape)]
+        names = channels if set(channels) <= set(shapes) else names
+        if len(names) != 1 and names is not channels:
+            sizes = {other: shape[::-1] if reverse else shape for other, shape in others.items()}
+            content = ", ".join(f"{other!r} {size}" for other, size in sizes.items()) or "no numbers"
+            text = f"it must hold {name} of (M, N) or of three channels, or one matrix by another name"
+            raise FileError(f"holds {content:.300}; {text}; variable= names one of several")
+    matrices = [load(name) for name in names]
+    extras: dict[str, Any] = {name: load(name) for name in EXTRAS if name in shapes}
+    for name in extras.keys() & {"first_bounce", "mixing"}:
+        extras[name] = floats(name, extras[name])
+    for name in extras.keys() & {"grid", "camera_grid"}:
+        extras[name] = checks.grid(f"array {name!r}", extras[name].ravel().tolist())
     if isinstance(matrices[0], np.ndarray):
-        for T in matrices:
-            headers.matrix_shape("T", T.shape)
-        matrices = [headers.floats("T", T) for T in matrices]
+        if wrong := [T.shape for T in matrices if not _is_matrix(np.shape(T))]:
+            raise FileError(f"T has shape {wrong[0]}; it must be (M, N) or (3, M, N), not empty")
+        matrices = [floats("T", T) for T in matrices]
         matrices = list(matrices[0]) if matrices[0].ndim == 3 else matrices
-    return Record(tuple(matrices), **small)
+    return Record(tuple(matrices), **extras)
+
+
+def _is_matrix(shape: tuple[int, ...]) -> bool:
+    return 0 not in shape and (len(shape) == 2 or (len(shape) == 3 and shape[0] in (1, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Arrays of a compressed transport, or of an inverse, by the names of `ltcl.transport`.
+    """Arrays of a compressed transport, or by its `format` of an inverse, by the names of `ltcl.transport`.
 
-    They are finite, with a grid and a first bounce that fit (else InputError); what they make is checked
-    where it is made.
+    They are finite, with a grid and a first bounce that fit (else InputError); the operators are checked
+    where they are made.
     """
 
     arrays: Mapping[str, np.ndarray]
-
-    def __post_init__(self) -> None:
-        for name in ("grid", "first_bounce", "system_0.R.kind"):
-            if name not in self.arrays:
-                raise InputError(f"a compressed transport has the array {name!r}, which is missing")
-        F = self.arrays["first_bounce"]
-        if F.ndim != 2 or len(F) not in (1, 3):
-            raise InputError(f"first_bounce has shape {F.shape}; it must be (1, N) or (3, N)")
-        checks.shape("grid", self.arrays["grid"], (2,))
-        checks.grid("grid", self.arrays["grid"].tolist(), F.shape[1])
-        for name, array in self.arrays.items():
-            if array.dtype.kind == "f" and not name.endswith(_MAY_BE_INFINITE):
-                checks.finite(f"array {name!r}", array)
-        if "mixing" in self.arrays:
-            layout.mixing(self.arrays["mixing"], len(F), None)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(N, N)."""
-        n = self.first_bounce.shape[1]
-        return n, n
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """(h, w) of projector and camera."""
-        h, w = self.arrays["grid"].tolist()
-        return h, w
-
+    format: str = "ltcl-compressed-1"
     camera_grid = None
 
-    @property
-    def first_bounce(self) -> np.ndarray:
-        """F, (channels, N)."""
-        return self.arrays["first_bounce"]
+    def __post_init__(self) -> None:
+        if missing := {"grid", "first_bounce", "system_0.R.kind"} - self.arrays.keys():
+            raise InputError(f"a compressed transport has the array {min(missing)!r}, which is missing")
+        F = self.first_bounce
+        if F.ndim != 2 or len(F) not in (1, 3):
+            raise InputError(f"first_bounce has shape {F.shape}; it must be (1, N) or (3, N)")
+        checks.grid("grid", checks.shape("grid", self.arrays["grid"], (2,)).tolist(), F.shape[1])
+        for name, array in self.arrays.items():
+            if array.dtype.kind == "f" and not name.endswith(".solution_error"):  # infinite where unknown
+                checks.finite(f"array {name!r}", array)
+        if self.mixing is not None:
+            layout.mixing(self.mixing, len(F), None)
 
-    @property
-    def mixing(self) -> np.ndarray | None:
-        """Of the projector's colours, (3, 3)."""
-        return self.arrays.get("mixing")
+    grid = property(lambda self: tuple(self.arrays["grid"].tolist()), doc="(h, w) of projector and camera.")
+    first_bounce = property(lambda self: self.arrays["first_bounce"], doc="F, (channels, N).")
+    mixing = property(lambda self: self.arrays.get("mixing"), doc="Of the projector's colours, (3, 3).")
+    shape = property(lambda self: (self.first_bounce.shape[1],) * 2, doc="(N, N).")
+
+    def _ending(self, *ends: str) -> list[np.ndarray]:
+        return [array for name, array in self.arrays.items() if name.endswith(ends)]
 
     @property
     def error(self) -> float:
         """Bound on the relative error of solutions, the largest of all channels."""
-        errors = [array for name, array in self.arrays.items() if name.endswith((_MAY_BE_INFINITE, "errors"))]
-        numbers = [array for array in errors if array.dtype.kind in "fiu"]
-        return max((float(np.max(array, initial=0.0)) for array in numbers), default=0.0)
+        errors = self._ending(".solution_error", "errors")
+        return max((float(np.max(a, initial=0.0)) for a in errors if a.dtype.kind in "fiu"), default=0.0)
 
     @property
     def nbytes(self) -> int:
@@ -192,12 +297,11 @@ class Parts:
     @property
     def entries(self) -> int:
         """Values that are not 0, of all cores."""
-        ends = (".data", ".codes", ".matrix")
-        return sum(int(np.count_nonzero(array)) for name, array in self.arrays.items() if name.endswith(ends))
+        return sum(int(np.count_nonzero(array)) for array in self._ending(".data", ".codes", ".matrix"))
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Names of the cores and bases, each once."""
-        texts = [(name, str(array)) for name, array in self.arrays.items() if array.dtype.kind in "SU"]
-        cores = {text for name, text in texts if name.endswith(".kind")} - {"compressed", "sum"}
-        return (*sorted(cores), *sorted({text for name, text in texts if name.startswith("basis_")}))
+        cores = {str(array) for array in self._ending(".kind")} - {"compressed", "sum"}
+        texts = {n: str(a) for n, a in self.arrays.items() if n.startswith("basis_") and a.dtype.kind in "SU"}
+        return (*sorted(cores), *sorted(set(texts.values())))

@@ -167,9 +167,9 @@ class _Bidiagonal:
         for operator, sign in ((self.A, 1.0), (self.minus, -1.0)):
             if operator is not None:
                 apply = operator.apply_transpose if transpose else operator.apply
-                part = apply(operator.device.upload(x)).get().astype(np.float64)
-                size += float(np.linalg.norm(part, axis=0).max())
-                product = product + sign * part
+                term = apply(operator.device.upload(x)).get().astype(np.float64)
+                size += float(np.linalg.norm(term, axis=0).max())
+                product = product + sign * term
         self._size = max(self._size, size)
         return product
 

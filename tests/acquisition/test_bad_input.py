@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +18,33 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import Report, Shots, VirtualRig, acquire, kept
-from ltcl.acquisition.calibrate import measure
-from ltcl.acquisition.geometry import Correspondence
+from ltcl.acquisition import Correspondence, Report, VirtualRig, acquire
+from ltcl.acquisition.session import calibration_folder, calibration_photographs
 from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, LtclError
 from ltcl.store import BlockStore
 from tests.store.stores import contents
 
-from .stopping import LINE, made, scene
+from .stopping import LINE, Unplugged, made, scene
 
+random = np.random.default_rng()
 GRID = (8, 8)
 FULL: dict[str, Any] = {"geometry": "aligned", "strategy": "pixel", "frames": 2}
 SHORT: dict[str, Any] = {**FULL, "response": LINE, "exposures": [0.5]}
 CAMERA: dict[str, Any] = {"bits": 12, "ambient": 0.01, "response": "linear"}
+TWICE = np.repeat(np.repeat(np.eye(64).reshape(8, 8, 64), 2, axis=0), 2, axis=1).reshape(256, 64)
 
 
-def refused(error: type[LtclError], text: str, rig: Any, **given: Any) -> None:
+def refused(error: type[LtclError], text: str, rig: Any, **settings: Any) -> None:
     """Assert that `acquire` says so in one line."""
-    with pytest.raises(error, match=text) as found:
-        acquire(rig, **given)
-    assert "\n" not in str(found.value)
+    with pytest.raises(error, match=rf"\A.*{text}.*\Z"):
+        acquire(rig, **settings)
 
 
 class Faulty(VirtualRig):
     """A camera whose photographs are changed on the way, from some number on."""
 
-    def __init__(self, fault: Callable[[Any, np.ndarray], Any], start: int = 1, T: Any = None) -> None:
-        super().__init__(scene(GRID) if T is None else T, GRID, **CAMERA)
+    def __init__(self, fault: Callable[[Any, np.ndarray], Any], start: int = 1) -> None:
+        super().__init__(scene(GRID), GRID, **CAMERA)
         self._fault, self._left = fault, start
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
@@ -52,44 +53,83 @@ class Faulty(VirtualRig):
         return image if self._left > 0 else self._fault(codes, image)
 
 
-def constant(code: int) -> Faulty:
-    """A camera that sees nothing of the scene."""
-    return Faulty(lambda _, image: np.full(GRID, code, image.dtype))
+def camera(T: np.ndarray | None = None, grid: tuple[int, int] = GRID, **options: Any) -> VirtualRig:
+    return VirtualRig(scene(grid) if T is None else T, grid, **{**CAMERA, **options})
 
 
-@pytest.mark.parametrize("given", [FULL, SHORT])
-def test_a_scene_without_light(given: dict[str, Any]) -> None:
-    for dark in (VirtualRig(0 * scene(GRID), GRID, **CAMERA), constant(0), constant(7)):
-        refused(AcquisitionError, "is the lens cap on, the projector off", dark, **given)
+def unused() -> Unplugged:
+    """A rig that must not be asked for a photograph."""
+    return Unplugged(scene(GRID), GRID, left=0)
 
 
-@pytest.mark.parametrize("given", [FULL, SHORT])
-def test_a_scene_that_is_all_saturated(given: dict[str, Any]) -> None:
-    for bright in (VirtualRig(scene(GRID), GRID, **{**CAMERA, "ambient": 1e5}), constant(4095)):
-        refused(AcquisitionError, "every pixel is saturated.* 0.0001 s", bright, **given)
+UNLIT, BRIGHT = camera(0 * scene(GRID)), camera(ambient=1e5)
+DARK, SATURATED = "is the lens cap on, the projector off", "every pixel is saturated.* 0.0001 s"
+MEASURED: dict[str, Any] = {"response": None, "exposures": None}
+CONSTANT = Faulty(lambda _, image: np.full_like(image, 7))
+FINE = camera(camera_grid=(16, 16), camera_map=TWICE)
+GIVEN = {"geometry": Correspondence.aligned(GRID)}
 
 
-def test_a_scene_that_gray_code_cannot_decode() -> None:
-    given: dict[str, Any] = {"strategy": "pixel", "response": LINE}
-    refused(AcquisitionError, "the geometry: photographs", constant(7), **given)
+@pytest.mark.parametrize(
+    ("rig", "change", "error", "text"),
+    [
+        (UNLIT, {}, AcquisitionError, DARK),
+        (UNLIT, MEASURED, AcquisitionError, DARK),
+        (CONSTANT, {}, AcquisitionError, DARK),
+        (CONSTANT, MEASURED, AcquisitionError, DARK),
+        (BRIGHT, {}, AcquisitionError, SATURATED),
+        (BRIGHT, MEASURED, AcquisitionError, SATURATED),
+        (CONSTANT, {"geometry": "graycode"}, AcquisitionError, "the geometry: photographs"),
+        (camera(), {"exposures": [1e-4]}, InputError, "exposures is .*lost in noise at 0.0001 s"),
+        (camera(), {"exposures": [30.0]}, InputError, "exposures is .*saturates at 30 s"),
+        (FINE, {}, InputError, r"geometry is 'aligned'.*\(16, 16\)"),
+        (FINE, GIVEN, InputError, r"geometry.*\(8, 8\).*\(16, 16\)"),
+        (camera(grid=(8, 16)), GIVEN, InputError, r"geometry.*\(8, 8\).*\(8, 16\)"),
+        (None, {"strategy": "spiral"}, InputError, "strategy is 'spiral'"),
+        (None, {"geometry": "stripes"}, InputError, "geometry is 'stripes'"),
+        (None, {"geometry": np.eye(2)}, InputError, "geometry is a ndarray"),
+        (None, {"order": 64}, InputError, "order is 64"),
+        (None, {"block": 1}, InputError, "block is 1"),
+        (None, {"threshold": 0.0}, InputError, "threshold is 0"),
+        (None, {"frames": 0}, InputError, "frames is 0"),
+        (None, {"resume": "no"}, InputTypeError, "resume is 'no'"),
+        (None, {"exposures": 0.5}, InputError, "exposures is 0.5"),
+        (None, {"exposures": "long"}, InputTypeError, "exposures"),
+        (None, {"exposures": []}, InputError, r"exposures is \[\]"),
+        (None, {"exposures": [1.0, -1.0]}, InputError, "exposures is"),
+        (None, {"exposures": [np.nan]}, InputError, "exposures has 1 NaN"),
+        (None, {"exposures": [0.5, 40.0]}, InputError, "exposures is 40.*30"),
+        (None, {"response": "srgb"}, InputTypeError, "response is a str"),
+        (None, {"progress": 3}, InputTypeError, "progress is 3"),
+        (None, {"store": 3}, InputTypeError, "store is 3"),
+    ],
+)
+def test_bad_arguments(rig: Any, change: dict[str, Any], error: type[LtclError], text: str) -> None:
+    """Those for None, which need no photograph, are refused before the first one."""
+    refused(error, text, rig or unused(), **{**SHORT, **change})
+
+
+def test_a_photograph_of_another_kind_is_not_kept(tmp_path: Path) -> None:
+    path, rig = tmp_path / "T.zarr", Faulty(lambda _, image: image[:4], start=30)
+    refused(AcquisitionError, r"photograph 30 is uint16 \(4, 8\).*\(8, 8\)", rig, **FULL, store=path)
+    assert calibration_photographs(path) == 29
 
 
 @pytest.mark.parametrize("strategy", ["pixel", "hadamard", "adaptive"])
-def test_some_black_pixels_are_masked(tmp_path: Path, strategy: str) -> None:
-    """Their noise is no first bounce: T loads, and what is compensated is as if they were not there."""
+def test_some_black_pixels_are_masked(strategy: str) -> None:
+    """Their noise is no first bounce: what is compensated is as if they were not there."""
     black, T = [3, 17], scene(GRID)
     T[black] = T[:, black] = 0.0
-    path = tmp_path / "T.zarr"
-    measured = acquire(VirtualRig(T, GRID, **CAMERA), **{**SHORT, "strategy": strategy}, store=path)
+    measured = acquire(camera(T), **{**SHORT, "strategy": strategy})
     assert np.flatnonzero(measured.masked).tolist() == black
     pattern = ltcl.compensate(measured, np.full(GRID, 0.1, np.float32), rtol=1e-3).pattern
     seen = np.delete(T @ np.asarray(pattern, np.float64).ravel(), black)
     assert np.std(seen) < 10 ** (-30 / 20) * np.mean(seen)
 
 
-@pytest.mark.parametrize("pixels", [[5], [9, 10, 40]])
-def test_hot_pixels_decide_nothing(tmp_path: Path, pixels: list[int]) -> None:
+def test_hot_pixels_decide_nothing(tmp_path: Path) -> None:
     """They are masked; exposures, response and so T are what they are without them."""
+    pixels = [9, 10, 40]
 
     def hot(_: Any, image: np.ndarray) -> np.ndarray:
         image = image.copy()
@@ -97,39 +137,19 @@ def test_hot_pixels_decide_nothing(tmp_path: Path, pixels: list[int]) -> None:
         return image
 
     measured = acquire(Faulty(hot), **FULL, store=tmp_path / "T.zarr")
-    acquire(VirtualRig(scene(GRID), GRID, **CAMERA), **FULL, store=tmp_path / "good.zarr")
+    acquire(camera(), **FULL, store=tmp_path / "good.zarr")
     assert np.flatnonzero(measured.masked).tolist() == pixels
     exposures, good = (Report.of(tmp_path / name).exposures for name in ("T.zarr", "good.zarr"))
     np.testing.assert_allclose(exposures, good, rtol=0.1)
-    p = np.random.default_rng(0).random(GRID).astype(np.float32)
+    p = random.random(GRID).astype(np.float32)
     ours = np.delete(np.asarray(measured @ p, np.float64).ravel(), pixels)
     theirs = np.delete(scene(GRID) @ p.ravel(), pixels)
     assert np.linalg.norm((ours @ theirs) / (ours @ ours) * ours - theirs) < 0.02 * np.linalg.norm(theirs)
 
 
-@pytest.mark.parametrize(("seconds", "part"), [(1e-4, "lost in noise"), (30.0, "saturates")])
-def test_exposures_at_which_nothing_is_seen(seconds: float, part: str) -> None:
-    rig = VirtualRig(scene(GRID), GRID, **CAMERA)
-    refused(InputError, f"exposures is .*{part} at {seconds:g} s", rig, **{**SHORT, "exposures": [seconds]})
-
-
-def test_a_change_behind_the_calibration_keeps_no_batch(tmp_path: Path) -> None:
-    """Half of the light; a photograph too late: refused before the batch is kept, naming photographs."""
-    shots = Shots(VirtualRig(scene(GRID), GRID, **CAMERA))
-    measure(shots, geometry="aligned", frames=2, response=LINE, exposures=[0.5])
-    last: list[np.ndarray] = [np.zeros(GRID, np.uint16)]
-
-    def late(_: Any, image: np.ndarray) -> np.ndarray:
-        last.append(image)
-        return last[-2]
-
-    for number, fault in enumerate((late, lambda _, image: image // 2)):
-        path = tmp_path / f"{number}.zarr"
-        refused(AcquisitionError, r"photographs? \d+", Faulty(fault, shots.count + 2), **SHORT, store=path)
-        assert not BlockStore.open(path).written
-
-
-def test_whatever_ends_a_calibration_its_photographs_stay(tmp_path: Path) -> None:
+def test_whatever_ends_a_calibration_its_photographs_stay(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Also photographs that contradict each other: they are not taken again, and are refused again."""
     path, numbers = tmp_path / "T.zarr", iter(range(10**6))
 
@@ -137,64 +157,11 @@ def test_whatever_ends_a_calibration_its_photographs_stay(tmp_path: Path) -> Non
         on = codes.all() and next(numbers) == 6
         return np.minimum(image + np.uint16(300), 4095).astype(np.uint16) if on else image
 
-    for rig in (Faulty(lamp), unused(VirtualRig(scene(GRID), GRID, **CAMERA))):
+    for rig in (Faulty(lamp), Unplugged(scene(GRID), GRID, left=0, **CAMERA)):
         refused(AcquisitionError, r"photographs? \d+.* bright", rig, **{**SHORT, "frames": 4}, store=path)
-        assert kept.count(path) > 20
+        assert calibration_photographs(path) > 20
+        assert str(calibration_folder(path)) in caplog.text
     assert not path.exists()
-
-
-@pytest.mark.parametrize(
-    ("spoilt", "text"),
-    [
-        (lambda image: image[:4], r"photograph 50 is uint16 \(4, 8\).*\(8, 8\)"),
-        (lambda image: image.astype(np.uint8), r"photograph 50 is uint8 \(8, 8\)"),
-        (lambda image: None, "photograph 50 is None"),
-        (lambda image: np.stack([image] * 3, -1), r"photograph 50 has shape \(8, 8, 3\)"),
-        (lambda image: image[:0], r"photograph 50 has shape \(0, 8\)"),
-        (lambda image: image + np.uint16(60000), "photograph 50 reaches"),
-    ],
-)
-def test_photographs_of_another_kind(spoilt: Callable[[np.ndarray], Any], text: str) -> None:
-    refused(AcquisitionError, text, Faulty(lambda _, image: spoilt(image), start=50), **SHORT)
-
-
-@pytest.mark.parametrize(
-    ("given", "error", "text"),
-    [
-        ({"strategy": "spiral"}, InputError, "strategy is 'spiral'"),
-        ({"geometry": "stripes"}, InputError, "geometry is 'stripes'"),
-        ({"geometry": 3}, InputTypeError, "geometry is a int"),
-        ({"order": 64}, InputError, "order is 64"),
-        ({"block": 1}, InputError, "block is 1"),
-        ({"threshold": 0.0}, InputError, "threshold is 0"),
-        ({"frames": 0}, InputError, "frames is 0"),
-        ({"resume": "no"}, InputTypeError, "resume is 'no'"),
-        ({"exposures": []}, InputError, r"exposures is \[\]"),
-        ({"exposures": 0.5}, InputError, "exposures is 0.5"),
-        ({"exposures": [1.0, -1.0]}, InputError, "exposures is"),
-        ({"exposures": [np.nan]}, InputError, "exposures has 1 NaN"),
-        ({"exposures": "fast"}, InputTypeError, "exposures is"),
-        ({"exposures": [0.5, 40.0]}, InputError, "exposures has 40 s"),
-        ({"response": "srgb"}, InputTypeError, "response is a str"),
-        ({"progress": 3}, InputTypeError, "progress is 3"),
-        ({"store": 3}, InputTypeError, "store is 3"),
-    ],
-)
-def test_arguments_are_refused_before_the_first_photograph(
-    given: dict[str, Any], error: type[LtclError], text: str
-) -> None:
-    refused(error, text, unused(), **{**FULL, **given})
-
-
-def unused(rig: VirtualRig | None = None) -> VirtualRig:
-    """A rig that must not be asked for a photograph."""
-    rig = rig or VirtualRig(scene(GRID), GRID)
-
-    def photograph(codes: Any, seconds: float) -> np.ndarray:
-        raise AssertionError("photographed before all was checked")
-
-    rig.photograph = photograph
-    return rig
 
 
 def test_a_place_where_no_store_can_be(tmp_path: Path) -> None:
@@ -209,27 +176,25 @@ def test_a_place_where_no_store_can_be(tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_grids_that_do_not_match() -> None:
-    wide = VirtualRig(scene((8, 16)), (8, 16), **CAMERA)
-    twice = np.repeat(np.repeat(np.eye(64).reshape(8, 8, 64), 2, axis=0), 2, axis=1).reshape(256, 64)
-    fine = VirtualRig(scene(GRID), GRID, camera_grid=(16, 16), camera_map=twice, **CAMERA)
-    refused(InputError, r"geometry is 'aligned'.*\(16, 16\)", fine, **SHORT)
-    given = {**SHORT, "geometry": Correspondence.aligned(GRID)}
-    for rig, part in ((wide, r"\(8, 16\)"), (fine, r"\(16, 16\)")):
-        refused(InputError, rf"geometry is from \(8, 8\) to \(8, 8\).*{part}", rig, **given)
-
-
 @pytest.mark.parametrize("strategy", ["pixel", "adaptive"])
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str) -> None:
     """From one call of the system on, at random places of all stages; each time there is room again later."""
-    rig, given = made(strategy)
-    acquire(rig, store=tmp_path / "whole.zarr", **given)
-    path, random, failures = tmp_path / "T.zarr", np.random.default_rng(1), []
+    rig, settings = made(strategy)
+    acquire(rig, store=tmp_path / "whole.zarr", **settings)
+    path, failures = tmp_path / "T.zarr", []
     for left in (*random.integers(10, 200, 3), *random.integers(20, 400, 9), 10**9):
         with monkeypatch.context() as patch:
-            fill_after(patch, int(left))
+            calls = iter(range(10**9))
+
+            def full(*arguments: Any, real: Any, calls: Any = calls, left: int = left, **options: Any) -> Any:
+                if next(calls) >= left:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                return real(*arguments, **options)
+
+            for name in ("write", "mkdir", "fsync"):  # all that takes room fails after so many calls
+                patch.setattr(os, name, partial(full, real=getattr(os, name)))
             try:
-                acquire(made(strategy)[0], store=path, **given)
+                acquire(made(strategy)[0], store=path, **settings)
                 break
             except FileError as error:
                 failures.append(str(error))
@@ -238,22 +203,6 @@ def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: 
     assert contents(path) == contents(tmp_path / "whole.zarr")
     assert len(failures) >= 3, failures
     for text in failures:
-        assert text.startswith((f"{path}", f"{kept.place(path)}")), text
+        assert text.startswith((f"{path}", f"{calibration_folder(path)}")), text
         assert "No space left on device" in text
     assert {path.name for path in tmp_path.iterdir()} == {"whole.zarr", "T.zarr"}
-
-
-def fill_after(patch: pytest.MonkeyPatch, left: int) -> None:
-    """Everything that takes room on the disk fails after so many calls."""
-    count = iter(range(1, 10**9))
-
-    def full(real: Callable[..., Any]) -> Callable[..., Any]:
-        def act(*arguments: Any, **options: Any) -> Any:
-            if next(count) > left:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            return real(*arguments, **options)
-
-        return act
-
-    for name in ("write", "mkdir", "fsync"):
-        patch.setattr(os, name, full(getattr(os, name)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""An acquisition that ends at any line of ltcl loses nothing committed; going on gives the same store.
+"""An acquisition that ends at any line of ltcl loses nothing committed; a flipped bit of it is noticed.
 
 It ends by SIGKILL and by Ctrl-C. LTCL_KILLS=N in the environment takes N ends of each strategy.
 """
@@ -7,61 +7,116 @@ It ends by SIGKILL and by Ctrl-C. LTCL_KILLS=N in the environment takes N ends o
 from __future__ import annotations
 
 import os
+import shutil
 import signal
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ltcl.acquisition import kept
+import ltcl
+from ltcl.acquisition import Calibration, Report
+from ltcl.acquisition.session import calibration_photographs
+from ltcl.errors import AcquisitionError, FileError, LtclError
 from ltcl.store import BlockStore
 from tests.store.stores import contents
 
-from .stopping import MADE, Nursery
+from .stopping import MADE, acquire_and_end, made
 
 random = np.random.default_rng()
 KILLS = int(os.environ.get("LTCL_KILLS", "9"))
 STATUS = {"SIGKILL": -signal.SIGKILL, "Ctrl-C": 2}
-
-
-@pytest.fixture(scope="module")
-def nursery() -> Iterator[Nursery]:
-    made = Nursery()
-    yield made
-    made.close()
+FINAL, HALF = ("pixel", "adaptive"), ("pixel, half done", "adaptive, half done")
 
 
 def committed(path: Path) -> tuple[bool, bool, int]:
     """Whether the calibration and the transport are; photographs of the one or batches of the other."""
-    if not path.exists():
-        return False, False, kept.count(path)
-    store = BlockStore.open(path)
-    store.verify()
-    begun = "strategy" in store.attributes
-    return begun, store.final, 0 if store.final else len(store.written) if begun else kept.count(path)
+    store = BlockStore.open(path) if path.exists() else None
+    if store is not None:
+        store.verify()
+    if store is None or "strategy" not in store.attributes:
+        return False, False, calibration_photographs(path)
+    return True, store.final, 0 if store.final else len(store.written)
 
 
 @pytest.mark.parametrize("strategy", MADE)
-def test_ended_and_resumed(tmp_path: Path, nursery: Nursery, strategy: str) -> None:
+def test_ended_and_resumed(tmp_path: Path, strategy: str) -> None:
     """Three ends each, so that all stages are met; then to the end."""
     whole = tmp_path / "whole" / "T.zarr"
     whole.parent.mkdir()
-    _, lines, photographs = nursery.acquire(whole, strategy)
+    _, lines, photographs = acquire_and_end(whole, strategy)
     batch = max(16, BlockStore.open(whole).layout.block_rows + 2)
     for number in range(-(-KILLS // 3)):
-        path, taken, before = tmp_path / str(number) / "T.zarr", 0, (False, False, 0)
+        path, count, before = tmp_path / str(number) / "T.zarr", 0, (False, False, 0)
         path.parent.mkdir()
         for line in random.integers(1, lines, 3).tolist():
             end = str(random.choice(list(STATUS)))
-            status, _, more = nursery.acquire(path, strategy, line, end)
+            status, _, more = acquire_and_end(path, strategy, line, end)
             assert status in (STATUS[end], 0), (line, end)  # what is resumed has fewer lines
-            taken += more
+            count += more
             after = committed(path)
             assert after >= before
             before = after
-        status, _, more = nursery.acquire(path, strategy)
+        status, _, more = acquire_and_end(path, strategy)
         assert status == 0
-        assert photographs <= taken + more <= photographs + 3 * (batch + 1)
+        assert photographs <= count + more <= photographs + 3 * (batch + 1)
         assert contents(path) == contents(whole)
         assert os.listdir(path.parent) == ["T.zarr"]
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Stores of acquisitions that are done, and of such that were stopped in the middle of the scan."""
+    paths = {kind: tmp_path_factory.mktemp("stores") / "T.zarr" for kind in FINAL + HALF}
+    for kind in FINAL:
+        rig, settings = made(kind)
+        ltcl.acquire(rig, store=paths[kind], **settings)
+        rig, settings = made(kind, left=70)
+        with pytest.raises(AcquisitionError, match="photograph 71: "):
+            ltcl.acquire(rig, store=paths[f"{kind}, half done"], **settings)
+        assert BlockStore.open(paths[f"{kind}, half done"]).written
+    return paths
+
+
+def flip(file: Path) -> bytes:
+    """Flip one bit; returns what was there."""
+    good = file.read_bytes()
+    bad = bytearray(good)
+    bad[int(random.integers(len(good)))] ^= 1 << int(random.integers(8))
+    file.write_bytes(bad)
+    return good
+
+
+@pytest.mark.parametrize("kind", FINAL + HALF)
+def test_any_flipped_bit_is_detected(stores: dict[str, Path], tmp_path: Path, kind: str) -> None:
+    """Of each file once, by `verify`; of a transport by its report; of half a scan by who goes on."""
+    path = Path(shutil.copytree(stores[kind], tmp_path / "T.zarr"))
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    for file in files:
+        good = flip(file)
+        with pytest.raises(FileError, match=rf"^{path}[^\n]*$"):
+            BlockStore.open(path).verify()
+        if kind in FINAL:
+            with pytest.raises(FileError, match=r"T\.zarr"):
+                Report.of(path)
+        elif random.random() < 0.2 or file == files[-1]:
+            rig, settings = made(kind.partition(",")[0])
+            with pytest.raises(FileError, match=r"T\.zarr"):
+                ltcl.acquire(rig, store=path, **settings)
+        file.write_bytes(good)
+    BlockStore.open(path).verify()
+    flip(next(file for file in files if "calibration.white.value" in str(file)))
+    with pytest.raises(FileError, match=r"T\.zarr"):
+        Calibration.of(path)
+
+
+@pytest.mark.parametrize(
+    "state", [{"strategy": "spiral"}, {"strategy": ["pixel"]}, {"settings": 3}, {"settings": {}}]
+)
+def test_a_state_that_makes_no_sense(stores: dict[str, Path], tmp_path: Path, state: dict[str, Any]) -> None:
+    path = Path(shutil.copytree(stores["pixel, half done"], tmp_path / "T.zarr"))
+    BlockStore.open(path, "a").update(**state)
+    rig, settings = made("pixel")
+    with pytest.raises(LtclError, match=r"T\.zarr"):
+        ltcl.acquire(rig, store=path, **settings)

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +31,7 @@ class Outcome:
 
     @property
     def json(self) -> Any:
-        """The one JSON document on stdout, of a run that ended well."""
+        """Of a run that ended well."""
         assert self.code == 0, self.err
         return self.document
 
@@ -39,25 +42,23 @@ class Outcome:
 
     def refused(self, *parts: str, code: int = 1) -> None:
         """One line on stderr with these parts, nothing on stdout."""
-        assert (self.code, self.out) == (code, "")
+        assert (self.code, self.out, self.err.count("\n")) == (code, "", 1), self.err
         assert self.err.startswith("ltcl: error: ")
-        assert self.err.count("\n") == 1
-        for part in parts:
-            assert part in self.err
+        assert [part for part in parts if part not in self.err] == [], self.err
 
 
 Program = Callable[..., Outcome]
 
 
-@pytest.fixture
-def program(capsys: pytest.CaptureFixture[str]) -> Program:
+@pytest.fixture(scope="session")
+def program() -> Program:
     """`ltcl` with these arguments."""
 
     def run(*arguments: object) -> Outcome:
-        capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
-        printed = capsys.readouterr()
-        return Outcome(code, printed.out, printed.err)
+        out, err = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = main([str(argument) for argument in arguments])
+        return Outcome(code, out.getvalue(), err.getvalue())
 
     return run
 
@@ -97,36 +98,48 @@ def inverse(folder: Path, transport: Path) -> Path:
     return folder / "inverse.npz"
 
 
+def write(path: Path, picture: Any) -> Path:
+    images.write(path, np.asarray(picture, np.float32))
+    return path
+
+
 @pytest.fixture(scope="session")
 def picture(folder: Path) -> Path:
     """Within reach of `transport`: 5 x 10, linear, between 0.3 and 0.4."""
-    images.write(folder / "sky.exr", np.random.default_rng(1).uniform(0.3, 0.4, (5, 10)).astype(np.float32))
-    return folder / "sky.exr"
+    return write(folder / "sky.exr", np.random.default_rng(1).uniform(0.3, 0.4, (5, 10)))
 
 
 @pytest.fixture(scope="session")
 def large_picture(folder: Path) -> Path:
     """A PNG in colour, 20 x 30."""
-    images.write(folder / "large.png", scenes.landscape(20, 30))
-    return folder / "large.png"
+    return write(folder / "large.png", scenes.landscape(20, 30))
 
 
 @pytest.fixture(scope="session")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def results(program: Program, transport: Path, picture: Path, large_picture: Path, folder: Path) -> Any:
+    """The folder and the JSON of compensate, separate and relight on two pictures, all in one folder."""
+    out, told = folder.with_name("results"), {}
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    common = f"--on-dark mask --encoding linear --grid 5x10 --resize --json --out {out}".split()
+    solving = ["--first-bounce", "exact", "--rtol", "1e-4", "--method", "chebyshev"]
+    for command, more in (("compensate", solving), ("separate", [*solving, "--bounces", 2]), ("relight", [])):
+        told[command] = program(command, transport, picture, large_picture, *common, *more).json
+    return out, told
+
+
+@pytest.fixture(scope="session")
+def simulated(program: Program, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A corner of two walls, 4 x 8, in a room that is not dark; nothing is photographed here."""
     out = tmp_path_factory.mktemp("simulated") / "scan"
-    curves = ["--response", "film", "--projector-response", "film", "--ambient", "0.05"]
-    assert (
-        main(["simulate", "dihedral", "--out", str(out), "--size", "4", "--strategy", "pixel", *curves]) == 0
-    )
+    options = ["--size", 4, "--strategy", "pixel", "--response", "film", "--ambient", 0.05]
+    assert program("simulate", "dihedral", "--out", out, *options, "--projector-response", "film").code == 0
     return out
 
 
 @pytest.fixture(scope="session")
-def acquired(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def acquired(program: Program, simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same, all photographed; not to be changed."""
-    import shutil
-
     scan = Path(shutil.copytree(simulated, tmp_path_factory.mktemp("acquired") / "scan"))
-    assert main(["acquire", "run", str(scan)]) == 0
+    assert program("acquire", "run", scan).code == 0
     return scan

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl acquire`: planned, run, ended early, run again, reported."""
+"""`ltcl simulate`, `acquire`, `show`, `demo`: planned, run, ended early, run again, reported."""
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,8 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl import images
-from ltcl.acquisition import FolderRig, VirtualRig
+from ltcl import demo, scenes
+from ltcl.acquisition import FolderRig, Project, VirtualRig, rigs
 from ltcl.store import BlockStore
 
 GRID = (4, 8)
@@ -29,7 +30,7 @@ def scan(simulated: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def finished(acquired: Path, tmp_path: Path) -> Path:
     """A copy of a finished one."""
-    return Path(shutil.copytree(acquired, tmp_path / "scan"))
+    return Path(shutil.copytree(acquired, tmp_path / "finished"))
 
 
 def change(scan: Path, old: str, new: str) -> None:
@@ -39,37 +40,31 @@ def change(scan: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
-class Ending:
-    """A virtual rig whose photographs end, with this error, at one of them."""
+def end(patch: pytest.MonkeyPatch, at: int, error: BaseException) -> None:
+    """The photographs of a virtual rig end, with this error, at one of them."""
+    photograph, count = VirtualRig.photograph, iter(range(1, at + 1))
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, at: int, error: BaseException) -> None:
-        photograph, self.left = VirtualRig.photograph, at
+    def photograph_or_end(rig: VirtualRig, codes: Any, seconds: float) -> np.ndarray:
+        if next(count) == at:
+            raise error
+        return photograph(rig, codes, seconds)
 
-        def end(rig: VirtualRig, codes: Any, seconds: float) -> np.ndarray:
-            self.left -= 1
-            if self.left == 0:
-                raise error
-            return photograph(rig, codes, seconds)
-
-        monkeypatch.setattr(VirtualRig, "photograph", end)
+    patch.setattr(VirtualRig, "photograph", photograph_or_end)
 
 
 def error_of(scan: Path, truth: Path) -> float:
     """Of T p for a pattern p that was not scanned, after one scale."""
-    p = random.random(GRID).astype(np.float32)
-    found, exact = (
-        np.asarray(ltcl.load(path) @ p) for path in (scan / "transport.zarr", truth / "truth.npz")
-    )
-    scale = np.vdot(found, exact) / np.vdot(found, found)
-    return float(np.linalg.norm(scale * found - exact) / np.linalg.norm(exact))
+    p, paths = random.random(GRID).astype(np.float32), (scan / "transport.zarr", truth / "truth.npz")
+    measured, exact = (np.asarray(ltcl.load(path) @ p) for path in paths)
+    scale = np.vdot(measured, exact) / np.vdot(measured, measured)
+    return float(np.linalg.norm(scale * measured - exact) / np.linalg.norm(exact))
 
 
 def test_photographs_become_a_transport_and_run_again_reports_it(program, acquired, monkeypatch):
-    Ending(monkeypatch, 1, OSError("there is no rig"))
+    end(monkeypatch, 1, OSError("there is no rig"))
     told = program("acquire", "run", acquired, "--json").json
     assert (told["strategy"], told["grid"], told["coverage"]) == ("pixel", [4, 8], 1.0)
-    assert told["error"][0] < 0.02
-    assert error_of(acquired, acquired) < 0.02
+    assert max(told["error"][0], error_of(acquired, acquired)) < 0.02
     assert told == program("acquire", "report", acquired, "--json").json
     outcome = program("acquire", "report", acquired)
     assert "relative error of T p" in outcome.out
@@ -77,31 +72,22 @@ def test_photographs_become_a_transport_and_run_again_reports_it(program, acquir
 
 
 def test_plans_before_and_after_the_calibration(program, simulated, acquired):
-    before, after = (program("acquire", "plan", one, "--json").json for one in (simulated, acquired))
+    before, after = (program("acquire", "plan", each, "--json").json for each in (simulated, acquired))
     assert (before["measured"], after["measured"]) == (False, True)
     for told in (before, after):
-        assert set(told["plans"]) == {"adaptive", "pixel", "block", "hadamard"}
-        assert told["asked_for"] == "pixel"
-        pixel, coarse, count = told["plans"]["pixel"], told["plans"]["block"], len(told["exposures"])
-        assert (pixel["grid"], coarse["grid"]) == ([4, 8], [2, 4])
-        assert pixel["photographs"] == pixel["patterns"] * count + pixel["calibration"]
+        assert {*told["plans"]} == {"adaptive", "pixel", "block", "hadamard"}
+        assert (told["asked_for"], told["plans"]["block"]["grid"]) == ("pixel", [2, 4])
         assert told["auto"] in told["plans"]
+        pixel, exposures = told["plans"]["pixel"], len(told["exposures"])
+        assert pixel["photographs"] == pixel["patterns"] * exposures + 2 + pixel["calibration"]  # 2 batches
     assert after["exposures"] == program("acquire", "report", acquired, "--json").json["exposures"]
     assert not (simulated / "transport.zarr").exists()
+    lines = program("acquire", "plan", simulated).out.splitlines()
+    assert {line.split()[0] for line in lines[4:8]} == {"adaptive", "pixel", "block", "hadamard"}
+    assert "acquisition.toml asks for pixel; auto takes " in lines[-1]
     slower = program("acquire", "plan", simulated, "--overhead", "10", "--json").json["plans"]["pixel"]
     more = slower["seconds"] - before["plans"]["pixel"]["seconds"]
     assert more == pytest.approx(10 * slower["photographs"])
-
-
-def test_a_plan_is_a_table(program, scan):
-    lines = program("acquire", "plan", scan).out.splitlines()
-    assert lines[0] == f"{scan}: virtual rig, 1 channel(s)"
-    assert {line.split()[0] for line in lines[4:8]} == {"adaptive", "pixel", "block", "hadamard"}
-    assert "acquisition.toml asks for pixel; auto takes " in lines[-1]
-    change(scan, '"pixel"', '"auto"')
-    path = scan / "acquisition.toml"
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())  # as Notepad writes it
-    assert "\nauto takes " in program("acquire", "plan", scan).out
 
 
 def test_run_goes_on_from_wherever_the_folder_stands(program, scan, acquired, monkeypatch):
@@ -113,115 +99,50 @@ def test_run_goes_on_from_wherever_the_folder_stands(program, scan, acquired, mo
     ):
         program("acquire", "report", scan).refused("transport.zarr")
         with monkeypatch.context() as patch:
-            Ending(patch, at, error)
+            end(patch, at, error)
             program("acquire", "run", scan).refused(*parts, code=code)
-    change(scan, '"pixel"', '"hadamard"')
-    program("acquire", "run", scan).refused("[acquire] strategy is 'hadamard'", "'pixel'")
-    change(scan, '"hadamard"', '"pixel"')
-    change(scan, '\nresponse = "film"', '\nresponse = "srgb"')
-    program("acquire", "run", scan).refused("rig.response is 'srgb'", "'film'")
-    change(scan, '\nresponse = "srgb"', '\nresponse = "film"')
     with monkeypatch.context() as patch:  # all is photographed, and the transport is not there
         patch.setattr(BlockStore, "finalize", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt()))
-        assert program("acquire", "run", scan).code == 130
-    change(scan, 'transport = "truth.npz"', 'transport = "unplugged.npz"')
-    Ending(monkeypatch, 1, OSError("there is no rig"))
-    change(scan, 'transport = "unplugged.npz"', 'transport = "truth.npz"')
-    assert program("acquire", "finalize", scan, "--json").code == 0
-    found, whole = (BlockStore.open(one / "transport.zarr") for one in (scan, acquired))
+        lines = program("acquire", "run", scan, "--verbose")
+        assert (lines.code, "scan" in lines.err) == (130, True)
+    end(monkeypatch, 1, OSError("there is no rig"))
+    assert program("acquire", "finalize", scan, "--json").code == 0  # a name of earlier versions
+    ours, whole = (BlockStore.open(each / "transport.zarr") for each in (scan, acquired))
     for b in range(whole.layout.blocks()):
-        np.testing.assert_array_equal(found.read(0, b).toarray(), whole.read(0, b).toarray())
+        np.testing.assert_array_equal(ours.block(0, b).matrix.toarray(), whole.block(0, b).matrix.toarray())
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "parts"),
-    [
-        ('strategy = "pixel"', 'strategy = "hadamard"', ["strategy is 'hadamard'", "'pixel'"]),
-        ('transport = "truth.npz"', 'transport = "truth.npz"\ngrid = [8, 4]', ["8", "4"]),
-        ('\nresponse = "film"', '\nresponse = "srgb"', ["rig.response is 'srgb'", "'film'"]),
-    ],
-)
-def test_a_finished_scan_is_not_that_of_other_settings(program, finished, old, new, parts):
-    change(finished, old, new)
-    program("acquire", "run", finished).refused("acquisition.toml: [", *parts)
-
-
-def test_a_finished_live_scan_opens_no_camera(program, finished):
+def test_a_live_scan_that_is_photographed_opens_no_camera(program, finished):
     path = finished / "acquisition.toml"
     live = '[rig]\nkind = "live"\n[rig.camera]\nkind = "opencv"\nsource = 999\nchannels = 1\n'
     settings = path.read_text().partition("\n[acquire]\n")[2]
     path.write_text(f"{live}[rig.display]\ngrid = [4, 8]\n[acquire]\n{settings}")
     assert program("acquire", "run", finished, "--json").json["strategy"] == "pixel"
+    shutil.rmtree(finished / "transport.zarr")
+    assert program("acquire", "run", finished).code == 1
 
 
-def test_a_report_has_pictures(program, acquired, tmp_path):
-    told = program("acquire", "report", acquired, "--out", tmp_path, "--json").json
-    T, F = ltcl.load(acquired / "transport.zarr"), images.read(tmp_path / "first_bounce.exr")
-    np.testing.assert_allclose(F, T.first_bounce.reshape(GRID), rtol=1e-6)
-    white = images.read(tmp_path / "white.exr")
-    np.testing.assert_allclose(white, T @ np.ones(GRID, np.float32), rtol=0.03)
-    assert all((tmp_path / f"{name}.png").is_file() for name in ("ambient", "coverage", "white"))
-    assert told["folder"] == str(acquired)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "part"),
-    [
-        ("bits = 12", "bits = 99", "[rig] bits is 99"),
-        ("bits = 12", "bits = 12\ncamera_grid = [8, 8]", "[rig] camera_grid is 8 x 8"),
-        ("bits = 12", "bits = 12\nexposures = [0.5]", "rig.exposures has one exposure"),
-        ("ambient = 0.05", "ambient = nan", "[rig] ambient has 1 NaN"),
-        ('geometry = "aligned"', 'geometry = "stripes"', "[acquire] geometry is 'stripes'"),
-        ('strategy = "pixel"', "order = 64", "[acquire] order is 64"),
-        ('strategy = "pixel"', "exposures = [0.5, 40]", "[acquire] exposures has 40 s"),
-        ('strategy = "pixel"', "sigmas = -1", "[acquire] sigmas is -1"),
-    ],
-)
-def test_settings_are_refused_by_file_and_table(program, scan, old, new, part):
-    change(scan, old, new)
+def test_a_scan_is_not_that_of_other_settings(program, scan, finished):
+    change(finished, 'strategy = "pixel"', 'strategy = "hadamard"')
+    program("acquire", "run", finished).refused("acquisition.toml: [", "strategy is 'hadamard'", "'pixel'")
+    change(scan, "bits = 12", "bits = 99")
     for command in ("plan", "run"):
-        program("acquire", command, scan).refused(f"{scan / 'acquisition.toml'}: ", part)
-    assert not (scan / "transport.zarr").exists()
-
-
-def test_progress_goes_from_the_calibration_to_all_patterns(program, scan):
-    lines = program("acquire", "run", scan, "--verbose").err.splitlines()
-    for stage in ("calibration", "scan", "relative error of T p"):
-        assert any(stage in line for line in lines), stage
-
-
-FOLDER = """\
-[rig]
-kind = "folder"
-projector_grid = [4, 8]
-pattern_bits = 16
-
-[acquire]
-geometry = "aligned"
-strategy = "pixel"
-response = "linear"
-exposures = [0.5, 8.0]
-frames = 2
-"""
+        program("acquire", command, scan).refused(f"{scan / 'acquisition.toml'}: [rig] bits is 99")
 
 
 @pytest.fixture
 def by_hand(tmp_path: Path) -> Path:
     """A folder rig's acquisition, of which nothing is there yet."""
-    (tmp_path / "hand").mkdir()
-    (tmp_path / "hand" / "acquisition.toml").write_text(FOLDER)
-    return tmp_path / "hand"
+    text = '[rig]\nkind = "folder"\nprojector_grid = [4, 8]\npattern_bits = 16\n[acquire]\nframes = 2\n'
+    text += 'geometry = "aligned"\nstrategy = "pixel"\nresponse = "linear"\nexposures = [0.5, 8.0]\n'
+    (tmp_path / "acquisition.toml").write_text(text)
+    return tmp_path
 
 
-@pytest.fixture
-def scene(simulated: Path) -> VirtualRig:
-    T = ltcl.load(simulated / "truth.npz")
-    return VirtualRig(T, T.grid, bits=12, response="linear", black=0.0, ambient=0.01)
-
-
-def photograph(scene: VirtualRig, folder: Path, to: Path | None = None) -> int:
+def photograph(truth: Path, folder: Path, to: Path | None = None) -> int:
     """Photographs of the shooting list that are not there yet, as a person would take them; their number."""
-    count = 0
+    T, count = ltcl.load(truth / "truth.npz"), 0
+    scene = VirtualRig(T, T.grid, bits=12, response="linear", black=0.0, ambient=0.01)
     for row in (folder / "shots.csv").read_text().splitlines()[1:]:
         number, pattern, seconds, save = row.split(",")
         target = folder / f"{save}.png"
@@ -233,43 +154,95 @@ def photograph(scene: VirtualRig, folder: Path, to: Path | None = None) -> int:
     return count
 
 
-def test_a_person_is_told_the_next_photograph_and_it_is_no_error(program, by_hand, scene, simulated):
+def test_a_person_is_told_the_next_photograph_and_it_is_no_error(program, by_hand, simulated):
     """Which pattern, for how long, under which name; on stdout, with an exit code of its own."""
-    rounds, outcome = 0, program("acquire", "run", by_hand)
-    while outcome.code:
-        rounds += 1
-        assert rounds < 15
-        assert (outcome.code, outcome.err) == (3, "")
-        told = program("acquire", "run", by_hand, "--json")
-        assert (told.code, told.document["exit_code"]) == (3, 3)
-        shot = told.document["next"]
-        assert shot["number"] in told.document["missing"]
+    card = by_hand / "card"
+    card.mkdir()
+    for step in range(15):
+        outcome, told = program("acquire", "run", by_hand), program("acquire", "run", by_hand, "--json")
+        if outcome.code == 0:
+            assert "34 patterns" in outcome.out
+            assert error_of(by_hand, simulated) < 0.02
+            return
+        assert (outcome.code, outcome.err, told.code, told.document["exit_code"]) == (3, "", 3, 3)
+        shot, missing = told.document["next"], told.document["missing"]
+        assert shot["number"] in missing
         for part in (shot["pattern"], f"{shot['seconds']:.6g} s", shot["save_as"], "ltcl acquire run"):
             assert part in outcome.out
         assert (by_hand / shot["pattern"]).is_file()
-        assert photograph(scene, by_hand) == len(told.document["missing"])
-        outcome = program("acquire", "run", by_hand)
-    assert "reciprocity" in outcome.out
-    assert error_of(by_hand, simulated) < 0.02
+        assert photograph(simulated, by_hand, card if step == 2 else None) == len(missing)
+        if step == 2:  # the camera's own files
+            (spare := card / "IMG_1.png").write_bytes(b"")
+            counts = f"{len(missing) + 1}", f"{len(missing)}"
+            program("acquire", "run", by_hand, "--take", card).refused(*counts)
+            spare.unlink()
+            program("acquire", "run", by_hand, "--take", card / "none").refused("none: is no folder")
+            assert program("acquire", "run", by_hand, "--take", card).code in (0, 3)
+            assert not {*missing} & {*FolderRig(by_hand, GRID, pattern_bits=16).missing()}
+    pytest.fail("15 rounds were not enough")
 
 
-def test_files_of_the_camera_are_taken(program, by_hand, scene):
-    card = by_hand / "card"
-    card.mkdir()
-    missing = program("acquire", "run", by_hand, "--json").document["missing"]
-    while len(missing) <= 2:
-        assert photograph(scene, by_hand) == len(missing)
-        missing = program("acquire", "run", by_hand, "--json").document["missing"]
-    assert photograph(scene, by_hand, card) == len(missing)
-    (spare := card / "IMG_1.png").write_bytes(b"")
-    program("acquire", "run", by_hand, "--take", card).refused(f"{len(missing) + 1}", f"{len(missing)}")
-    spare.unlink()
-    program("acquire", "run", by_hand, "--take", card / "none").refused("none: is no folder")
-    outcome = program("acquire", "run", by_hand, "--take", card)
-    assert outcome.code in (0, 3), outcome.err
-    assert not set(missing) & set(FolderRig(by_hand, GRID, pattern_bits=16).missing())
+def test_how_the_next_pattern_comes(program, monkeypatch, tmp_path):
+    calls = []
+    monkeypatch.setattr(rigs, "show", lambda *args, **kwargs: calls.append((args, kwargs)) or 3)
+    for options in ([], ["--display", "0", "--every", "2"], ["--arrival"]):
+        assert program("show", tmp_path, *options, "--json").json == {"folder": str(tmp_path), "shown": 3}
+    assert [arguments for arguments, _ in calls] == [(tmp_path,)] * 3
+    assert [(each["display"], each["advance"]) for _, each in calls] == [(1, "key"), (0, 2.0), (1, "arrival")]
 
 
-def test_take_is_for_folder_rigs_and_no_file_is_no_acquisition(program, scan):
-    program("acquire", "run", scan, "--take", scan).refused("--take", "virtual")
-    program("acquire", "run", scan / "nowhere").refused("acquisition.toml: no such file", "ltcl simulate")
+@pytest.mark.parametrize("scene", ["dihedral", "trihedral", "box"])
+def test_the_truth_is_that_of_the_scene(program, tmp_path, scene):
+    truth = getattr(scenes, scene)(4, **({"sides": 5} if scene == "box" else {}))
+    outcome = program("simulate", scene, "--size", 4, "--out", tmp_path)
+    assert "{} x {} projector pixels, 1 channel(s)".format(*truth.grid) in outcome.out
+    np.testing.assert_allclose(ltcl.load(tmp_path / "truth.npz").matrices[0], truth.matrices()[0])
+    names = ["acquisition.toml", "simulate.json", "truth.npz"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+
+
+def test_the_rig_is_as_asked_for(program, tmp_path):
+    arguments = ["--size", "4", "--albedo", "0.8,0.5,0.3", "--response", "film", "--bits", "8", "--seed", "5"]
+    arguments += ["--ambient", "0.05", "--camera-grid", "6x14", "--projector-response", "gamma2.2"]
+    more = ["--strategy", "hadamard", "--json"]
+    told = program("simulate", "dihedral", "--out", tmp_path, *arguments, *more).json
+    assert (told["channels"], told["projector_grid"], told["options"]["bits"]) == (3, [4, 8], 8)
+    project = Project.open(tmp_path)
+    assert project.settings == {"geometry": "graycode", "strategy": "hadamard"}
+    with project.rig() as rig:
+        facts, seen = rig.describe(), rig.radiance(np.ones((4, 8, 3)))
+    truth = ltcl.load(tmp_path / "truth.npz") @ np.ones((4, 8, 3), np.float32) + 0.05
+    assert (seen.shape, seen.mean()) == ((6, 14, 3), pytest.approx(truth.mean(), rel=1e-5))
+    expected = {"response": "film", "projector_response": "gamma2.2", "ambient": [0.05], "seed": 5}
+    assert expected.items() <= facts.items()
+
+
+def test_a_transport_file_is_a_scene_and_no_acquisition_is_overwritten(program, colour_transport, tmp_path):
+    told = program("simulate", colour_transport, "--out", tmp_path, "--json").json
+    assert (told["channels"], told["projector_grid"]) == (3, [4, 12])
+    common = ["simulate", "dihedral", "--out", tmp_path, "--size"]
+    assert program(*common, 2).code == program(*common, 3).code == 0
+    (tmp_path / "transport.zarr").mkdir()
+    program(*common, 3).refused("holds a transport.zarr")
+    (tmp_path / "transport.zarr").rmdir()
+    (tmp_path / "simulate.json").unlink()
+    program(*common, 3).refused("holds an acquisition.toml")
+
+
+def test_mitsuba_renders_what_is_photographed(program, tmp_path):
+    pytest.importorskip("mitsuba", reason='mitsuba is not installed: pip install "ltcl[rig]"')
+    told = program("simulate", "mitsuba:dihedral", "--grid", "6x8", "--out", tmp_path / "m", "--json").json
+    assert (told["channels"], told["projector_grid"]) == (1, [6, 8])
+    assert not (tmp_path / "m" / "truth.npz").exists()
+    with Project.open(tmp_path / "m").rig() as rig:
+        assert rig.photograph(np.ones((6, 8)), 0.5).max() > 100
+    program("simulate", "mitsuba:nothing.xml", "--out", tmp_path / "n").refused("nothing.xml: no such file")
+
+
+def test_the_demo_says_what_was_reached_and_where_to_look(program, tmp_path):
+    outcome = program("demo", "--out", tmp_path, "--size", "6", "--verbose")
+    errors = json.loads((tmp_path / "report.json").read_text())["errors"]
+    assert errors["compensated"] < 0.02 < errors["uncompensated"]
+    assert all(f"{100 * error:.3g} %" in outcome.out for error in errors.values())
+    assert str(tmp_path / "contact_sheet.png") in outcome.out
+    assert [line.removeprefix("ltcl: ") for line in outcome.err.splitlines()] == list(demo.STEPS)

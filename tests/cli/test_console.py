@@ -1,82 +1,185 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Tables and progress as people see them."""
+"""Help, exit codes, errors, notes and progress; `ltcl doctor` and `devices`."""
 
 from __future__ import annotations
 
-import json
 import logging
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
-from ltcl.cli import console
+import ltcl
+from ltcl.cli import command, doctor
+from ltcl.device import Device, discovery
+from ltcl.solvers import METHODS
+
+from .conftest import Program
+
+COMMANDS = [
+    *("devices", "doctor", "demo", "simulate", "info", "analyze", "convert", "compress", "invert"),
+    *("compensate", "separate", "relight", "show", "acquire plan", "acquire run", "acquire report"),
+]
+DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "cli.md").read_text(encoding="utf-8")
 
 
-def test_a_table_shows_names_as_they_are_and_numbers_right(capsys):
-    name = "a/[bold]very" + 40 * "y" + " long[/bold] name.npz"
-    console.table(("file", "rho", "n"), [(name, 0.123456, 5), ("b", None, 123), ("c", float("inf"), 7)])
-    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
-    assert lines[1].startswith(name)
-    assert [line.split()[-2] for line in lines] == ["rho", "0.1235", "-", "diverges"]
-    assert [line[-3:] for line in lines] == ["  n", "  5", "123", "  7"]
+def test_version_and_help(program):
+    assert program("--version").out == f"ltcl {ltcl.__version__}\n"
+    outcome = program("--help")
+    assert outcome.code == 0
+    assert all(name.partition(" ")[0] in outcome.out for name in COMMANDS)
+    for code in (command.FAILED, command.USAGE, command.WAITING, command.INTERNAL, command.INTERRUPTED):
+        assert f" {code} " in outcome.out
+        assert f"| {code} |" in DOCUMENT
+    listed = program("acquire", "--help").out
+    assert "resume" not in listed  # a name of earlier versions, hidden
+    assert "finalize" not in listed
 
 
-def test_answer_is_strict_json(capsys):
-    console.answer({"rho": np.float32(0.5), "products": float("inf"), "name": "Größe"})
-    assert json.loads(capsys.readouterr().out) == {"rho": 0.5, "products": None, "name": "Größe"}
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(program, name):
+    outcome = program(*name.split(), "--help")
+    assert outcome.code == 0
+    assert all(option in outcome.out for option in ("--json", "--quiet", "-q", "--verbose"))
+    assert f"ltcl {name}" in DOCUMENT
 
 
-@pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("COLUMNS", "120")
+def test_python_m_is_the_same_program_and_its_help_imports_nothing_heavy():
+    code = (
+        "import sys, runpy\nsys.argv = ['ltcl', '--help']\n"
+        "try:\n    runpy.run_module('ltcl', run_name='__main__')\n"
+        "finally:\n    print(*{'pyopencl', 'matplotlib', 'cv2'} & set(sys.modules), file=sys.stderr)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (run.returncode, run.stderr.split()) == (0, [])
+    assert "compensate" in run.stdout
 
 
-@pytest.mark.usefixtures("terminal")
-def test_progress_is_a_bar_with_elapsed_time_and_time_left(capsys):
-    with console.Progress() as progress:
-        progress("reading")
-        progress("frames", 8, 32)
-        progress("frames", 16, 32)
-        progress._bar.refresh()
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert progress.done == 16
-    assert "frames" in err
-    assert "0:00:0" in err
-    assert "left" in err
+def test_the_fields_of_reports_are_on_the_page(program, results, transport):
+    told = [*results[1].values(), *program("info", transport, "--json").json]
+    told += program("analyze", transport, "--json").json
+    told += [picture for text in told for picture in text.get("pictures", [])]
+    told += [part for picture in told for part in picture.get("parts", [])]
+    assert [field for entry in told for field in entry if f"`{field}`" not in DOCUMENT] == []
 
 
-@pytest.mark.parametrize("quiet", [True, False])
-def test_without_a_terminal_and_if_quiet_there_is_none(capsys, monkeypatch, quiet):
-    if quiet:
-        monkeypatch.setenv("FORCE_COLOR", "1")
-    with console.Progress(quiet) as progress:
-        progress("frames", 8, 32)
-    assert capsys.readouterr() == ("", "")
+@pytest.mark.parametrize(
+    ("error", "code", "parts"),
+    [
+        (KeyboardInterrupt(), 130, ["interrupted"]),
+        (MemoryError(), 1, ["memory"]),
+        (ltcl.errors.DeviceError("of two\n  lines"), 1, ["of two lines"]),
+        (ltcl.errors.FileError("no file"), 1, ["no file"]),
+        (ZeroDivisionError("by nothing"), 70, ["ZeroDivisionError", "by nothing", "--verbose"]),
+    ],
+)
+def test_what_a_command_raises_is_a_line_a_code_and_json(program, monkeypatch, error, code, parts):
+    def raise_it(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(doctor.discovery, "list_devices", raise_it)
+    program("devices").refused(*parts, code=code)
+    failed = program("devices", "--json")
+    assert (failed.document["type"], failed.document["exit_code"]) == (type(error).__name__, code)
+    assert ("Traceback" in program("devices", "--verbose").err) == (code == 70)
 
 
-def test_if_verbose_each_step_is_one_line(capsys):
-    with console.logging_to_stderr(quiet=False, verbose=True), console.Progress() as progress:
-        for name in progress.each(["a.png", "b.png"]):
-            progress("solving", 0, 2)
-            progress("solving", len(name) / 5, 2)
-    logging.getLogger("ltcl").info("afterwards")
-    assert capsys.readouterr().err == "ltcl: 1/2 a.png: solving\nltcl: 2/2 b.png: solving\n"
+def test_quiet_and_verbose_and_warnings_of_the_library(program, transport, tmp_path, monkeypatch):
+    arguments = ["convert", transport, tmp_path / "T.npy"]
+    assert "--grid 5x10" in program(*arguments).err
+    assert program(*arguments, "--quiet").err == ""
+    assert re.search(r"^ltcl: reading .*corner\.npz$", program(*arguments, "--verbose").err, re.MULTILINE)
+
+    def warn() -> list[Any]:
+        logging.getLogger("ltcl.store").warning("grid 16 x 64:\n is it another one?")
+        return []
+
+    monkeypatch.setattr(doctor.discovery, "list_devices", warn)
+    assert program("devices").err.splitlines()[0] == "ltcl: warning: grid 16 x 64: is it another one?"
+    assert logging.getLogger("ltcl").level == logging.NOTSET
 
 
-def test_solves_count_the_digits_gained():
-    progress, done = console.Progress(), []
-    callback = progress.solve(1e-2, 2)
-    for iteration, residual in [
-        (0, 1.0),
-        (1, 0.1),
-        (2, 1e-3),
-        (0, 1.0),
-        (1, float("nan")),
-        (2, 1e-3),
-        (0, 9.0),
-    ]:
-        callback(iteration, residual)
-        done.append(progress.done)
-    assert done == pytest.approx([0, 0.5, 1, 1, 1, 2, 2])
+def test_progress_is_a_bar_with_elapsed_time_and_time_left(capsys, monkeypatch):
+    for terminal, quiet in ((False, False), (True, True), (True, False)):
+        monkeypatch.setenv("FORCE_COLOR", "1" if terminal else "")
+        with command.Progress(quiet) as progress:
+            progress("reading")
+            progress("frames", 8, 32)
+            progress("frames", 16, 32)
+            progress.refresh()
+        out, err = capsys.readouterr()
+        assert (out, progress.done) == ("", 16)
+        assert all((part in err) == (terminal and not quiet) for part in ("frames", "0:00:0", "left"))
+
+
+def failed(program: Program, *arguments: str) -> dict[str, Any]:
+    """The only check that fails."""
+    outcome = program("doctor", *arguments, "--json")
+    assert outcome.code == 1
+    (check,) = [check for check in outcome.document["checks"] if not check["passed"]]
+    return check
+
+
+def test_all_is_well_here_and_every_solver_and_product_is_tried(program, device, monkeypatch):
+    kernel, files = Device.kernel, set()
+
+    def record(self: Device, file: str, *arguments: Any, **defines: Any) -> Any:
+        files.add(file)
+        return kernel(self, file, *arguments, **defines)
+
+    monkeypatch.setattr(Device, "kernel", record)
+    told = program("doctor", "--json").json
+    assert told["passed"] is True
+    assert {f"solve, {method}" for method in METHODS} <= {check["check"] for check in told["checks"]}
+    assert {"csr", "dense", "tile", "wavelet", "form_factor", "southwell", "walk", "vector"} <= files
+
+
+def test_what_fails_has_a_fix(program, monkeypatch, tmp_path):
+    check = failed(program, "--device", "nonsense")
+    assert ("nonsense" in check["found"], "ltcl devices" in check["fix"]) == (True, True)
+    (tmp_path / "file").write_text("no folder")
+    with monkeypatch.context() as patch:
+        patch.setenv("LTCL_CACHE", str(tmp_path / "file"))
+        printed = program("doctor").out
+        assert all(word in printed for word in ("FAILED", "cache folder", "fix: ", "LTCL_CACHE", "1 of "))
+    with monkeypatch.context() as patch:
+        patch.setitem(doctor.LIMITS, "product", 0.0)
+        checks = program("doctor", "--json").document["checks"]
+        assert {check["check"][:7] for check in checks if "differs from NumPy" in check["found"]} == {
+            "product"
+        }
+    monkeypatch.setattr(discovery, "list_devices", list)
+    monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
+    assert "OCL_ICD_VENDORS=/nowhere" in failed(program)["found"]
+
+
+def test_a_driver_that_crashes_or_hangs_is_named(program, monkeypatch, tmp_path):
+    """As the loader would do, with drivers that do what is in their files."""
+    trial = "import os, time; exec(open(os.environ['OCL_ICD_VENDORS']).read())"
+    monkeypatch.setattr(doctor, "TRIAL", trial)
+    monkeypatch.setattr(doctor, "SECONDS", 2)
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
+    actions = {"crash": "os.abort()", "hang": "time.sleep(60)", "good": "", "odd": "raise RuntimeError"}
+    for name, action in actions.items():
+        (tmp_path / f"{name}.icd").write_text(action)
+    check = failed(program)
+    crashing, working = check["found"].split("working")
+    assert [name for name in actions if f"{name}.icd" in crashing] == ["crash", "hang"]
+    assert [name for name in actions if f"{name}.icd" in working] == ["good", "odd"]
+    assert "OCL_ICD_VENDORS" in check["fix"]
+
+
+def test_devices_mark_the_one_that_would_be_chosen(program, device, monkeypatch):
+    entries = program("devices", "--json").json
+    (chosen,) = [entry for entry in entries if entry["chosen"]]
+    assert (chosen["name"], chosen["index"]) == (device.name, device.description.index)
+    assert ["->", chosen["index"]] in [line.split()[:2] for line in program("devices").out.splitlines()]
+    monkeypatch.setenv("LTCL_DEVICE", "nonsense")
+    outcome = program("devices")
+    assert (outcome.code, outcome.err) == (0, "ltcl: LTCL_DEVICE=nonsense matches none of these\n")
+    assert "->" not in outcome.out
+    monkeypatch.setattr(discovery, "list_devices", list)
+    program("devices").refused("no OpenCL device", "install")

@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from ltcl import images
-from ltcl.errors import FileError, LtclError
+from ltcl.errors import FileError, MemoryLimitError
 
+random = np.random.default_rng(0)
 KINDS = [(".png", 8), (".png", 16), (".jpg", 8), (".bmp", 8), (".tif", 8), (".tif", 16), (".tif", 32)]
 KINDS += [(".exr", 16), (".exr", 32)]
 SUFFIXES = [".png", ".jpg", ".tif", ".bmp", ".exr"]
@@ -29,18 +30,23 @@ def good(folder: Path, suffix: str, bits: int | None = None, shape: tuple[int, .
     return (folder / f"good{suffix}").read_bytes()
 
 
-def refusal(path: Path, data: bytes) -> str:
-    """Message of the FileError that reading `data` gives."""
+def refusal(path: Path, data: bytes) -> str | None:
+    """Message of the FileError that reading `data` gives, or None where it is a picture."""
     path.write_bytes(data)
-    with pytest.raises(FileError) as error:
-        images.read(path)
-    text = str(error.value)
-    assert text.startswith(f"{path}: ")
-    assert "\n" not in text
-    return text
+    try:
+        picture = images.read(path)
+    except (FileError, MemoryLimitError) as error:
+        message = str(error)
+    else:
+        assert picture.dtype == np.float32
+        assert np.isfinite(picture).all()
+        return None
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message
 
 
-def mutant(data: bytes, random: np.random.Generator) -> bytes:
+def mutant(data: bytes) -> bytes:
     """`data` cut off, with bytes appended, or with up to three bytes changed, more often near its begin."""
     changed, kind = bytearray(data), random.random()
     if kind < 0.25:
@@ -56,19 +62,8 @@ def mutant(data: bytes, random: np.random.Generator) -> bytes:
 @pytest.mark.parametrize("shape", [(20, 30, 3), (20, 30)])
 def test_a_mutant_gives_a_picture_or_one_line_that_names_it(tmp_path, capfd, suffix, bits, shape):
     data, path = good(tmp_path, suffix, bits, shape), tmp_path / f"bad{suffix}"
-    random, refused = np.random.default_rng(3), 0
-    for _ in range(MUTANTS):
-        path.write_bytes(mutant(data, random))
-        try:
-            picture = images.read(path)
-        except LtclError as error:
-            message, refused = str(error), refused + 1
-            assert message.startswith(f"{path}: ")
-            assert "\n" not in message
-        else:
-            assert picture.dtype == np.float32
-            assert np.isfinite(picture).all()
-    assert refused > MUTANTS / 10
+    refused = [refusal(path, mutant(data)) is not None for _ in range(MUTANTS)]
+    assert sum(refused) > MUTANTS / 10
     out, err = capfd.readouterr()
     assert out == ""
     assert suffix == ".exr" or err == ""  # OpenEXR itself writes of damaged pixels, and cannot be told not to
@@ -78,9 +73,9 @@ def test_a_mutant_gives_a_picture_or_one_line_that_names_it(tmp_path, capfd, suf
 def test_truncated_files_and_any_flip_in_a_png_are_refused(tmp_path, suffix):
     data, path = good(tmp_path, suffix), tmp_path / f"bad{suffix}"
     for share in (0.02, 0.3, 0.5, 0.9, 0.99):
-        refusal(path, data[: int(len(data) * share)])
+        assert refusal(path, data[: int(len(data) * share)])
     for place in np.linspace(0, len(data) - 5, 60).astype(int) if suffix == ".png" else ():
-        refusal(path, data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :])
+        assert refusal(path, data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :])
 
 
 def resized(suffix: str, data: bytes, h: int, w: int) -> bytes:
@@ -89,11 +84,6 @@ def resized(suffix: str, data: bytes, h: int, w: int) -> bytes:
     if suffix == ".png":
         changed[16:24] = struct.pack(">II", w, h)
         changed[29:33] = struct.pack(">I", zlib.crc32(changed[12:29]))
-    elif suffix == ".jpg":
-        place = data.index(b"\xff\xc0")
-        changed[place + 5 : place + 9] = struct.pack(">HH", min(h, 65535), min(w, 65535))
-    elif suffix == ".bmp":
-        changed[18:26] = struct.pack("<ii", w, h)
     elif suffix == ".tif":
         for tag, value in ((256, w), (257, h)):
             for kind in (3, 4):  # stored as SHORT or LONG; becomes LONG
@@ -108,47 +98,12 @@ def resized(suffix: str, data: bytes, h: int, w: int) -> bytes:
 
 
 @pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (60000, 60000), (30000, 30000), (0, 5)])
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".exr"])
 def test_absurd_sizes_are_refused_before_decoding(tmp_path, capfd, suffix, size):
-    refusal(tmp_path / f"bad{suffix}", resized(suffix, good(tmp_path, suffix), *size))
-    assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_what_is_no_picture_is_refused(tmp_path, capfd, suffix):
-    path = tmp_path / f"bad{suffix}"
-    for data in (
-        b"a letter, no picture; " * 30,
-        b"\x89PNG\r\n\x1a\n",
-        b"\x76\x2f\x31\x01\x02\0\0\0",
-        b"II*\0",
-    ):
-        refusal(path, data)
-    assert "empty" in refusal(path, b"")
-    path.unlink()
-    with pytest.raises(FileError, match="no such file"):
-        images.read(path)
-    path.mkdir()
-    with pytest.raises(FileError, match="folder"):
-        images.read(path)
-    assert capfd.readouterr() == ("", "")
-
-
-def test_threads_leave_stdout_and_the_log_level_as_they_were(tmp_path):
-    paths = [tmp_path / f"bad{number}{suffix}" for suffix in SUFFIXES for number in range(8)]
-    for path in paths:
-        data = good(tmp_path, path.suffix)
-        path.write_bytes(data[: len(data) // 2] if path.stem.endswith("1") else data)
-
-    def shape(path: Path) -> tuple[int, ...]:
-        with contextlib.suppress(FileError):
-            return images.read(path).shape
-        return ()
-
-    before = sys.stdout, os.fstat(2).st_ino, cv2.utils.logging.getLogLevel()
-    with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(shape, paths)) == [() if "bad1" in path.stem else (20, 30, 3) for path in paths]
-    assert (sys.stdout, os.fstat(2).st_ino, cv2.utils.logging.getLogLevel()) == before
+    assert refusal(tmp_path / f"bad{suffix}", resized(suffix, good(tmp_path, suffix), *size))
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert suffix == ".exr" or err == ""
 
 
 def png(data: bytes, depth: int = 8) -> bytes:
@@ -160,14 +115,42 @@ def png(data: bytes, depth: int = 8) -> bytes:
 
 
 ROWS = b"\0abcd" * 3
-WRONG = [
-    b"nothing that zlib wrote",
-    zlib.compress(b"\x09" + ROWS[1:]),
-    zlib.compress(ROWS[:7]),
-]  # 9 is no filter
+NO_PICTURES = [
+    b"",
+    b"a letter, no picture; " * 30,
+    b"\x89PNG\r\n\x1a\n",
+    b"\x76\x2f\x31\x01\x02\0\0\0",
+    b"II*\0",
+    png(b"nothing that zlib wrote"),
+    png(zlib.compress(b"\x09" + ROWS[1:])),  # 9 is no filter
+    png(zlib.compress(ROWS[:7])),
+    png(zlib.compress(ROWS), depth=7),
+]
 
 
-@pytest.mark.parametrize("data", [*map(png, WRONG), png(zlib.compress(ROWS), depth=7)])
-def test_a_png_with_right_checksums_and_wrong_contents_is_refused(tmp_path, capfd, data):
-    refusal(tmp_path / "a.png", data)
-    assert capfd.readouterr().err == ""
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_no_picture_is_refused(tmp_path, capfd, suffix):
+    path = tmp_path / f"bad{suffix}"
+    for data in NO_PICTURES:
+        assert refusal(path, data)
+    for missing, text in ((tmp_path / f"none{suffix}", "no such file"), (tmp_path, "extension")):
+        with pytest.raises(FileError, match=text):
+            images.read(missing)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_threads_leave_stdout_and_the_log_level_as_they_were(tmp_path):
+    paths = [tmp_path / f"{number}{suffix}" for suffix in SUFFIXES for number in range(8)]
+    for path in paths:
+        data = good(tmp_path, path.suffix)
+        path.write_bytes(data[: len(data) // (1 + (path.stem == "1"))])
+
+    def is_read(path: Path) -> bool:
+        with contextlib.suppress(FileError):
+            return images.read(path).shape == (20, 30, 3)
+        return False
+
+    before = sys.stdout, os.fstat(2).st_ino, cv2.utils.logging.getLogLevel()
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(is_read, paths)) == [path.stem != "1" for path in paths]
+    assert (sys.stdout, os.fstat(2).st_ino, cv2.utils.logging.getLogLevel()) == before

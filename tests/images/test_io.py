@@ -9,35 +9,32 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from ltcl import images
 from ltcl.errors import FileError, InputError, InputTypeError
 
 random = np.random.default_rng(3)
-SHAPES = [(1, 1), (53, 7), (5, 7, 3), (1, 9, 3)]
-SCANLINES = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+SHAPES = [(1, 1), (53, 7), (1, 9, 3)]
+INTEGERS = [(".png", 8), (".png", 16), (".bmp", 8), (".tif", 8), (".tiff", 16)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("encoding", ["auto", "srgb", "linear"])
-@pytest.mark.parametrize(
-    ("suffix", "bits"), [(".png", 8), (".png", 16), (".bmp", 8), (".tif", 8), (".tiff", 16)]
-)
+@pytest.mark.parametrize(("suffix", "bits"), INTEGERS)
 def test_integer_formats_give_every_code_back(tmp_path, suffix, bits, encoding, shape):
     path, white = tmp_path / f"a{suffix}", 2**bits - 1
     codes = random.integers(0, white + 1, shape)
     linear = codes / white if encoding == "linear" else images.from_srgb(codes / white)
     images.write(path, linear, encoding=encoding, bits=bits)
     result = images.read(path, encoding=encoding)
-    assert result.dtype == np.float32
-    assert result.flags.c_contiguous
+    assert (result.dtype, result.flags.c_contiguous) == (np.float32, True)
     np.testing.assert_array_equal(result, linear.astype(np.float32))
     np.testing.assert_array_equal(images.read_codes(path), codes)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(("suffix", "bits"), [(".tif", 32), (".exr", 32), (".exr", 16), (".EXR", 32)])
+@pytest.mark.parametrize(("suffix", "bits"), [(".tif", 32), (".exr", 32), (".EXR", 16)])
 def test_float_formats_are_exact_and_never_clip(tmp_path, suffix, bits, shape):
     linear = (10 * random.normal(size=shape)).astype(np.float16 if bits == 16 else np.float32)
     images.write(tmp_path / f"a{suffix}", linear, bits=bits)
@@ -49,55 +46,43 @@ def test_float_formats_are_exact_and_never_clip(tmp_path, suffix, bits, shape):
 def test_jpeg_is_close(tmp_path, shape):
     ramp = np.linspace(0.1, 0.9, 24).reshape((1, 24) + (1,) * (len(shape) - 2))
     images.write(tmp_path / "a.jpg", np.broadcast_to(ramp, shape))
-    assert images.read(tmp_path / "a.jpg").shape == shape
     # JPEG at 95 moves a smooth ramp by some codes of 255; the curve's slope is below 2.3.
     np.testing.assert_allclose(images.read(tmp_path / "a.jpg"), np.broadcast_to(ramp, shape), atol=9.2 / 255)
 
 
-def test_defaults_clipping_and_order_of_channels_as_other_programs_see_them(tmp_path):
-    for suffix, kind in {".png": "uint8", ".jpg": "uint8", ".bmp": "uint8", ".tif": "float32"}.items():
-        images.write(tmp_path / f"a{suffix}", [[-1.0, 2.0]])
-        stored = cv2.imread(str(tmp_path / f"a{suffix}"), cv2.IMREAD_UNCHANGED)
-        assert stored is not None
-        assert stored.dtype == kind
-        assert [stored.min(), stored.max()] == ([-1, 2] if kind == "float32" else [0, 255])
-    red = np.zeros((2, 2, 3))
-    red[..., 0] = 1
-    images.write(tmp_path / "a.png", red)
-    assert np.asarray(Image.open(tmp_path / "a.png"))[0, 0].tolist() == [255, 0, 0]
-    images.write(tmp_path / "a.exr", red)
-    assert OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()["R"].pixels.min() == 1
+@pytest.mark.parametrize(
+    ("suffix", "dtype", "bgr"),
+    [*((name, np.uint8, [0, 255, 0]) for name in (".png", ".jpg", ".bmp")), (".tif", np.float32, [0, 2, -1])],
+)
+def test_defaults_clipping_and_order_of_channels_as_other_programs_see_them(tmp_path, suffix, dtype, bgr):
+    images.write(tmp_path / f"a{suffix}", np.tile([-1.0, 2.0, 0.0], (8, 8, 1)))
+    stored = cv2.imread(str(tmp_path / f"a{suffix}"), cv2.IMREAD_UNCHANGED)
+    assert stored is not None
+    assert stored.dtype == dtype
+    np.testing.assert_allclose(stored[4, 4], bgr, atol=2 if suffix == ".jpg" else 0)
 
 
-# Where the corners A B / C D of the pixels in the file are seen.
-UPRIGHT = dict(enumerate(["AB/CD", "BA/DC", "DC/BA", "CD/AB", "AC/BD", "CA/DB", "DB/CA", "BD/AC"], start=1))
-
-
-@pytest.mark.parametrize("orientation", UPRIGHT)
+@pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("channels", [(), (3,)])
 def test_a_picture_is_read_upright_and_a_photograph_keeps_its_pixels(tmp_path, suffix, orientation, channels):
-    path, corners = tmp_path / f"a{suffix}", {"A": 30, "B": 90, "C": 150, "D": 210}
-    codes = np.array([[corners[c] for c in row] for row in ("AB", "CD")], np.uint8).repeat(8, 0).repeat(12, 1)
-    codes = codes if channels == 1 else np.stack([codes] * 3, axis=-1)
-    exif = Image.Exif()
-    exif[274] = orientation
-    Image.fromarray(codes).save(path, exif=exif, quality=95)
-    np.testing.assert_allclose(images.read_codes(path), codes, atol=2)
-    np.testing.assert_allclose(images.read(path, encoding="linear", upright=False) * 255, codes, atol=2)
-    picture = images.read(path, encoding="linear")
-    h, w = picture.shape[:2]
-    assert (h, w) == ((16, 24) if orientation < 5 else (24, 16))
-    for row, names in zip((0, h - 1), UPRIGHT[orientation].split("/"), strict=True):
-        for column, name in zip((0, w - 1), names, strict=True):
-            np.testing.assert_allclose(picture[row, column] * 255, corners[name], atol=2)
+    path = tmp_path / f"a{suffix}"
+    codes = random.integers(0, 256, (2, 3, *channels)).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+    picture = Image.fromarray(codes)
+    picture.getexif()[274] = orientation
+    picture.save(path, exif=picture.getexif(), quality=100, subsampling=0)
+    np.testing.assert_allclose(images.read_codes(path), codes, atol=4)
+    np.testing.assert_allclose(255 * images.read(path, encoding="linear", upright=False), codes, atol=4)
+    upright = np.asarray(ImageOps.exif_transpose(picture))
+    np.testing.assert_allclose(255 * images.read(path, encoding="linear"), upright, atol=4)
 
 
-def test_palettes_are_looked_up(tmp_path):
-    picture = Image.fromarray(np.array([[1, 0]], np.uint8), "P")
-    picture.putpalette([10, 20, 30, 40, 50, 60])
-    picture.save(tmp_path / "a.png")
-    np.testing.assert_array_equal(images.read_codes(tmp_path / "a.png"), [[[40, 50, 60], [10, 20, 30]]])
+def test_palettes_are_looked_up_and_bits_are_black_and_white(tmp_path):
+    palette, bits = Image.fromarray(np.array([[1, 0]], np.uint8), "P"), Image.fromarray(np.eye(2) > 0)
+    palette.putpalette([10, 20, 30, 40, 50, 60])
+    for picture, codes in ((palette, [[[40, 50, 60], [10, 20, 30]]]), (bits, 255 * np.eye(2))):
+        picture.save(tmp_path / "a.png")
+        np.testing.assert_array_equal(images.read_codes(tmp_path / "a.png"), codes)
 
 
 @pytest.mark.parametrize(("suffix", "dtype"), [(".png", "uint8"), (".png", "uint16"), (".tif", "float32")])
@@ -113,45 +98,47 @@ def test_alpha_is_dropped_only_where_it_is_opaque(tmp_path, suffix, dtype):
 
 
 PLANE = np.ones((2, 3), np.float32)
-RGB = dict.fromkeys("RGB", PLANE)
+RGB = {"R": PLANE, "G": 2 * PLANE, "B": 3 * PLANE}
 SHIFTED = {"dataWindow": (np.array([2, 1], np.int32), np.array([4, 2], np.int32))}
 
 
 @pytest.mark.parametrize(
     ("channels", "header", "outcome"),
     [
-        ({"depth": PLANE}, {}, (2, 3)),
-        (RGB, {}, (2, 3, 3)),
-        ({**RGB, "A": PLANE}, {}, (2, 3, 3)),
+        ({"depth": PLANE}, {}, PLANE),
+        ({**RGB, "A": PLANE}, {}, np.stack([*RGB.values()], axis=-1)),
         ({**RGB, "A": 0 * PLANE}, {}, "6 transparent"),
         ({**RGB, "Z": PLANE}, {}, "'Z'"),
-        ({"R": PLANE, "G": PLANE}, {}, "'G'"),
         ({"id": PLANE.astype(np.uint32)}, {}, "UINT"),
         ({"Y": PLANE}, SHIFTED, "window"),
         ({"Y": np.nan * PLANE}, {}, "6 NaN"),
     ],
 )
 def test_exr_files_of_others(tmp_path, channels, header, outcome):
-    OpenEXR.File({**SCANLINES, **header}, channels).write(str(tmp_path / "a.exr"))
-    if isinstance(outcome, tuple):
-        np.testing.assert_array_equal(images.read(tmp_path / "a.exr"), np.ones(outcome))
-        return
-    with pytest.raises(FileError, match=f"a.exr: .*{outcome}"):
-        images.read(tmp_path / "a.exr")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    OpenEXR.File(header, channels).write(str(tmp_path / "a.exr"))
+    if isinstance(outcome, str):
+        with pytest.raises(FileError, match=f"a.exr: .*{outcome}"):
+            images.read(tmp_path / "a.exr")
+    else:
+        np.testing.assert_array_equal(images.read(tmp_path / "a.exr"), outcome)
 
 
-def test_tiff_files_of_others(tmp_path):
-    path = tmp_path / "a.tif"
-    cv2.imwrite(str(path), np.full((2, 3), np.nan, np.float32))
-    assert np.isnan(images.read_codes(path)).all()
-    with pytest.raises(FileError, match=r"a\.tif: .*6 NaN"):
-        images.read(path)
-    cv2.imwrite(str(path), np.zeros((2, 2), np.int16))
-    with pytest.raises(FileError, match="int16"):
-        images.read(path)
-    path.write_bytes(cv2.imencodemulti(".tif", [np.zeros((4, 5), np.uint8)] * 2)[1].tobytes())
-    with pytest.raises(FileError, match="pages"):
-        images.read(path)
+@pytest.mark.parametrize(
+    ("pages", "text"),
+    [
+        ([np.full((2, 3), np.nan, np.float32)], "6 NaN"),
+        ([np.zeros((2, 2), np.int16)], "int16"),
+        ([np.zeros((4, 5), np.uint8)] * 2, "pages"),
+    ],
+)
+def test_tiff_files_of_others(tmp_path, pages, text):
+    (tmp_path / "a.tif").write_bytes(cv2.imencodemulti(".tif", pages)[1].tobytes())
+    with pytest.raises(FileError, match=rf"a\.tif: .*{text}"):
+        images.read(tmp_path / "a.tif")
+
+
+BLACK = np.zeros((2, 2))
 
 
 @pytest.mark.parametrize(
@@ -159,14 +146,11 @@ def test_tiff_files_of_others(tmp_path):
     [
         ("a.png", np.full((2, 2), np.inf), {}, "image has 4 NaN"),
         ("a.png", np.zeros((2, 2, 4)), {}, "image has shape"),
-        ("a.png", np.zeros((0, 2)), {}, "image has shape"),
-        ("a.png", np.zeros((2, 2)), {"bits": 32}, "bits is 32; .* 8 or 16"),
-        ("a.png", np.zeros((2, 2)), {"encoding": "gamma"}, "encoding is 'gamma'"),
+        ("a.png", BLACK, {"bits": 32}, "bits is 32; .* 8 or 16"),
+        ("a.png", BLACK, {"encoding": "gamma"}, "encoding is 'gamma'"),
         ("a.exr", np.full((2, 2), 1e5), {"bits": 16}, "65504"),
         ("a.jpg", np.zeros((1, 70000)), {}, r"a\.jpg: .*70000"),
-        ("a.gif", np.zeros((2, 2)), {}, r"\.gif is unknown; pictures are .*\.png.*\.exr"),
-        ("a", np.zeros((2, 2)), {}, "has no extension"),
-        ("a.png", np.zeros((2, 2), complex), {}, "image holds complex"),
+        ("a.gif", BLACK, {}, r"\.gif is unknown; pictures are .*\.png.*\.exr"),
     ],
 )
 def test_what_cannot_be_written_is_refused_and_the_earlier_file_stays(tmp_path, name, image, options, text):
@@ -200,23 +184,5 @@ def test_shrinking_averages_areas_per_axis_and_growing_interpolates():
     np.testing.assert_allclose(ramp, np.linspace(0.25, 2.75, 6), rtol=1e-6)
     columns = images.resize(image, (4, 20))
     np.testing.assert_array_equal(images.resize(image, (4, 31)), images.resize(columns, (4, 31)))
-
-
-@pytest.mark.parametrize(("grid", "new"), [((1, 1), (5, 3)), ((40, 3), (7, 31)), ((13, 17), (13, 17))])
-@pytest.mark.parametrize("channels", [(), (3,)])
-def test_no_value_leaves_the_range_of_the_input(grid, new, channels):
-    image = random.normal(size=(*grid, *channels)).astype(np.float32)
-    result = images.resize(image, new)
-    assert result.shape == (*new, *channels)
-    assert result.dtype == np.float32
-    room = 1e-5 * np.abs(image).max()  # float32 sums of up to 1600 weights
-    assert result.min() >= image.min() - room
-    assert result.max() <= image.max() + room
-
-
-def test_bad_grids_and_pictures_are_refused():
-    for grid in ((0, 4), (4,), "44", (2.5, 3), None):
-        with pytest.raises(InputError, match="grid"):
-            images.resize(np.zeros((4, 4)), grid)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="image"):
-        images.resize(np.zeros((2, 4, 4, 3)), (2, 2))
+    with pytest.raises(InputError, match="grid"):
+        images.resize(image, (0, 4))

@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from typing import Any
 
 import numpy as np
 import pytest
 
 import ltcl
 from ltcl.device import Device
-from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
 from ltcl.scenes import Block, CornerRows, FormFactor, Patches, box, cut, dihedral, visibility
 from ltcl.scenes.builders import WALLS
@@ -24,7 +23,6 @@ from tests.operators import helpers
 from tests.scenes.closed_forms import closed_room
 
 BLOCK = [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
-TABLE = Block((0.25, 0.25, 0.0), (0.5, 0.25, 0.5), albedo=0.5)
 
 
 @pytest.fixture(params=["cpu", "gpu"])
@@ -51,10 +49,8 @@ ASTRIDE = Patches(
 SCENES = {
     "astride a plane": (ASTRIDE, None),
     "1 patch": (cut(WALLS[:1], 1), None),
-    "2 patches": (cut(WALLS[:2], 1), None),
     "53 tiles": (tiles(53), None),
     "room": (cut(WALLS, 3), None),
-    "tiles around a block": (tiles(23), [[(-1, -1, -1), (1, 1, 1)]]),
     "two blocks": (cut(WALLS, 3), [*BLOCK, [(0.4, 0.6, 0.2), (0.6, 0.7, 0.9)]]),
 }
 
@@ -136,19 +132,16 @@ def test_a_scene_gives_its_operators(device, block):
 
 
 def test_launches_in_slabs_give_the_same(device, monkeypatch):
-    patches, blocks = cut(WALLS, 3), np.array(BLOCK)
+    patches = cut(WALLS, 3)
     A, x = FormFactor(patches, 0.5, device=device), device.upload(gallery.vectors(54, 5))
     whole, seen = A.apply(x).get(), visibility(patches, BLOCK, device)
     monkeypatch.setattr("ltcl.scenes.form_factor._LAUNCH", 7 * 56)
     monkeypatch.setattr(sys.modules[Rays.__module__], "_LAUNCH", 54 * 16 * 7)
     helpers.same_rows(device, whole, A.apply(x).get(), reference.product_error(A.to_dense(), x.get()))
     np.testing.assert_array_equal(visibility(patches, BLOCK, device), seen)
-    i, j = np.triu_indices(54, 1)
-    np.testing.assert_array_equal(Rays(patches, blocks, device, 4).pairs(i, j), seen[i, j])
 
 
-@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 53])
-@pytest.mark.parametrize(("boxes", "samples"), [(1, 1), (2, 3), (5, 4)])
+@pytest.mark.parametrize(("count", "boxes", "samples"), [(1, 1, 1), (8, 2, 3), (9, 1, 4), (53, 5, 4)])
 def test_rays_meet_their_twin(launched, count, boxes, samples):
     rng = np.random.default_rng(count)
     patches = Patches(*rng.uniform(-1, 1, (3, count, 3)) * np.array([3, 0.3, 0.3])[:, None, None])
@@ -170,45 +163,6 @@ def test_boxes_hide_what_is_behind_them_and_nothing_else(device):
     across = np.abs(patches.centre[:, None, 0] - patches.centre[:, 0]) > 0.5
     np.testing.assert_array_equal(visibility(patches, [[(0.4, -1, -1), (0.6, 2, 2)]], device), ~across)
     assert visibility(patches, [[(2, 2, 2), (3, 3, 3)]], device).min() == 1.0
-    room = (*WALLS, *TABLE.faces())
-    seen, wall = visibility(cut(room, 4), BLOCK, device), np.arange(16 * 12) // 4 % 12
-    assert seen[wall >= 6].min() == 1.0  # a box does not block its own faces
-    assert seen[np.ix_(wall < 6, wall < 6)].min() < 1.0
-    # Rays within the plane of a face, and along an edge, pass.
-    ends = np.array([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0], [-1.0, -1.0, 1.0], [1.0, -1.0, 1.0]])
-    specks = Patches(ends, np.full((4, 3), [0, 1e-9, 0]), np.full((4, 3), [1e-9, 0, 0]))
-    assert visibility(specks, [[(-0.5, -1.0, 0.0), (0.5, 0.5, 1.0)]], device).min() == 1.0
-
-
-@pytest.mark.parametrize("make", [FormFactor, visibility])
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        ({"patches": [1]}, "patches is a list"),
-        ({"patches": Patches(*np.zeros((3, 0, 3)))}, "patches are 0"),
-        ({"patches": Patches(*np.ones((3, 6, 3)))}, "6 without area, the first at 0"),
-        ({"patches": Patches(np.full((6, 3), np.nan), *np.ones((2, 6, 3)))}, "patches.centre has 18 NaN"),
-        ({"blocks": [[(0, 0, 0), (1, 1, -1)]]}, "the first must be below"),
-        ({"blocks": [[(0, 0, 0), (1, 1, np.nan)]]}, "blocks has 1 NaN"),
-        ({"albedo": 1.0}, r"albedo has 1 value\(s\) outside \[0, 1\)"),
-        ({"albedo": [0.5, 0.5]}, r"albedo has shape \(2,\); it must be \(\) or \(6,\)"),
-        ({"samples": 65}, "samples is 65; it must be at most 64"),
-    ],
-)
-def test_bad_input_is_refused(device, make: Any, arguments: dict[str, Any], part: str):
-    if (make is visibility and "albedo" in arguments) or (make is FormFactor and "samples" in arguments):
-        return
-    with pytest.raises((InputError, InputTypeError), match=part):
-        make(**{"patches": cut(WALLS, 1), "blocks": BLOCK, "device": device, **arguments})
-
-
-def test_what_does_not_fit_is_refused(device, monkeypatch):
-    monkeypatch.setattr("ltcl.checks.host_memory", lambda: 64)
-    with pytest.raises(MemoryLimitError, match="the visibility of 6 x 6 patches needs 144 B"):
-        visibility(cut(WALLS, 1), BLOCK, device)
-    monkeypatch.setattr(device, "memory", 1000)
-    with pytest.raises(MemoryLimitError, match="the geometry of 24 patches needs"):
-        FormFactor(cut(WALLS, 2), device=device)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -220,10 +174,7 @@ def test_rows_of_a_corner_are_those_of_the_dihedral(n):
         np.testing.assert_allclose(rows.rows(start, stop), scene.A[start:stop], rtol=1e-6, atol=1e-9)
     for x in (gallery.vectors(2 * n * n, None), gallery.vectors(2 * n * n, 3)):
         np.testing.assert_allclose(rows.matmat(x), scene.A @ x, rtol=1e-6, atol=1e-6)
-    for bad, part in (
-        (lambda: rows.matmat(np.ones((3, 2))), r"x has shape \(3, 2\)"),
-        (lambda: rows.rows(3, 2), "rows 3 to 2"),
-        (lambda: CornerRows(2, (0.5, 0.4, 0.3)), "albedo has 3 colours"),
-    ):
-        with pytest.raises(InputError, match=part):
-            bad()
+    with pytest.raises(InputError, match=r"x has shape \(3, 2\)"):
+        rows.matmat(np.ones((3, 2)))
+    with pytest.raises(InputError, match="albedo has 3 colours"):
+        CornerRows(2, (0.5, 0.4, 0.3))

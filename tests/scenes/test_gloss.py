@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-import ltcl
-from ltcl import checks
 from ltcl.diagnostics import reciprocity_defect
-from ltcl.errors import InputError, InputTypeError, MemoryLimitError
-from ltcl.scenes import Block, GlossyScene, box, cut, dihedral, glossy, trihedral
+from ltcl.scenes import Block, GlossyScene, box, cut, dihedral, glossy
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.gloss import brdf
 from ltcl.scenes.gloss.beams import exchange
@@ -41,11 +38,6 @@ def test_bins_hold_equal_projected_solid_angles(k: int) -> None:
     points = points[(points**2).sum(axis=1) < 1]
     counts = np.bincount(brdf.bins(np.column_stack([points, np.sqrt(1 - (points**2).sum(axis=1))]), k))
     assert counts == pytest.approx(np.full(k * k, len(points) / k**2), abs=5 * (len(points) / k**2) ** 0.5)
-    places = brdf.lattice(k, points=4)
-    np.testing.assert_array_equal(
-        brdf.bins(places, k), np.broadcast_to(np.arange(k * k)[:, None], (k * k, 16))
-    )
-    np.testing.assert_allclose(np.linalg.norm(places, axis=-1), 1)
 
 
 @pytest.mark.parametrize(("k", "exponent"), [(2, 1), (4, 20), (8, 0.5), (8, 512)])
@@ -58,14 +50,10 @@ def test_lobes_return_all_light_and_are_reciprocal(k: int, exponent: float) -> N
     assert shine.direct(VECTORS, other) == pytest.approx(shine.direct(other, VECTORS), rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "walls",
-    [
-        WALLS,
-        WALLS[:3],
-        (Wall("a", (1, 0, 2), (-1, 0, 0), (0, 0, -2)), Wall("b", (0, 0, 1), (0, 3, 0.5), (0, 0, -1))),
-    ],
-)
+UNEQUAL = (Wall("a", (1, 0, 2), (-1, 0, 0), (0, 0, -2)), Wall("b", (0, 0, 1), (0, 3, 0.5), (0, 0, -1)))
+
+
+@pytest.mark.parametrize("walls", [WALLS, UNEQUAL])
 def test_beams_exchange_the_same_light_both_ways(walls: tuple[Wall, ...]) -> None:
     G, area = exchange(walls, 3, directions=16, rays=64), cut(walls, 3).area
     E = np.repeat(area, 16)[:, None] * G.toarray()
@@ -94,9 +82,8 @@ def test_transport_solves_equation_28_and_bounces_equation_29(scene: GlossyScene
     expected = scene.P @ np.linalg.solve(np.eye(len(A)) - A, scene.K @ scene.Q.toarray())
     (T,) = scene.matrices()
     np.testing.assert_allclose(T, expected, atol=2e-8)
-    np.testing.assert_allclose(
-        (scene.P @ scene.K @ scene.Q).toarray(), np.diag(scene.first_bounce), atol=1e-15
-    )
+    direct = (scene.P @ scene.K @ scene.Q).toarray()
+    np.testing.assert_allclose(direct, np.diag(scene.first_bounce), atol=1e-15)
     bounces, light = scene.bounces(pattern, 40), scene.K @ (scene.Q @ pattern.ravel())
     assert bounces.sum(axis=0).ravel() == pytest.approx(T @ pattern.ravel(), rel=1e-6)
     for bounce in bounces[:4]:
@@ -104,32 +91,14 @@ def test_transport_solves_equation_28_and_bounces_equation_29(scene: GlossyScene
         light = A @ light
     x, y = np.random.default_rng(0).random((2, len(A)))
     assert (scene.A @ x) @ y == pytest.approx(x @ (scene.A.H @ y), rel=1e-12)
-    wanted = T @ np.random.default_rng(3).uniform(0.2, 0.8, 18)
-    result = ltcl.compensate(scene.transport(), wanted.reshape(scene.grid), rtol=1e-5)
-    assert (result.clipped, result.error) == (0, pytest.approx(0, abs=1e-4))
-
-
-def test_colours_and_frames() -> None:
-    colour = corner(2, albedo=(0.8, 0.4, 0.2))
-    patterns = np.random.default_rng(2).random((2, *colour.grid, 3))
-    bounces = colour.bounces(patterns, 2)
-    assert bounces.shape == (3, 2, 2, 4, 3)
-    for channel, albedo in enumerate((0.8, 0.4, 0.2)):
-        grey = corner(2, albedo=albedo)
-        assert bounces[:, 1, ..., channel] == pytest.approx(grey.bounces(patterns[1, ..., channel], 2))
-        assert colour.matrices()[channel] == pytest.approx(grey.matrices()[0])
-    assert len(colour.A) == len(colour.K) == colour.transport().channels == len(colour.first_bounce) == 3
 
 
 def test_without_gloss_it_is_the_diffuse_scene_and_reciprocal() -> None:
     matte = corner(4, gloss=0, albedo=[0.7, 0.4])
     np.testing.assert_allclose(matte.matrices()[0], matte.matte.matrices()[0], atol=2e-8)
     assert reciprocity_defect(matte.matrices()[0], matte.first_bounce) < 1e-6
-    shiny, sharp = corner(4, 0.4), trihedral(3, angle=70)
+    shiny = corner(4, 0.4)
     assert reciprocity_defect(shiny.matrices()[0], shiny.first_bounce) > 0.02
-    room = glossy(sharp, 3, projector=sharp.viewer.eye, directions=16, rays=256)
-    error = np.linalg.norm(room.matte.form_factors - sharp.form_factors)
-    assert error < 0.03 * np.linalg.norm(sharp.form_factors)
 
 
 def first_bounce_by_integration(gloss: float, exponent: float) -> float:
@@ -144,10 +113,8 @@ def first_bounce_by_integration(gloss: float, exponent: float) -> float:
 
     def reflect(normal: tuple[int, int, int], place: Any, centre: Any, other: np.ndarray) -> np.ndarray:
         # Any frame does for an isotropic lobe.
-        axes, away = (
-            np.stack([np.roll(normal, 1), np.roll(normal, 2), normal], axis=1),
-            np.subtract(place, centre),
-        )
+        axes = np.stack([np.roll(normal, 1), np.roll(normal, 2), normal], axis=1)
+        away = np.subtract(place, centre)
         one = np.broadcast_to(away / np.linalg.norm(away), room.shape)
         return 1 - gloss + gloss * shine.direct(one @ axes, other @ axes)
 
@@ -166,7 +133,6 @@ def test_first_bounce_approaches_an_integral_without_bins() -> None:
 
 
 def test_a_glossy_block_casts_a_shadow_and_shows_a_highlight() -> None:
-    """What the block hides is dark; a black one takes light away."""
     cube = box(1, sides=3, occluder=BLOCK)
     gloss = [0.8 if wall.name.startswith("block") else 0.0 for wall in cube.walls]
     options: dict[str, Any] = {"projector": (0.9, 0.2, 1.4), "camera": (0.15, 0.75, 1.4), "rays": 16}
@@ -180,49 +146,3 @@ def test_a_glossy_block_casts_a_shadow_and_shows_a_highlight() -> None:
     assert top.max() > 20 * 0.5 * (1 - 0.8)  # of the matte part
     # Halfway between projector and camera, which are as high above it.
     assert np.unravel_index(np.argmax(top), top.shape) == (3, 2)
-    assert room.transport(room.first_bounce, on_dark="mask").masked.sum() == (direct == 0).sum() > 0
-    dark = glossy(WALLS[:3], 4, blocks=[Block(BLOCK.corner, BLOCK.size)], **options, directions=16)
-    of_scene = glossy(box(1, sides=3, occluder=dark.matte.blocks[0]), 4, **options, directions=16)
-    assert (of_scene.matrices()[0] == dark.matrices()[0]).all()
-    free = glossy(WALLS[:3], 4, **options, directions=16).matte
-    assert (free.form_factors.sum(axis=1) - dark.matte.form_factors.sum(axis=1)).max() > 0.1
-
-
-@pytest.mark.parametrize(
-    ("change", "part"),
-    [
-        ({"gloss": -0.1}, "gloss has the value -0.1"),
-        ({"exponent": 129}, "exponent is 129; it must be at most 128"),
-        ({"directions": 3}, "directions is 3"),
-        ({"directions": 60}, "directions is 60; it must be a square number"),
-        ({"seed": -1}, "seed is -1"),
-        ({"projector": (0, 0.5, 0.5)}, "projector is at .*, on the wall 'right'"),
-        ({"camera": (-1, -1, 0.5)}, "camera is at .*, where it faces none of 2 wall"),
-        ({"room": 5}, "room is 5"),
-        ({"room": WALLS[:2], "camera": None}, "camera is None"),
-        ({"blocks": [[(0, 0, 0), (1, 1, 1)]]}, "blocks is .* ltcl.scenes.Block"),
-    ],
-)
-def test_bad_scenes_are_refused(change: dict[str, Any], part: str) -> None:
-    options = {
-        "room": dihedral(2),
-        "n": 2,
-        "projector": PROJECTOR,
-        "camera": CAMERA,
-        "directions": 16,
-        **change,
-    }
-    with pytest.raises((InputError, InputTypeError), match=part):
-        glossy(**options)
-
-
-def test_memory_and_patterns_are_checked_first(monkeypatch: pytest.MonkeyPatch, scene: GlossyScene) -> None:
-    with pytest.raises(InputError, match="pattern has shape"):
-        scene.bounces(np.ones((2, 2)), 1)
-    with pytest.raises(InputError, match="count is -1"):
-        scene.bounces(np.ones(scene.grid), -1)
-    with pytest.raises(MemoryLimitError, match=r"glossy dihedral, 20000000000 patches .* needs"):
-        glossy(dihedral(2), 10**5, projector=PROJECTOR)
-    monkeypatch.setattr(checks, "host_memory", lambda: 1 << 10)
-    with pytest.raises(MemoryLimitError, match="transport of glossy dihedral, 1 of 18 x 18, needs"):
-        scene.matrices()

@@ -13,31 +13,23 @@ from ltcl import scenes
 from ltcl.diagnostics import other_grid
 
 random = np.random.default_rng(0)
-SCENES = {
-    "corner": (scenes.box, {"n": 12, "sides": 3, "albedo": 0.7}),
-    "closed": (scenes.box, {"n": 8}),
-    "dihedral": (scenes.dihedral, {"n": 16}),
-    "odd": (scenes.dihedral, {"n": 15}),
-    "trihedral": (scenes.trihedral, {"n": 12}),
-}
+SCENES = [scenes.box(12, sides=3, albedo=0.7), scenes.box(8), scenes.dihedral(15), scenes.trihedral(12)]
 
 
-@pytest.mark.parametrize("form", [np.asarray, scipy.sparse.csr_array])
-@pytest.mark.parametrize("name", SCENES)
-def test_a_wrong_grid_is_found(name, form, caplog):
+@pytest.mark.parametrize("scene", SCENES, ids=["corner", "closed", "dihedral", "trihedral"])
+def test_a_wrong_grid_is_found(scene, caplog):
     """Half and double the width, rows as columns, all in a row; with texture or noise the right one fits."""
-    build, options = SCENES[name]
-    transport = build(**options).transport()
+    transport = scene.transport()
     (h, w), T = transport.grid, transport.to_numpy()
-    for width in (w // 2, 2 * w, h, h * w):
+    for width in {w // 2, 2 * w, h, h * w} - {w}:
         if h * w % width == 0:
-            assert other_grid(form(T), (h * w // width, width)) == (h, w), width
+            assert other_grid(T, (h * w // width, width)) == (h, w), width
     texture, noise = random.uniform(0.1, 1.0, (h * w, 1)), random.normal(size=T.shape)
-    for right in (T, texture * T, T + 0.1 * T.mean() * noise):
-        assert other_grid(form(right), (h, w)) is None
-    ltcl.Transport(form(T), (h, w))
+    for right in (T, scipy.sparse.csr_array(T), texture * T, T + 0.1 * T.mean() * noise):
+        assert other_grid(right, (h, w)) is None
+    ltcl.Transport(T, (h, w))
     assert caplog.messages == []
-    ltcl.Transport(form(T), (w, h))
+    ltcl.Transport(scipy.sparse.csr_array(T), (w, h))
     assert str((h, w)) in caplog.messages[0]
 
 
@@ -49,16 +41,6 @@ def test_a_file_that_is_loaded_with_a_wrong_grid_is_warned_of(tmp_path, caplog):
     assert "(16, 32)" in caplog.messages[0]
 
 
-@pytest.mark.parametrize("grid", [(1, 256), (256, 1), (16, 16), (4, 64), (1, 1)])
-def test_without_smooth_rows_any_grid_fits(grid):
-    n = grid[0] * grid[1]
-    one, x = np.eye(n), np.arange(n) / n
-    for T in (one, one + random.random((n, n)), one + 1e-3, np.diag(random.random(n)) + 1e-3, 0 * one):
-        assert other_grid(T, grid) is None
-    if 1 in grid:  # a projector of one row
-        assert other_grid(one + np.exp(-(((x[:, None] - x) / 0.1) ** 2)), grid) is None
-
-
 @pytest.mark.parametrize(
     "kind", ["array", "csr", "stored", "operator", "compressed", "colour", "blocks", "wide"]
 )
@@ -66,9 +48,9 @@ def test_to_numpy_is_T(kind, tmp_path):
     T = scenes.dihedral(4).transport().to_numpy()
     three = [T, 0.5 * T, 0.2 * T]
     dense = {"colour": np.array(three), "blocks": np.array([three] * 3), "wide": T[:16]}.get(kind, T)
-    given = {"csr": scipy.sparse.csr_array(T), "operator": aslinearoperator(T), "blocks": [three] * 3}
+    sources = {"csr": scipy.sparse.csr_array(T), "operator": aslinearoperator(T), "blocks": [three] * 3}
     F = np.diag(T) if kind == "operator" else "diagonal"
-    built = ltcl.Transport(given.get(kind, dense), (4, 8), F, (4, 4) if kind == "wide" else None)
+    built = ltcl.Transport(sources.get(kind, dense), (4, 8), F, (4, 4) if kind == "wide" else None)
     if kind == "compressed":
         built = ltcl.compress(built, rtol=1e-5)
     if kind == "stored":

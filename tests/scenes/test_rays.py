@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from ltcl.errors import InputError
 from ltcl.scenes import Block, box, cut, trihedral
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.rays import cast, clear, sight
@@ -28,25 +25,16 @@ def test_blocks_stop_rays_as_the_twin_says() -> None:
     block, rng = Block((0.2, 0.3, 0.1), (0.4, 0.3, 0.5)), np.random.default_rng(1)
     boxes = np.array([(block.low, block.high)])
     start, end = rng.random((2, 3000, 3))
-    twin = reference.blocked(
-        start, end, np.concatenate([boxes.mean(axis=1), np.array([block.size]) / 2], axis=1)
-    )
+    middle_and_half = np.concatenate([boxes.mean(axis=1), np.array([block.size]) / 2], axis=1)
+    twin = reference.blocked(start, end, middle_and_half)
     np.testing.assert_array_equal(clear((), start, end, boxes), ~twin)
     # Its own faces are in front of it; a ray from the face outwards, along it or over the top passes.
     hits = cast(block.faces(), start[twin], (end - start)[twin], boxes)
     outside = ((start < block.low) | (start > block.high)).any(axis=1)[twin]
     assert (hits.wall[outside] >= 0).all()
-    for place, aim in [
-        ((0.6, 0.4, 0.3), (1, 0.9, 0.9)),
-        ((0.6, 0.4, 0.3), (0.6, 0.9, 0.3)),
-        ((0, 0, 0.6), (1, 1, 0.6)),
-    ]:
-        assert clear((), np.array([place]), np.array(aim, float), boxes).all()
+    places, aims = [(0.6, 0.4, 0.3)] * 2 + [(0, 0, 0.6)], [(1, 0.9, 0.9), (0.6, 0.9, 0.3), (1, 1, 0.6)]
+    assert clear((), np.array(places, float), np.array(aims), boxes).all()
     assert not clear((), np.array([[0.6, 0.4, 0.3]]), np.array([0.0, 0.4, 0.3]), boxes).any()
-    # A place on a ceiling is reached from its front only.
-    ceiling, floor = Wall("ceiling", (0, 0, 0.7), (1, 0, 0), (0, 1, 0)), start * (1, 1, 0)
-    assert clear([ceiling], floor, np.array([0.3, 0.4, 0.7])).all()
-    assert not clear([ceiling], floor, np.array([0.3, 0.4, 0.9])).any()
 
 
 def test_sight_is_in_the_frame_of_each_patch_and_keeps_to_shadows() -> None:
@@ -79,35 +67,13 @@ def test_a_pinhole_shows_a_screen_as_it_is() -> None:
     assert read(EYE, [SCREEN], wide.T, grid=(4, 4))[:, 0] == pytest.approx(inside, abs=0.005)
 
 
-@pytest.mark.parametrize("size", [61, 200, 333])
+@pytest.mark.parametrize("size", [61, 200])
 def test_reading_undoes_drawing_of_smooth_pictures(size: int) -> None:
     """Also seen at an angle and for any rounding of the image's height; negative values pass."""
     oblique, (y, x) = Viewer(eye=(-0.4, -0.9, 0.8), target=(0.5, 1, 0.5)), np.mgrid[:16, :16] / 16
     picture = np.stack([np.sin(3 * x) - 0.5, x * y, 1 - y], axis=-1).astype(np.float32)
     seen = read(oblique, [SCREEN], draw(oblique, [SCREEN], picture, size, supersample=4), grid=(16, 16))
     assert seen[1:-1, 1:-1] == pytest.approx(picture[1:-1, 1:-1], abs=0.02)
-
-
-@pytest.mark.parametrize("order", [(SCREEN, CARD), (CARD, SCREEN)])
-def test_the_nearest_wall_shows(order: tuple[Wall, Wall]) -> None:
-    """Whatever the order of the walls: the card covers half of the screen's width."""
-    picture = np.concatenate([np.full((4, 4), 5.0 if wall is CARD else 1.0) for wall in order], axis=1)
-    image = draw(EYE, order, picture, size=106, supersample=2)
-    assert (image == 5).sum() == pytest.approx(50**2, rel=0.05)
-    assert (image == 1).sum() == pytest.approx(100**2 - 50**2, rel=0.05)
-    black = draw(EYE, [SCREEN], np.ones((4, 4)), size=106, supersample=1, screens=[CARD])
-    assert not black[30:76, 30:76].any()
-
-
-def test_hidden_patches_read_nothing_and_partly_hidden_ones_what_shows() -> None:
-    image = np.zeros((106, 106, 3), np.float32)
-    image[:, 53:] = 1
-    for walls, screens in (([SCREEN], [CARD]), ([SCREEN, CARD], [])):
-        wall = read(EYE, walls, image, (8, 8 * len(walls)), screens)[:, :8]
-        assert not wall[2:6, 2:6].any()  # behind the card
-        assert wall[2:6, 6:] == pytest.approx(1)
-    coarse = read(EYE, [SCREEN], image, (2, 2), [CARD])  # a quarter of each patch is hidden
-    assert coarse[..., 0] == pytest.approx(np.array([[0, 1], [0, 1]]), abs=0.03)
 
 
 def test_a_block_hides_what_is_behind_it_and_seams_show_no_cracks(device) -> None:
@@ -120,16 +86,3 @@ def test_a_block_hides_what_is_behind_it_and_seams_show_no_cracks(device) -> Non
     assert top == pytest.approx(1)
     slanted = trihedral(2, angle=60)
     assert slanted.view(np.ones(slanted.grid), size=300)[60:240, 100:200].min() == 1
-
-
-@pytest.mark.parametrize(
-    ("eye", "target", "part"),
-    [
-        ((0.5, 2, 0.5), (0.5, 1, 0.5), "viewer at .* must face the viewer"),  # behind the screen
-        ((0.5, 0, 0.5), (0.5, -1, 0.5), "viewer at .* must face the viewer"),  # looks away
-        ((1, 1, 3), (1, 1, 0), "straight up or down"),
-    ],
-)
-def test_bad_viewers_are_refused(eye: Any, target: Any, part: str) -> None:
-    with pytest.raises(InputError, match=part):
-        frame(Viewer(eye, target), [SCREEN])

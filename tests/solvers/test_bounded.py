@@ -124,7 +124,7 @@ def test_it_finds_the_least_squares(rho, weighted, bright, seed):
     assert (s.least <= least + 1e-6 * scale).all()
     # Held are those that the exact solution leaves at a bound; where w is small it hardly matters.
     outside = np.isclose(solution, lower[:, None]) | np.isclose(solution, upper[:, None])
-    assert np.mean(s.held != (outside & (lower < upper)[:, None])) < 0.03
+    assert np.mean(s.saturated != (outside & (lower < upper)[:, None])) < 0.03
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Small stores whose every entry is known, and acquisitions into them that end at a given moment."""
+"""Small matrices and stores whose every entry is known, and acquisitions that end at a given moment."""
 
 from __future__ import annotations
 
@@ -21,6 +21,20 @@ from ltcl.store import BlockStore
 PACKAGE = os.path.dirname(ltcl.__file__)
 
 
+def dense(M: int = 12, N: int = 12, dtype: str = "float32", seed: int = 1) -> np.ndarray:
+    """(M, N) with a strong diagonal, as a transport has."""
+    T = np.random.default_rng(seed).random((M, N))
+    np.fill_diagonal(T, 5 + T.diagonal())
+    return T.astype(dtype)
+
+
+def sparse(N: int = 12, dtype: str = "float32", seed: int = 1, pattern: int = 1) -> scipy.sparse.csr_array:
+    """(N, N) csr; equal `pattern` gives equal places, `seed` the values."""
+    keep = np.random.default_rng(pattern).random((N, N)) < 0.3
+    np.fill_diagonal(keep, True)
+    return scipy.sparse.csr_array(np.where(keep, dense(N, N, dtype, seed), 0).astype(dtype))
+
+
 def transport(rows: int = 10, columns: int = 12, channel: int = 0) -> scipy.sparse.csr_array:
     """(rows, columns) float32 with empty rows and a strong diagonal."""
     rng = np.random.default_rng([rows, columns, channel])
@@ -38,8 +52,8 @@ def variance(T: scipy.sparse.csr_array) -> scipy.sparse.csr_array:
 
 def make(path: Path, **options: Any) -> BlockStore:
     """An empty store for `transport()`: blocks of 3, the last one of less."""
-    given = {"shape": (10, 12), "grid": (3, 4), "camera_grid": (2, 5), "block_rows": 3, **options}
-    return BlockStore.create(path, **given)
+    sizes = {"shape": (10, 12), "grid": (3, 4), "camera_grid": (2, 5), "block_rows": 3, **options}
+    return BlockStore.create(path, **sizes)
 
 
 def part(store: BlockStore, T: scipy.sparse.csr_array, block: int) -> scipy.sparse.csr_array:
@@ -52,7 +66,7 @@ def fill(store: BlockStore, *, with_variance: bool = False, final: bool = True) 
     """Every batch of `transport()`."""
     for channel, block in store.missing():
         T = transport(*store.layout.shape, channel)
-        V = part(store, variance(T), block) if with_variance else None
+        V = part(store, variance(T), block).data if with_variance else None
         store.write(channel, block, part(store, T, block), V)
     if final:
         store.finalize()
@@ -61,7 +75,9 @@ def fill(store: BlockStore, *, with_variance: bool = False, final: bool = True) 
 
 def whole(store: BlockStore, channel: int = 0) -> np.ndarray:
     """T of a store, by its rows."""
-    return np.concatenate([store.read(channel, block).toarray() for block in range(store.layout.blocks())])
+    return np.concatenate(
+        [store.block(channel, block).matrix.toarray() for block in range(store.layout.blocks())]
+    )
 
 
 def contents(path: Path) -> dict[str, str]:
@@ -70,15 +86,15 @@ def contents(path: Path) -> dict[str, str]:
     return {str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
 
-def acquire(path: Path, told: Callable[[int, int], Any] = lambda c, b: None) -> None:
-    """What an acquisition does: begin or resume, write what is missing, finish; `told` of every block."""
+def acquire(path: Path, report: Callable[[int, int], Any] = lambda c, b: None) -> None:
+    """What an acquisition does: begin or resume, write what is missing, `report` every block, finish."""
     sizes: dict[str, Any] = {"shape": (12, 12), "camera_grid": None, "block_rows": 5, "channels": 3}
     store = BlockStore.open(path, "a") if path.exists() else make(path, **sizes)
     if not store.final:
         for channel, block in store.missing():
             T = transport(12, 12, channel)
-            store.write(channel, block, part(store, T, block), part(store, variance(T), block))
-            told(channel, block)
+            store.write(channel, block, part(store, T, block), part(store, variance(T), block).data)
+            report(channel, block)
         if "response" not in store.extras:
             store.extra("response", np.arange(5.0))
         store.update(finished=True)

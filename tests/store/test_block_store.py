@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 import ltcl
 from ltcl.errors import FileError, InputError, InputTypeError
-from ltcl.store import BlockStore, zarr_arrays
+from ltcl.store import BlockStore, block_store, zarr_arrays
 
 from .stores import fill, make, part, transport, variance, whole
 
@@ -34,52 +34,48 @@ def refused(path: Path, *words: str) -> None:
     with pytest.raises(FileError) as error:
         BlockStore.open(path).verify()
     text = str(error.value)
-    assert text.startswith((f"{path}: ", f"{path}/log/"))
+    assert text.startswith(str(path))
     assert "\n" not in text
     assert all(word in text for word in words), text
 
 
-@pytest.mark.parametrize("memory", [64, 64 * 20, 1 << 20])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_round_trip_with_any_memory(tmp_path: Path, channels: int, memory: int) -> None:
-    store = make(tmp_path / "T.zarr", channels=channels)
-    fill(store, with_variance=True, final=False)
-    assert (store.final, store.missing(), len(store.written)) == (False, [], 4 * channels)
+@settings(deadline=None, max_examples=25)
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 10), st.integers(1, 600), st.sampled_from((1, 3)))
+def test_any_shape_in_any_blocks_and_memory(
+    tmp_path_factory: pytest.TempPathFactory, M: int, N: int, size: int, memory: int, channels: int
+) -> None:
+    path = tmp_path_factory.mktemp("store") / "T.zarr"
+    grids = {"shape": (M, N), "grid": (1, N), "camera_grid": (M, 1)}
+    store = fill(make(path, **grids, block_rows=size, channels=channels), with_variance=True, final=False)
+    assert (store.final, store.missing(), len(store.written)) == (False, [], -(-N // size) * channels)
     store.finalize(memory=memory)
-    again = BlockStore.open(tmp_path / "T.zarr")
-    assert (again.final, again.missing(), len(again.written)) == (True, [], 4 * channels)
+    again = BlockStore.open(path)
+    assert (again.final, again.missing(), len(again.written)) == (True, [], -(-M // size) * channels)
     for channel in range(channels):
-        T = transport(channel=channel)
+        T = transport(M, N, channel)
         np.testing.assert_array_equal(whole(again, channel), T.toarray())
-        for block in range(4):
-            start, stop = store.layout.span(block)
-            np.testing.assert_array_equal(again.variance(channel, block), variance(T)[start:stop].data)
+        spread: list[Any] = [again.block(channel, b).variance for b in range(store.layout.blocks())]
+        np.testing.assert_array_equal(np.concatenate(spread), variance(T).data)
     again.verify()
-    assert sorted(os.listdir(again.path)) == [
-        *(f"channel_{c}" for c in range(channels)),
-        "extra",
-        "zarr.json",
-    ]
+    assert "log" not in os.listdir(path)
 
 
 def test_rows_are_changed_once_even_if_all_is_asked_for_again(tmp_path: Path) -> None:
     store = fill(make(tmp_path / "T.zarr"), with_variance=True, final=False)
-    left = [3]
+    errors = iter([None, None, OSError("no more")])
 
     def change(channel: int, first: int, matrix: Any, spread: Any) -> tuple[Any, Any]:
-        left[0] -= 1
-        if left[0] == 0:
-            raise OSError("no more")
-        more = 1.0 + np.arange(first, first + matrix.shape[0])
-        return scipy.sparse.diags_array(more) @ matrix, 2.0 * spread
+        if error := next(errors, None):
+            raise error
+        return (1 + first) * matrix, 2.0 * spread
 
     with pytest.raises(FileError, match="no more"):
         store.finalize(memory=64, change=change)
     assert not store.final
     store.finalize(memory=64, change=change)
-    T = transport()
-    np.testing.assert_allclose(whole(store), (1.0 + np.arange(10))[:, None] * T.toarray())
-    np.testing.assert_array_equal(store.variance(0, 1), 2.0 * variance(T)[3:6].data)
+    scale = 1.0 + 3 * (np.arange(10) // 3)
+    np.testing.assert_allclose(whole(store), scale[:, None] * transport().toarray())
+    np.testing.assert_array_equal(store.block(0, 1).variance, 2.0 * variance(transport())[3:6].data)
 
 
 def test_variance_of_some_columns_only_is_unknown_elsewhere(tmp_path: Path) -> None:
@@ -88,10 +84,9 @@ def test_variance_of_some_columns_only_is_unknown_elsewhere(tmp_path: Path) -> N
         columns = part(store, transport(), block)
         store.write(0, block, columns, np.ones(columns.nnz) if block == 2 else None)
     store.finalize()
-    spread = store.variance(0, 0)
+    T, spread = store.block(0, 0)
     assert spread is not None
-    known = (store.read(0, 0).indices >= 6) & (store.read(0, 0).indices < 9)
-    np.testing.assert_array_equal(np.isnan(spread), ~known)
+    np.testing.assert_array_equal(np.isnan(spread), (T.indices < 6) | (T.indices >= 9))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -105,24 +100,13 @@ def test_plain_zarr_reads_it_and_checks_it(tmp_path: Path, dtype: str) -> None:
     values, indices, pointers = (np.asarray(group[n]) for n in ("values", "indices_1", "pointers_to_1"))
     for name, array in (("values", values), ("indices_1", indices), ("pointers_to_1", pointers)):
         assert array.dtype == header["data_types"][name]
-    found = scipy.sparse.csr_array((values, indices, pointers), shape=header["shape"])
-    np.testing.assert_array_equal(found.toarray(), T.toarray())
+    matrix = scipy.sparse.csr_array((values, indices, pointers), shape=header["shape"])
+    np.testing.assert_array_equal(matrix.toarray(), T.toarray())
     assert (values.dtype, len(values)) == (dtype, header["number_of_stored_values"])
     chunk = path / "channel_0" / "block_000000.0" / "values" / "c" / "0"
     chunk.write_bytes(chunk.read_bytes()[:-9] + b"x" + chunk.read_bytes()[-8:])
     with pytest.raises(ValueError, match="checksum"):
         np.asarray(group["values"])
-
-
-@settings(deadline=None, max_examples=20)
-@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 10))
-def test_any_shape_cut_anyhow(
-    tmp_path_factory: pytest.TempPathFactory, rows: int, columns: int, size: int
-) -> None:
-    path = tmp_path_factory.mktemp("store") / "T.zarr"
-    grids = {"shape": (rows, columns), "grid": (1, columns), "camera_grid": (rows, 1)}
-    store = fill(make(path, **grids, block_rows=size))
-    np.testing.assert_array_equal(whole(store), transport(rows, columns).toarray())
 
 
 def test_missing_blocks_are_named_and_written_ones_replaced(tmp_path: Path) -> None:
@@ -131,12 +115,12 @@ def test_missing_blocks_are_named_and_written_ones_replaced(tmp_path: Path) -> N
         store.write(0, block, part(store, transport(), block))
     twice = part(store, transport() * np.float32(2), 2)
     store.write(0, 2, twice)
-    np.testing.assert_array_equal(store.read(0, 2).toarray(), twice.toarray())
+    np.testing.assert_array_equal(store.block(0, 2).matrix.toarray(), twice.toarray())
     assert store.missing() == [(0, 1), (0, 3)]
     with pytest.raises(FileError, match=r"2 block\(s\) \(channel, block\) \(0, 1\), \(0, 3\)"):
         store.finalize()
-    with pytest.raises(FileError, match=r"columns_0.000001.npz: is missing"):
-        store.read(0, 1)
+    with pytest.raises(FileError, match=r"columns_0.000001.npz is missing"):
+        store.block(0, 1)
     with pytest.raises(FileError, match="finalize"):
         ltcl.load(store.path)
 
@@ -147,25 +131,22 @@ def test_first_bounce(tmp_path: Path, sigmas: float) -> None:
     store = make(tmp_path / "T.zarr", **SQUARE, channels=3)
     fill(store, with_variance=True, final=False)
     store.finalize(sigmas=sigmas)
-    wanted = []
+    expected = []
     for channel in range(3):
         T = transport(12, 12, channel)
         F, sigma = T.diagonal(), np.sqrt(variance(T).diagonal())
-        wanted.append(np.where(sigmas * sigma < F, F, 0.0))
-    np.testing.assert_array_equal(store.extra("first_bounce"), wanted)
-    np.testing.assert_array_equal(store.extra("masked"), (np.array(wanted) <= 0).any(axis=0))
-    assert (np.count_nonzero(wanted) < 33) == (sigmas > 0)
+        expected.append(np.where(sigmas * sigma < F, F, 0.0))
+    np.testing.assert_array_equal(store.extra("first_bounce"), expected)
+    assert (np.count_nonzero(expected) < 33) == (sigmas > 0)
 
 
 @pytest.mark.parametrize("final", [False, True])
 def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
     store = make(tmp_path / "T.zarr", provenance={"rig": "virtual", "seed": 3})
-    arrays = {}
-    for dtype in ("bool", "uint8", "int64", "float16", "float32", "float64"):
-        for shape in ((), (0,), (3,), (2, 3), (2, 0, 4)):
-            name = f"an.array-{dtype}-{'x'.join(map(str, shape))}"
-            arrays[name] = np.arange(np.prod(shape, dtype=int)).reshape(shape).astype(dtype)
-            store.extra(name, arrays[name])
+    types, shapes = ("bool", "uint8", "int64", "float16", "float64"), ((), (0,), (3,), (2, 0, 4))
+    arrays = {f"an.array-{dtype}-{len(shape)}": np.ones(shape, dtype) for dtype in types for shape in shapes}
+    for name, array in arrays.items():
+        store.extra(name, array)
     store.update(step=4, name="π")
     BlockStore.open(store.path, "a").update(step=5)
     for bad in (float("nan"), object()):
@@ -176,12 +157,11 @@ def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
     again.verify()
     assert set(arrays) <= set(again.extras)
     for name, array in arrays.items():
-        np.testing.assert_array_equal(again.extra(name), array)
-        assert (again.extra(name).dtype, again.extra(name).shape) == (array.dtype, array.shape)
+        np.testing.assert_array_equal(again.extra(name), array, strict=True)
     assert again.attributes == {"step": 5, "name": "π"}
     versions = {"ltcl": ltcl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
     assert again.provenance == {"versions": versions, "rig": "virtual", "seed": 3}
-    with pytest.raises(InputError, match=r"\.\./escape"):
+    with pytest.raises(InputError, match=r"\.\./escape" if not final else "final"):
         store.extra("../escape", np.ones(2))
     with pytest.raises(InputTypeError, match="words"):
         store.extra("words", np.array(["a"]))
@@ -194,7 +174,6 @@ def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
         ({"camera_grid": (3, 3)}, "h \\* w must be 10"),
         ({"camera_grid": None}, "camera_grid is None"),
         ({"channels": 2}, "channels is 2"),
-        ({"orientation": "diagonals"}, "orientation is 'diagonals'"),
         ({"block_rows": 0}, "block_rows is 0"),
         ({"shape": (1 << 31, 1), "grid": (1, 1), "camera_grid": (1 << 31, 1)}, "2147483647"),
         ({"provenance": {"rig": object()}}, "plain JSON"),
@@ -209,20 +188,19 @@ def test_bad_stores_are_not_made(tmp_path: Path, options: dict[str, Any], text: 
 def test_bad_blocks_and_modes_are_refused(tmp_path: Path) -> None:
     store = make(tmp_path / "T.zarr")
     good = part(store, transport(), 0)
-    for block, matrix, text in (
-        (0, good[:2], r"matrix has shape \(2, 10\)"),
-        (4, good, "block is 4"),
-        (-1, good, "block is -1"),
-        (0, good * np.nan, "NaN"),
-        (0, good.astype(np.float64) * 1e39, "float32"),
-    ):
-        with pytest.raises(InputError, match=text):
-            store.write(0, block, matrix)
-    for spread in (good[[1, 0, 2]], np.full(good.nnz, -1.0), np.ones(good.nnz + 1)):
-        with pytest.raises(InputError, match="variance"):
-            store.write(0, 0, good, spread)
-    with pytest.raises(InputTypeError, match="matrix is a ndarray"):
-        store.write(0, 0, good.toarray())
+    wrong: list[tuple[int, Any, Any, str]] = [
+        (0, good[:2], None, r"matrix has shape \(2, 10\)"),
+        (0, good.toarray(), None, "matrix is a ndarray"),
+        (4, good, None, "block is 4"),
+        (-1, good, None, "block is -1"),
+        (0, good * np.nan, None, "NaN"),
+        (0, good.astype(np.float64) * 1e39, None, "float32"),
+        (0, good, np.full(good.nnz, -1.0), "variance"),
+        (0, good, np.ones(good.nnz + 1), "variance"),
+    ]
+    for block, matrix, spread, text in wrong:
+        with pytest.raises((InputError, InputTypeError), match=text):
+            store.write(0, block, matrix, spread)
     assert store.written == frozenset()
     for change in (lambda s: s.write(0, 0, good), lambda s: s.finalize(), lambda s: s.update(a=1)):
         with pytest.raises(FileError, match="mode 'a'"):
@@ -241,19 +219,14 @@ def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
     assert make(path, overwrite=True).written == frozenset()
     other.mkdir()
     (other / "thesis.txt").write_text("years of work")
-    for work in (lambda: make(other, overwrite=True), lambda: ltcl.store.zarr_folder.write(other, RECORD)):
+    for work in (lambda: make(other, overwrite=True), lambda: block_store.write(other, RECORD)):
         with pytest.raises(FileError, match="no store of ltcl"):
             work()
     assert (other / "thesis.txt").exists()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["T.zarr", "other"]
     zarr.create_group(tmp_path / "plain")
-    for name, text in (
-        ("nowhere", "no such"),
-        ("other/thesis.txt", "no folder"),
-        (".", "zarr.json"),
-        ("plain", "ltcl"),
-    ):
-        with pytest.raises(FileError, match=text):
+    for name in ("nowhere", "other/thesis.txt", ".", "plain"):
+        with pytest.raises(FileError, match=str(tmp_path / name)):
             BlockStore.open(tmp_path / name)
 
 
@@ -306,19 +279,6 @@ def test_any_damage_to_any_file_is_noticed(copy: Path) -> None:
     BlockStore.open(copy).verify()
 
 
-def test_damage_is_noticed_by_loading(stores: dict[str, Path], tmp_path: Path) -> None:
-    path = Path(shutil.copytree(stores["final"], tmp_path / "T.zarr"))
-    for file in files(path / "channel_0"):
-        good = file.read_bytes()
-        if "variance" not in str(file):
-            file.write_bytes(good[:-1] + bytes([good[-1] ^ 128]))
-            with pytest.raises(FileError, match=r"T\.zarr: channel_0/"):
-                ltcl.load(path, on_dark="mask")
-            file.write_bytes(good)
-    (path / "channel_0" / "notes.txt").write_text("x")
-    refused(path, "channel_0/notes.txt")
-
-
 def forge(file: Path, change: Callable[[dict[str, Any]], None]) -> None:
     """Change a document and seal it again, as an enemy could."""
     attributes = json.loads(file.read_bytes())["attributes"]
@@ -330,18 +290,12 @@ def forge(file: Path, change: Callable[[dict[str, Any]], None]) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "text"),
     [
-        ("schema", 3, "schema 3"),
+        ("schema", 3, "schema is 3"),
         ("schema", 1, "earlier"),
-        ("schema", "x" * 10**5, "schema"),
         ("shape", [12, 1 << 40], "shape"),
-        ("shape", [12], "shape is"),
         ("shape", "12 x 12", "shape is"),
-        ("grid", [1 << 20, 1 << 20], "1048576"),
         ("channels", 1 << 40, "channels is"),
         ("block_rows", -1, "block_rows is -1"),
-        ("block_rows", None, "block_rows is None"),
-        ("orientation", ["rows"], "orientation is"),
-        ("dtype", "float128", "dtype is"),
         ("surprise", 1, "surprise"),
     ],
 )
@@ -356,42 +310,26 @@ def test_a_huge_shape_is_only_a_list_of_missing_blocks(stores: dict[str, Path], 
     sizes = {"shape": [huge, huge], "grid": [1, huge], "block_rows": 1 << 12}
     forge(path / "zarr.json", lambda attributes: attributes["ltcl"].update(sizes))
     with pytest.raises(FileError, match="indptr"):
-        BlockStore.open(path).read(0, 0)
+        BlockStore.open(path).block(0, 0)
     with pytest.raises(FileError, match=r"lacks 524285 block\(s\)"):
         BlockStore.open(path, "a").finalize()
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"shape": [1 << 40]},
-        {"shape": [-1]},
-        {"shape": None},
-        {"data_type": "O"},
-        {"codecs": [{"name": "gzip"}]},
-        {"chunk_grid": {}},
-    ],
+    "change", [{"shape": [1 << 40]}, {"data_type": "O"}, {"codecs": [{"name": "gzip"}]}, None]
 )
-def test_declared_terabytes(stores: dict[str, Path], tmp_path: Path, change: dict[str, Any]) -> None:
-    """With all checksums right."""
+def test_what_cannot_be_rows(stores: dict[str, Path], tmp_path: Path, change: dict[str, Any] | None) -> None:
+    """With all checksums right: arrays that declare terabytes, and columns that do not ascend."""
     path = Path(shutil.copytree(stores["final"], tmp_path / "T.zarr"))
-    name = "channel_0/block_000000.0/values/zarr.json"
-    (path / name).write_text(json.dumps(json.loads((path / name).read_bytes()) | change))
+    file, node = (path / "channel_0" / "block_000000.0" / name for name in ("values/zarr.json", "indices_1"))
+    if change is None:
+        array = zarr.open_array(node, mode="a")
+        array[...] = np.asarray(array[...])[::-1]
+    else:
+        file.write_text(json.dumps(json.loads(file.read_bytes()) | change))
     sums = zarr_arrays.manifest(path, ["channel_0", "extra"])
     forge(path / "zarr.json", lambda attributes: attributes.update(files=sums))
-    with pytest.raises(FileError, match=r"T\.zarr: channel_0/block_000000"):
-        ltcl.load(path, on_dark="mask")
-
-
-@pytest.mark.parametrize("values", [lambda a: a + 100, lambda a: a - 1, lambda a: a[::-1]])
-def test_rows_that_are_none(stores: dict[str, Path], tmp_path: Path, values: Any) -> None:
-    """Written by zarr, with all checksums right."""
-    path = Path(shutil.copytree(stores["final"], tmp_path / "T.zarr"))
-    node = zarr.open_array(path / "channel_0" / "block_000000.0" / "indices_1", mode="a")
-    node[...] = values(np.asarray(node[...]))
-    sums = zarr_arrays.manifest(path, ["channel_0", "extra"])
-    forge(path / "zarr.json", lambda attributes: attributes.update(files=sums))
-    with pytest.raises(FileError, match=r"T\.zarr: channel_0/block_000000"):
+    with pytest.raises(FileError, match=r"T\.zarr: .*0[./](block_)?000000"):
         ltcl.load(path, on_dark="mask")
 
 

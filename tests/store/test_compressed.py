@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files of compressed transports: the same light comes back, and hostile ones are refused in one line."""
+"""Files of compressed transports and of inverses: the same bits come back, damage is refused in one line."""
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,197 +13,191 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import FileError, InputTypeError, LtclError
-from ltcl.operators import (
-    CSR,
-    Compressed,
-    Dense,
-    IdentityPlus,
-    ScaledColumns,
-    SubsetBasis,
-    Tiles,
-    Wavelet,
-)
+from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, ScaledColumns, SubsetBasis, Tiles, Wavelet
 from ltcl.store import Parts, formats
-from tests.problems import enclosure
+from tests.problems import enclosure, lambertian
 
-GRID = (6, 7)
-N = 42
-F = np.random.default_rng(0).uniform(0.3, 0.5, (3, N))
+random = np.random.default_rng()
+GRID, N = (6, 7), 42
+F = np.linspace(0.3, 0.5, 3 * N).reshape(3, N)
+CORES: dict[str, Any] = {"csr": CSR, "dense": lambda device, C: Dense(device, C.toarray()), "tiles": Tiles}
 
 
-def _core(device, kind, W, R):
-    C = R if W is None else W.to_dense() @ R @ W.to_dense().T
+def system(device: Any, W: Any, core: str, channel: int = 0) -> IdentityPlus:
+    C = W.to_dense() @ enclosure(N, 0.4, channel).R @ W.to_dense().T
     C = scipy.sparse.csr_array(np.where(np.abs(C) > 0.01, C, 0.0))
-    return {"csr": CSR, "dense": lambda d, C: Dense(d, C.toarray()), "tiles": Tiles}[kind](device, C)
+    R = Compressed(CORES[core](device, C), W, W, 0.01)
+    return IdentityPlus(R, weights=1.0 / F[channel], solution_error=0.02 * (channel + 1))
 
 
-def compressed(device, channels=1, core="csr", f=F, d=None, **options):
+def compressed(
+    device: Any, channels: int = 1, core: str = "csr", f: Any = F, d: Any = F, **options: Any
+) -> Any:
     """A transport whose channels share their basis."""
     W = Wavelet(device, GRID, "db2")
-    matrices = []
-    for channel in range(channels):
-        R = Compressed(_core(device, core, W, enclosure(N, 0.4, channel).R), W, W, 0.01)
-        S = IdentityPlus(R, weights=1.0 / F[channel], solution_error=0.02 * (channel + 1))
-        matrices.append(ScaledColumns(S, f[channel] if d is None else d[channel]))
+    matrices = [ScaledColumns(system(device, W, core, c), d[c]) for c in range(channels)]
     return ltcl.Transport(matrices, GRID, first_bounce=f[0] if channels == 1 else f, **options)
 
 
-def same(a, b):
-    assert (a.shape, a.grid, a.channels, a.error) == (b.shape, b.grid, b.channels, b.error)
-    np.testing.assert_array_equal(a.first_bounce, b.first_bounce)
-    np.testing.assert_array_equal(a.masked, b.masked)
-    p = np.random.default_rng(1).uniform(0.0, 1.0, (*GRID, 3))
-    np.testing.assert_array_equal(a @ p, b @ p)
-    for S, R in zip(a.systems, b.systems, strict=True):
+def ordered(device: Any, basis: str | None) -> Any:
+    W = SubsetBasis(device, GRID, np.arange(N)[::-1], Wavelet(device, GRID, basis, 2) if basis else None)
+    return ltcl.Transport(ScaledColumns(system(device, W, "tiles"), F[0]), GRID, first_bounce=F[0])
+
+
+def unknown_error(device: Any) -> Any:
+    S = IdentityPlus(Dense(device, np.zeros((N, N))), solution_error=np.inf)
+    return ltcl.Transport(ScaledColumns(S, F[0]), GRID, first_bounce=F[0])
+
+
+DARK = np.where(np.arange(N) % 5 == 0, 0.0, F)
+TRANSPORTS: dict[str, Any] = {
+    **{f"{core}, grey": partial(compressed, core=core) for core in CORES},
+    **{f"{core}, colour": partial(compressed, channels=3, core=core) for core in CORES},
+    "dark": partial(compressed, channels=3, f=DARK, d=DARK, on_dark="mask", mixing=np.eye(3) + 0.1),
+    "first bounce of others": partial(compressed, d=1.1 * F),
+    "order": partial(ordered, basis=None),
+    "order of wavelets": partial(ordered, basis="haar"),
+    "unknown error": unknown_error,
+}
+
+
+@pytest.mark.parametrize("name", TRANSPORTS)
+@pytest.mark.parametrize("extension", [".npz", ".zarr"])
+def test_the_same_transport_comes_back(device: Any, tmp_path: Path, extension: str, name: str) -> None:
+    C, path = TRANSPORTS[name](device), tmp_path / f"C{extension}"
+    ltcl.save(path, C)
+    if name == "dark":
+        with pytest.raises(FileError, match="on_dark='mask'"):
+            ltcl.load(path)
+    again: Any = ltcl.load(path, on_dark="mask")
+    assert again.device is device
+    assert (again.shape, again.grid, again.channels, again.error) == (C.shape, C.grid, C.channels, C.error)
+    for attribute in ("first_bounce", "masked", "mixing"):
+        np.testing.assert_array_equal(getattr(again, attribute), getattr(C, attribute))
+    p = random.uniform(0.0, 1.0, (*GRID, 3))
+    np.testing.assert_array_equal(again @ p, C @ p)
+    for T, S in zip(again.matrices, C.matrices, strict=True):
+        np.testing.assert_array_equal(T.d, S.d)
+    for S, R in zip(again.systems, C.systems, strict=True):
         np.testing.assert_array_equal(S.rmatmat(p.reshape(N, 3)), R.rmatmat(p.reshape(N, 3)))
         np.testing.assert_array_equal(S.weights, R.weights)
+    if "colour" in name:
+        assert len({basis for S in again.systems for basis in (S.R.into, S.R.out)}) == 1
 
 
-@pytest.mark.parametrize("core", ["csr", "dense", "tiles"])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_the_same_transport_comes_back(device, tmp_path, channels, core):
-    C = compressed(device, channels, core)
-    path = tmp_path / "C.npz"
-    ltcl.save(path, C)
-    again = ltcl.load(path)
-    same(C, again)
-    assert again.device is device
-    bases = {S.R.into for S in again.systems if isinstance(S.R, Compressed)}
-    assert len(bases) == 1  # shared by all, and on both sides
-    image = C @ np.full(GRID, 0.5)
-    np.testing.assert_array_equal(
-        ltcl.compensate(again, image, rtol=0.06).pattern, ltcl.compensate(C, image, rtol=0.06).pattern
-    )
-
-
-@pytest.mark.parametrize("of", [None, "haar"])
-def test_orders_come_back(device, tmp_path, of):
-    W = SubsetBasis(device, GRID, np.arange(N)[::-1], of and Wavelet(device, GRID, of, 2))
-    S = IdentityPlus(Compressed(_core(device, "tiles", W, enclosure(N, 0.4).R), W, W), weights=F[0])
-    C = ltcl.Transport(ScaledColumns(S, F[0]), GRID, first_bounce=F[0])
-    ltcl.save(tmp_path / "C.npz", C)
-    same(C, ltcl.load(tmp_path / "C.npz"))
-
-
-def test_masked_pixels_and_mixed_colours_come_back(device, tmp_path):
-    f = np.where(np.arange(N) % 5 == 0, 0.0, F)
-    mixing = np.eye(3) + 0.1
-    C = compressed(device, 3, f=f, on_dark="mask", mixing=mixing)
-    ltcl.save(tmp_path / "C.npz", C)
-    with pytest.raises(FileError, match="give on_dark='mask'"):
-        ltcl.load(tmp_path / "C.npz")
-    again = ltcl.load(tmp_path / "C.npz", on_dark="mask")
-    same(C, again)
-    np.testing.assert_array_equal(again.mixing, mixing)
-
-
-def test_another_first_bounce_than_the_columns(device, tmp_path):
-    C = compressed(device, d=1.1 * F)
-    ltcl.save(tmp_path / "C.npz", C)
-    again = ltcl.load(tmp_path / "C.npz")
-    np.testing.assert_array_equal(again.matrices[0].d, C.matrices[0].d)
-    np.testing.assert_array_equal(again.first_bounce, C.first_bounce)
-    given = ltcl.load(tmp_path / "C.npz", first_bounce=1.1 * F[0])
-    assert given.systems[0] is given.matrices[0].A
-
-
-def test_unknown_errors_stay_unknown(device, tmp_path):
-    S = IdentityPlus(Dense(device, np.zeros((N, N))), solution_error=np.inf)
-    ltcl.save(tmp_path / "C.npz", ltcl.Transport(ScaledColumns(S, F[0]), GRID, first_bounce=F[0]))
-    assert ltcl.load(tmp_path / "C.npz").error == np.inf
-
-
-def test_what_is_known_without_a_device(device, tmp_path):
+def test_what_is_known_without_a_device(device: Any, tmp_path: Path) -> None:
     C = compressed(device, 3, "tiles")
     ltcl.save(tmp_path / "C.npz", C)
     parts = formats.read(tmp_path / "C.npz")
     assert isinstance(parts, Parts)
-    assert (parts.shape, parts.grid, parts.error) == ((N, N), GRID, 0.06)
-    assert parts.kinds == ("tiles", "db2")
-    inside = [S.R.core for S in C.systems if isinstance(S.R, Compressed)]
-    packed = [core.packed for core in inside if isinstance(core, Tiles)]
-    assert parts.entries == sum(np.count_nonzero(one.codes) for one in packed)
-    assert parts.nbytes > sum(one.codes.nbytes + one.columns.nbytes for one in packed)
+    assert (parts.shape, parts.grid, parts.error, parts.kinds) == ((N, N), GRID, 0.06, ("tiles", "db2"))
+    packed = [S.R.core.packed for S in C.systems]
+    assert parts.entries == sum(np.count_nonzero(core.codes) for core in packed)
+    assert parts.nbytes > sum(core.codes.nbytes + core.columns.nbytes for core in packed)
 
 
-def test_other_formats_and_operators_are_refused(device, tmp_path):
-    C = compressed(device)
+def test_what_no_file_holds_is_refused(device: Any, tmp_path: Path) -> None:
     for name in ("C.npy", "C.mtx"):
-        with pytest.raises(FileError, match=r"does not keep compressed transports; \.npz and \.zarr do"):
-            ltcl.save(tmp_path / name, C)
-    plain = ltcl.Transport(Dense(device, np.eye(N)), GRID)
+        with pytest.raises(FileError, match=r"compressed transports; \.npz and \.zarr"):
+            ltcl.save(tmp_path / name, compressed(device))
     with pytest.raises(InputTypeError, match="T is made of Dense"):
-        ltcl.save(tmp_path / "C.npz", plain)
+        ltcl.save(tmp_path / "C.npz", ltcl.Transport(Dense(device, np.eye(N)), GRID))
     assert not list(tmp_path.iterdir())
 
 
-def test_the_grid_is_part_of_it(device, tmp_path):
-    path = tmp_path / "C.npz"
-    ltcl.save(path, compressed(device))
-    assert ltcl.load(path, grid=GRID).grid == GRID
+# Either file of the fixture `saved`: the array that is replaced, or of None left out, and what is refused.
+ALIEN: list[tuple[str, str, Any, str]] = [
+    ("C", "grid", None, "'grid'"),
+    ("C", "system_0.sign", None, "1 channels, but there are 0 operators"),
+    ("C", "grid", np.array([5, 5]), "grid is 5 x 5 = 25 pixels"),
+    ("C", "grid", np.array([42]), r"grid has shape \(1,\)"),
+    ("C", "first_bounce", F[:2], r"first_bounce has shape \(2, 42\)"),
+    ("C", "first_bounce", np.full((1, N), np.nan), "'first_bounce' has 42 NaN"),
+    ("C", "system_0.R.core.data", np.full(3, np.inf), "data' has 3 NaN or infinite"),
+    ("C", "mixing", np.eye(3), "one channel"),
+    ("C", "columns_0", np.ones(3), r"d has shape \(3,\)"),
+    ("C", "format", np.array("ltcl-compressed-2"), "'format' is"),
+    ("C", "system_0.R.core.shape", np.array([1 << 62, 1 << 62]), "indptr has 43 entries"),
+    ("inverse", "errors", None, "'errors'"),
+    ("inverse", "grid", np.array([6, 8]), "grid is 6 x 8"),
+    ("inverse", "errors", np.array([0.1]), "must be 1 or 3"),
+    ("inverse", "confidence", np.array(2.0), "confidence is 2.0"),
+    ("inverse", "mixing", np.zeros((3, 3)), "mixing has the condition number"),
+    ("inverse", "system_1.sign", np.array(1.0), "I - A"),
+    ("inverse", "system_2.R.kind", np.array("magic"), "'magic'"),
+]
+
+
+@pytest.fixture(scope="module")
+def inverse() -> ltcl.Inverse:
+    scenes = [lambertian(N, rho, seed=3) for rho in (0.2, 0.5, 0.8)]
+    matrices, first_bounce = [scene.T for scene in scenes], np.stack([scene.F for scene in scenes])
+    T = ltcl.Transport(matrices, GRID, first_bounce=first_bounce, mixing=np.eye(3) + 0.1)
+    return ltcl.invert(T, 1e-2, basis="db2")
+
+
+@pytest.fixture
+def saved(device: Any, inverse: ltcl.Inverse, tmp_path: Path) -> Path:
+    """A folder of a compressed transport and of an inverse."""
+    ltcl.save(tmp_path / "C.npz", compressed(device))
+    ltcl.save_inverse(tmp_path / "inverse.npz", inverse)
+    return tmp_path
+
+
+LOAD: dict[str, Any] = {"C": ltcl.load, "inverse": ltcl.load_inverse}
+
+
+@pytest.mark.parametrize(("file", "name", "value", "text"), ALIEN)
+def test_arrays_that_do_not_fit(saved: Path, file: str, name: str, value: Any, text: str) -> None:
+    path = saved / f"{file}.npz"
+    with np.load(path) as archive:
+        arrays = {**archive, name: value}
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    with pytest.raises(FileError, match=text) as error:
+        LOAD[file](path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_one_is_not_the_other_and_each_has_its_grid(saved: Path, inverse: ltcl.Inverse) -> None:
+    with pytest.raises(FileError, match=r"inverse\.npz: .*load_inverse"):
+        ltcl.load(saved / "inverse.npz")
+    with pytest.raises(FileError, match=r"C\.npz: is no inverse"):
+        ltcl.load_inverse(saved / "C.npz")
+    with pytest.raises(FileError, match=r"extension is '\.npy'"):
+        ltcl.save_inverse(saved / "a.npy", inverse)
+    with pytest.raises(InputTypeError, match="inverse is a Transport"):
+        ltcl.save_inverse(saved / "a.npz", ltcl.load(saved / "C.npz"))  # pyright: ignore[reportArgumentType]
+    assert len(list(saved.iterdir())) == 2
+    assert ltcl.load(saved / "C.npz", grid=GRID).grid == GRID
     wrong: list[dict[str, Any]] = [{"grid": (7, 6)}, {"camera_grid": (1, N)}]
     for options in wrong:
-        with pytest.raises(FileError, match=r"compressed on its own, \(6, 7\)"):
-            ltcl.load(path, **options)
+        with pytest.raises(FileError, match=r"\(6, 7\)"):
+            ltcl.load(saved / "C.npz", **options)
+    columns = ltcl.load(saved / "C.npz", first_bounce=F[0])
+    assert columns.systems[0] is columns.matrices[0].A
 
 
-def _rewritten(device, tmp_path, **changes):
-    """A file of a compressed transport with some arrays replaced, or, of None, left out."""
-    path = tmp_path / "C.npz"
-    ltcl.save(path, compressed(device))
-    with np.load(path) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    arrays |= {name.replace("__", "."): value for name, value in changes.items()}
-    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
-    return path
+def test_the_same_inverse_comes_back(saved: Path, inverse: ltcl.Inverse) -> None:
+    again = ltcl.load_inverse(saved / "inverse.npz")
+    for attribute in ("grid", "channels", "errors", "confidence"):
+        assert getattr(again, attribute) == getattr(inverse, attribute)
+    for attribute in ("first_bounce", "mixing"):
+        np.testing.assert_array_equal(getattr(again, attribute), getattr(inverse, attribute))
+    desired = random.random((2, *GRID, 3))
+    np.testing.assert_array_equal(again.pattern(desired), inverse.pattern(desired))
+    assert [S.R.error for S in again.systems] == [S.R.error for S in inverse.systems]
 
 
-ALIEN = {
-    "no grid": ({"grid": None}, "'grid', which is missing"),
-    "no first bounce": ({"first_bounce": None}, "'first_bounce', which is missing"),
-    "no operators": ({"system_0__R__kind": None}, "'system_0.R.kind', which is missing"),
-    "no sign": ({"system_0__sign": None}, "1 channels, but there are 0 operators"),
-    "grid of others": ({"grid": np.array([5, 5])}, "grid is 5 x 5 = 25 pixels"),
-    "grid of one": ({"grid": np.array([42])}, r"grid has shape \(1,\)"),
-    "two channels": ({"first_bounce": F[:2]}, r"\(2, 42\); it must be \(1, N\) or \(3, N\)"),
-    "three channels": ({"first_bounce": F}, "3 channels, but there are 1 operators"),
-    "no numbers": ({"first_bounce": np.full((1, N), np.nan)}, "array 'first_bounce' has 42 NaN"),
-    "infinite values": ({"system_0__R__core__data": np.full(3, np.inf)}, "data' has 3 NaN or infinite"),
-    "mixing of grey": ({"mixing": np.eye(3)}, "T has one channel"),
-    "columns of others": ({"columns_0": np.ones(3)}, r"d has shape \(3,\)"),
-    "other layout": ({"format": np.array("ltcl-compressed-2")}, "the layout of the archive is"),
-    "column beyond": (
-        {"system_0__R__core__indices": np.array([99], np.int32), "system_0__R__core__data": np.ones(1)},
-        "the three must agree",
-    ),
-    "huge shape": ({"system_0__R__core__shape": np.array([1 << 62, 1 << 62])}, "indptr has 43 entries"),
-}
-
-
-@pytest.mark.parametrize("name", ALIEN)
-def test_files_that_do_not_fit_are_refused_in_one_line(device, tmp_path, name):
-    changes, part = ALIEN[name]
-    path = _rewritten(device, tmp_path, **changes)
-    with pytest.raises(FileError, match=part) as caught:
-        ltcl.load(path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
-
-
-def _mutants(array):
+def mutants(array: np.ndarray) -> Any:
     """The array with another shape, another type, and with values that lie."""
-    yield array.ravel()[:0]
-    yield np.append(array.ravel(), array.ravel()[-1:])
-    yield array[None]
+    yield from (array.ravel()[:0], np.append(array.ravel(), array.ravel()[-1:]), array[None])
     if array.dtype.kind in "US":
-        yield np.array("nothing")
-        yield np.array(3.0)
+        yield from (np.array("nothing"), np.array(3.0))
     elif array.size:
         yield np.full(array.shape, "a")
-        lies = (
-            (-1, 0, 1, 35, 200, 1 << 31, 1 << 62) if array.dtype.kind in "iu" else (-1.0, 0.0, 1e30, np.nan)
-        )
-        for value in lies:
+        integers, reals = (-1, 0, 1, 35, 200, 1 << 31, 1 << 62), (-1.0, 0.0, 1e30, np.nan)
+        for value in integers if array.dtype.kind in "iu" else reals:
             wide = np.result_type(array.dtype, np.min_scalar_type(value))
             changed = array.astype(wide if array.dtype.kind in "iu" else array.dtype)
             with np.errstate(over="ignore"):  # 1e30 is infinite in float16
@@ -209,28 +205,21 @@ def _mutants(array):
             yield changed
 
 
-def _lit(path):
-    """Why a file is refused; nothing where it is not, and gives pictures."""
-    try:
-        T = ltcl.load(path, on_dark="mask")
-    except LtclError as error:
-        return str(error)
-    assert (T @ np.ones(GRID)).shape == GRID
-    return ""
-
-
-@pytest.mark.parametrize("core", ["csr", "dense", "tiles"])
-def test_whatever_arrays_say_there_is_a_transport_or_one_line(device, tmp_path, core):
+@pytest.mark.parametrize("core", CORES)
+def test_whatever_arrays_say_there_is_a_transport_or_one_line(device: Any, tmp_path: Path, core: str) -> None:
     """No array is believed: kernels never see an index that is beyond."""
-    ltcl.save(tmp_path / "C.npz", compressed(device, core=core))
-    with np.load(tmp_path / "C.npz") as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    refused = 0
+    path, refusals = tmp_path / "C.npz", []
+    ltcl.save(path, compressed(device, core=core))
+    with np.load(path) as archive:
+        arrays = dict(archive)
     for name, array in arrays.items():
-        for number, mutant in enumerate(_mutants(array)):
-            path = tmp_path / f"{number}.npz"
+        for mutant in mutants(array):
             np.savez(path, **{**arrays, name: mutant})
-            text = _lit(path)
-            assert "\n" not in text, (name, number)
-            refused += bool(text)
-    assert refused > 3 * len(arrays)
+            try:
+                T = ltcl.load(path, on_dark="mask")
+            except LtclError as error:
+                refusals.append(str(error))
+            else:
+                assert (T @ np.ones(GRID)).shape == GRID
+    assert len(refusals) > 3 * len(arrays)
+    assert not [text for text in refusals if "\n" in text]

@@ -4,9 +4,7 @@
 graycode         patterns, and the coordinates that their photographs give
 subpixel         fractions of a pixel from the edges of stripes
 correspondence   the map; `decode` makes it from photographs
-measure          drives a projector and a camera through the patterns
-resample         photographs on the projector's grid, by area
-unmixing         projector pixels separated by smaller camera pixels
+resample         photographs on the projector's grid: its pixels separated by smaller camera pixels
 sharpness        how much of a pixel's light comes out at its neighbours
 """
 
@@ -14,8 +12,7 @@ from __future__ import annotations
 
 from ltcl.acquisition.geometry.correspondence import Correspondence, decode
 from ltcl.acquisition.geometry.graycode import GrayCode
-from ltcl.acquisition.geometry.measure import measure
 from ltcl.acquisition.geometry.resample import Resampling
 from ltcl.acquisition.geometry.sharpness import Sharpness
 
-__all__ = ["Correspondence", "GrayCode", "Resampling", "Sharpness", "decode", "measure"]
+__all__ = ["Correspondence", "GrayCode", "Resampling", "Sharpness", "decode"]

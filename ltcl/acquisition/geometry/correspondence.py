@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Which projector coordinates each camera pixel sees."""
+"""Which projector coordinates each camera pixel sees, from photographs of Gray code."""
 
 from __future__ import annotations
 
@@ -10,32 +10,21 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.geometry.graycode import Axis, GrayCode, consistent
+from ltcl.acquisition.geometry.graycode import GrayCode, consistent
 from ltcl.acquisition.geometry.subpixel import refine
 from ltcl.errors import InputError
+
+_DARK, _STEPS = 2e-3, 1.5  # least difference that counts, of the brightest pixel and of the camera's codes
 
 
 @dataclass(frozen=True)
 class Correspondence:
     """A map from camera pixels to projector coordinates.
 
-    Attributes
-    ----------
-    x, y : (H, W) float32
-        Column and row of the projector, in pixels, with pixel centres at integers; NaN where not valid.
-    confidence : (H, W) float32
-        In [0, 1]; 0 where not valid.
-    valid : (H, W) bool
-    grid : (h, w)
-        Of the projector.
+    `x`, `y` (H, W) float32: column and row of the projector's `grid` (h, w), in pixels with centres at
+    integers; NaN where not `valid` (H, W) bool. InputError for sizes that differ, and where a valid
+    coordinate is not finite.
 
-    Raises
-    ------
-    InputError
-        Sizes that differ, or a valid coordinate that is not finite.
-
-    Examples
-    --------
     >>> Correspondence.aligned((2, 3)).x
     array([[0., 1., 2.],
            [0., 1., 2.]], dtype=float32)
@@ -43,7 +32,6 @@ class Correspondence:
 
     x: np.ndarray
     y: np.ndarray
-    confidence: np.ndarray
     valid: np.ndarray
     grid: tuple[int, int]
 
@@ -53,26 +41,17 @@ class Correspondence:
         if valid.ndim != 2 or valid.size == 0:
             raise InputError(f"valid has shape {valid.shape}; it must be (H, W)")
         object.__setattr__(self, "valid", valid)
-        for name in ("x", "y", "confidence"):
+        for name in ("x", "y"):
             array = checks.shape(name, checks.real(name, getattr(self, name)), valid.shape)
             checks.finite(f"{name}[valid]", array[valid])
-            other = 0.0 if name == "confidence" else np.nan
-            object.__setattr__(self, name, np.where(valid, array, other).astype(np.float32))
+            object.__setattr__(self, name, np.where(valid, array, np.nan).astype(np.float32))
 
     @classmethod
     def aligned(cls, grid: tuple[int, int]) -> Correspondence:
         """The camera already on the projector's grid."""
         h, w = checks.grid("grid", grid)
         y, x = np.mgrid[:h, :w]
-        return cls(x, y, np.ones(grid), np.ones(grid, bool), (h, w))
-
-    @classmethod
-    def of(cls, x: Axis, y: Axis, grid: tuple[int, int]) -> Correspondence:
-        """Decoded coordinates, without those that are not fully known or do not fit their neighbours."""
-        valid = (x.width <= 2.0) & (y.width <= 2.0)
-        valid &= consistent(x.value, valid) & consistent(y.value, valid)
-        (column, fits), (row, also) = refine(x, valid, grid[1]), refine(y, valid, grid[0])
-        return cls(column, row, np.minimum(x.confidence, y.confidence), fits & also, grid)
+        return cls(x, y, np.ones(grid, bool), (h, w))
 
     @property
     def camera_grid(self) -> tuple[int, int]:
@@ -81,40 +60,30 @@ class Correspondence:
 
     @property
     def decoded(self) -> float:
-        """Part of the camera's pixels that are valid."""
+        """Fraction of the camera's pixels that are valid."""
         return float(self.valid.mean())
 
 
 def decode(
-    images: Sequence[Any],
-    grid: tuple[int, int],
-    *,
-    high_frequency: bool = False,
-    subpixel: bool = True,
+    images: Sequence[Any], grid: tuple[int, int], *, subpixel: bool = True, levels: int | None = None
 ) -> Correspondence:
-    """The map from photographs of Gray code, without a rig.
+    """The map from photographs (H, W) or (H, W, 3) of `GrayCode(grid).patterns()`, in that order.
 
-    Parameters
-    ----------
-    images : sequence of (H, W) or (H, W, 3)
-        Of `GrayCode(grid, high_frequency).patterns()`, in that order.
-    grid : (h, w)
-        Of the projector.
-    high_frequency : bool
-        As in `GrayCode`.
-    subpixel : bool
-        Fit planes through the edges of stripes; else coordinates are whole, or halves on edges.
+    They are linear or raw, all of one exposure. `subpixel`: fractions of a pixel (error 0.03) by planes
+    through the edges of stripes. Pixels that are not fully known or do not fit their neighbours are not
+    valid. `levels`: codes of the camera where images are floats; a difference of one code may be noise.
 
-    Raises
-    ------
-    InputError
-        Another number of photographs, mixed sizes, NaN; or white shows nothing that black does not.
+    InputError for another number of photographs, mixed sizes, NaN; white as dark as black; no valid pixel.
 
-    Examples
-    --------
     >>> decode(GrayCode((4, 6)).patterns(), (4, 6)).decoded
     1.0
     """
-    code = GrayCode(checks.grid("grid", grid), high_frequency)
-    x, y = code.decode(images, edges=checks.flag("subpixel", subpixel))
-    return Correspondence.of(x, y, code.grid)
+    code = GrayCode(checks.grid("grid", grid))
+    dark = max(_DARK, _STEPS / (levels - 1)) if levels else _DARK
+    x, y = code.decode(images, dark=dark, edges=checks.flag("subpixel", subpixel))
+    valid = (x.width <= 2.0) & (y.width <= 2.0)
+    valid &= consistent(x.value, valid) & consistent(y.value, valid)
+    if not valid.any():
+        raise InputError("photographs: no pixel is decoded; patterns must be in view, sharp, above the noise")
+    columns, rows = (refine(x, valid, grid[1]), refine(y, valid, grid[0])) if subpixel else (x.value, y.value)
+    return Correspondence(columns, rows, valid, code.grid)

@@ -1,37 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Light from the codes of a camera, and codes for the light of a projector.
 
-    stack        photographs of one scene at several exposures, checked
-    response     Response: from codes to linear light; calibrate: the response from photographs alone
-    noise        NoiseModel; estimate: from repeated photographs
-    merge        merge: photographs to Radiance, with its variance and what of it is valid
-    black        the camera's offset and the ambient light
-    projector    ProjectorResponse: from codes to the projector's light
-    colour       mixing of the projector's colours in the camera's
+    response     from codes to linear light, and its estimation from photographs alone
+    camera       photographs at several exposures; noise, from repeated ones; the level of black
+    merge        photographs to radiance, with its variance and what of it is valid
+    projector    from codes to the light of the projector, and how its colours mix
 
 A linear value is light on the sensor, 1 at the largest code; radiance is linear value per second.
 """
 
 from __future__ import annotations
 
-from ltcl.acquisition.radiometry import black, projector
-from ltcl.acquisition.radiometry.black import Black
-from ltcl.acquisition.radiometry.colour import mixing
+from ltcl.acquisition.radiometry.camera import NoiseModel, black_level, estimate
 from ltcl.acquisition.radiometry.merge import Radiance, merge
-from ltcl.acquisition.radiometry.noise import NoiseModel, estimate
-from ltcl.acquisition.radiometry.projector import ProjectorResponse
+from ltcl.acquisition.radiometry.projector import ProjectorResponse, mixing, projector_response
 from ltcl.acquisition.radiometry.response import Response, calibrate
 
 __all__ = [
-    "Black",
     "NoiseModel",
     "ProjectorResponse",
     "Radiance",
     "Response",
-    "black",
+    "black_level",
     "calibrate",
     "estimate",
     "merge",
     "mixing",
-    "projector",
+    "projector_response",
 ]

@@ -1,20 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Photographs at several exposures as one picture of radiance, with its variance and what of it is valid.
 
-The light f(code) - black = L t + noise of exposure k has a variance V(L t_k) that the noise model tells, so
+The light f(code) - black = L t + noise of exposure k has the variance V(L t_k) of the noise model, so
 
     L = sum_k w_k t_k light_k / sum_k w_k t_k^2,    w_k = 1 / V(L t_k),    variance = 1 / sum_k w_k t_k^2
 
 Weights of a noisy value itself would favour samples that came out low. So L is computed twice: as the sum of
-light over the sum of seconds, which is best where photons make the noise; then with the weights that this L
-predicts, and without exposures whose predicted value lies within 2 standard deviations of saturation or of
-the lowest code. An exposure left out by the merged value, not by its own, leaves no bias.
-
-Where no exposure is clear of both ends, all that are not saturated count. Known limit: there the camera has
-clipped the noise itself, and without light the mean is too high by up to 0.4 standard deviations of the
-longest exposure (a black offset of twice the read noise prevents it). A pixel is invalid, value 0 and
-variance infinite, where every photograph that is not saturated has the lowest code. Radiance is never
-clipped: without light it scatters about 0.
+light over the sum of seconds; then with the weights that this L predicts, and without exposures whose
+predicted value lies within 2 standard deviations of saturation or of the lowest code. Where all do, those
+that are not saturated count (known limit: there clipped noise makes the mean too high by up to 0.4 standard
+deviations); a pixel whose photographs are saturated or at the lowest code is invalid.
 """
 
 from __future__ import annotations
@@ -29,9 +24,8 @@ import cv2
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.radiometry.noise import NoiseModel
+from ltcl.acquisition.radiometry.camera import NoiseModel, Stack, stack
 from ltcl.acquisition.radiometry.response import Response
-from ltcl.acquisition.radiometry.stack import Stack, stack
 from ltcl.errors import InputError
 
 _MARGIN = 2.0  # standard deviations: clipping there moves a mean by less than a hundredth of one
@@ -42,16 +36,9 @@ _TINY = np.float32(1e-30)  # instead of a division by zero
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Radiance:
-    """Pictures (H, W) or (H, W, 3), as the photographs.
+    """Pictures (H, W) or (H, W, 3): linear sensor value per second, its variance, and where it is valid.
 
-    Attributes
-    ----------
-    value : array
-        float32, linear sensor value per second; 0 where invalid.
-    variance : array
-        float32, of value; infinite where invalid.
-    valid : array
-        bool.
+    float32, float32 and bool; where not valid, the value is 0 and the variance infinite.
     """
 
     value: np.ndarray
@@ -79,97 +66,68 @@ def merge(
 ) -> Radiance:
     """Merge photographs of one scene into radiance, by weights of the noise model.
 
-    Parameters
-    ----------
-    images : sequence of (H, W) or (H, W, 3)
-        One or more: uint8, uint16, or floats with 1 for the largest code; floats above it are saturated.
-    seconds : (K,)
-        Of each photograph, in any order; repeated exposures are averaged.
-    response : Response, optional
-        From codes to light; None for linear codes.
-    noise : NoiseModel, optional
-        None for one of 10000 electrons, a read noise of 0.002, and no black.
-    levels : int, optional
-        Codes of the camera, 4096 for 12 bits in uint16. None: the noise model's, or those of the type.
-    black : float or (channels,), optional
-        Linear value without light; None takes that of the noise model.
+    `images` (H, W) or (H, W, 3) are uint8, uint16, or floats with 1 for the largest code, in any order of
+    their `seconds`. `response` None: linear codes; `levels` (4096 for 12 bits in uint16) None: those of the
+    noise model or the type; `black`, a float or one a channel: linear value without light, None for that of
+    the noise model. InputError for mixed sizes or types, NaN, other seconds or levels, a longer exposure
+    that is not brighter; a response of three channels for grey photographs; a black of another shape.
 
-    Returns
-    -------
-    Radiance
-
-    Raises
-    ------
-    InputError
-        Mixed sizes or types, NaN, seconds that do not fit, levels that a photograph exceeds, a longer
-        exposure that is not brighter; a response of three channels for grey photographs; a black of another
-        shape.
-
-    Examples
-    --------
-    >>> light = np.array([[0.2, 0.02], [2.0, 400.0]])
-    >>> shots = [np.clip(light * t, 0, 1) for t in (0.1, 1.0)]
-    >>> merged = merge(shots, [0.1, 1.0])
-    >>> merged.value.round(4)
-    array([[0.2 , 0.02],
-           [2.  , 0.  ]], dtype=float32)
-    >>> merged.valid
-    array([[ True,  True],
-           [ True, False]])
+    >>> light = np.array([[0.2, 2.0, 400.0]])
+    >>> merged = merge([np.clip(light * t, 0, 1) for t in (0.1, 1.0)], [0.1, 1.0])
+    >>> merged.value.round(4).tolist(), merged.valid.tolist()
+    ([[0.20000000298023224, 2.0, 0.0]], [[True, True, False]])
     """
     response, noise = response or Response.identity(), noise or NoiseModel()
     bracket = stack(images, seconds, levels or noise.levels or None)
-    if response.channels == 3 and bracket.channels == 1:
+    pixels, channels = bracket.images[0].shape
+    if response.channels > channels:
         raise InputError("response has 3 channels, but images are grey; it must have one")
     offset = checks.finite("black", checks.real("black", noise.black if black is None else black))
-    checks.shape("black", offset, (), (bracket.channels,))
-    offset = np.broadcast_to(offset, (bracket.channels,)).astype(np.float32)
-    channels = [_Channel(bracket, response, noise, black, c) for c, black in enumerate(offset)]
-    shape = bracket.images[0].shape
-    merged = Radiance(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, bool))
-    planes = [plane.reshape(bracket.pixels, -1) for plane in (merged.value, merged.variance, merged.valid)]
+    checks.shape("black", offset, (), (channels,))
+    offset = np.broadcast_to(offset, (channels,)).astype(np.float32)
+    planes = [np.empty((pixels, channels), dtype) for dtype in (np.float32, np.float32, bool)]
+    mergers = [_Channel(bracket, response, noise, level, c) for c, level in enumerate(offset)]
 
     def run(block: tuple[int, int]) -> None:
-        pixels, c = slice(block[0], block[0] + _BLOCK), block[1]
-        for plane, values in zip(planes, channels[c](pixels), strict=True):
-            plane[pixels, c] = values
+        rows, c = slice(block[0], block[0] + _BLOCK), block[1]
+        for plane, values in zip(planes, mergers[c](rows), strict=True):
+            plane[rows, c] = values
 
-    blocks = [(start, c) for start in range(0, bracket.pixels, _BLOCK) for c in range(bracket.channels)]
+    blocks = [(start, c) for start in range(0, pixels, _BLOCK) for c in range(channels)]
     if len(blocks) == 1:  # a thread takes longer to start than a small picture to merge
         run(blocks[0])
     else:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             list(pool.map(run, blocks))
-    return merged
+    return Radiance(*(plane.reshape(bracket.shape) for plane in planes))
 
 
 class _Channel:
-    """Merges blocks of pixels of one channel. Arrays are (pixels,); tables are made once."""
+    """Merges blocks of pixels of one channel, arrays (pixels,), by tables that are made once."""
 
     def __init__(
         self, bracket: Stack, response: Response, noise: NoiseModel, black: np.float32, c: int
     ) -> None:
         self.response = Response(response.values[c % response.channels])
         self.black, self.saturation = black, np.float32(noise.saturation)
-        self.images = [image.reshape(bracket.pixels, -1)[:, c] for image in bracket.images]
+        self.images = [image[:, c] for image in bracket.images]
         self.t = [np.float32(t) for t in bracket.seconds]
-        integers = self.images[0].dtype.kind == "u"
-        self.table = self.response.linear(np.linspace(0.0, 1.0, bracket.levels)) if integers else None
+        self.table = self.response.linear(np.linspace(0.0, 1.0, max(bracket.levels, 2)))
         # Of whole codes the lowest is 0; floats have no end there.
-        self.lowest = float(self.response.linear(np.zeros(1))[0]) if bracket.levels else -np.inf
+        self.lowest = self.table[0] if bracket.levels else np.float32(-np.inf)
         x = np.linspace(0.0, 1.0, _VALUES)
         slope = self.response.derivative(self.response.codes(x + black))
         variance = replace(noise, levels=bracket.levels).variance(x, slope)
         self.weights = (1.0 / variance).astype(np.float32)  # of the value x above black
-        margin = _MARGIN * np.sqrt(variance[[0, -1]]).astype(np.float32)
+        low, high = _MARGIN * np.sqrt(variance[[0, -1]]).astype(np.float32)
         # Values above black whose noise is clipped at neither end.
-        self.clear = self.lowest + margin[0] - black, self.saturation - margin[1] - black
+        self.clear = self.lowest + low - black, self.saturation - high - black
 
     def __call__(self, pixels: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Value, variance and validity of some pixels."""
         light = [self._linear(image[pixels]) for image in self.images]
         unsaturated = [value <= self.saturation for value in light]
-        dark = [value <= np.float32(self.lowest) for value in light]
+        dark = [value <= self.lowest for value in light]
         light = [(value - self.black) * usable for value, usable in zip(light, unsaturated, strict=True)]
         time = sum(s * t for s, t in zip(unsaturated, self.t, strict=True))
         pilot = sum(light) / np.maximum(time, _TINY)
@@ -189,7 +147,7 @@ class _Channel:
 
     def _linear(self, codes: np.ndarray) -> np.ndarray:
         """Linear values, black still in them."""
-        if self.table is None:
+        if codes.dtype.kind == "f":
             return self.response.linear(codes)
         if codes.dtype == np.uint8 and len(self.table) == 256:
             return cv2.LUT(np.ascontiguousarray(codes), self.table).ravel()

@@ -6,13 +6,11 @@ f is a monotone cubic spline, 0 without light and 1 at the largest code; f and a
 
     sum_pk w_pk (f(c_pk) - L_p t_k)^2,    w_pk = 1 / variance(L_p t_k)
 
-L_p is eliminated, which leaves a quadratic form in the coefficients of f. After the first round the form is
+L_p is eliminated, which leaves a quadratic form in the coefficients of f. After the first round it is
 linearised about the codes c' that f and L_p predict, f(c) = f(c') + f'(c') (c - c') (Gauss-Newton), so that
-noise of the codes neither flattens the curve nor selects the weights. Exposures whose prediction lies within
-the noise of either end take no part; what moved is weighted down by Tukey's biweight.
-
-Known limit: two exposures, or exposures that are all powers of one ratio, do not separate f from f times a
-wobble of that period in log f; only smoothness does. Ratios such as 2, 3, 2, 3 are better than 4, 4, 4.
+noise of the codes does not flatten the curve. Exposures whose prediction lies within the noise of either end
+do not count; what moved is weighted down by Tukey's biweight. Known limit: exposures in equal ratios do not
+separate f from f times a wobble of that period in log f; ratios of 2, 3, 2, 3 are better than 4, 4, 4.
 """
 
 from __future__ import annotations
@@ -27,20 +25,19 @@ import scipy.optimize
 from scipy.interpolate import BSpline
 
 from ltcl import checks
-from ltcl.acquisition.radiometry.noise import NoiseModel
-from ltcl.acquisition.radiometry.stack import BLACK, NO_LIGHT, Stack, stack
+from ltcl.acquisition.radiometry.camera import BLACK, MOST, NO_LIGHT, NoiseModel, Stack, stack
 from ltcl.errors import InputError
 
 _TABLE, _FINE = 4097, 2049  # codes of the result; of the table that inverts it: 1/8 code of 8 bits
 # In brackets: the error of an sRGB camera's curve, from 0.02 to 0.9 of full scale, measured.
 _SAMPLES, _LEAST = 4096, 50  # pixels of a channel (1024: 0.14 %, 4096: 0.08 %); at least two an unknown
-_BINS = 64  # of brightness, which take part alike (16 to 128: 0.09 %)
+_BINS = 64  # of brightness, which have equal shares (16 to 128: 0.09 %)
 _ROUNDS = 8  # of reweighting (5: 0.09 %, 8 to 20: 0.08 %)
 _SMOOTH = 300.0  # weight of a relative change of slope by 1, in units of noise (30: 0.11 %, 1000: 0.07 %)
 _MARGIN = 2.5  # standard deviations that a prediction keeps from the ends (1: 0.08 %, 4: 0.09 %)
 _TUKEY = 5.0  # standard deviations at which a residual counts no more (3: 0.17 %, 8: 0.07 %)
 _DEGREE, _INTERVALS = 3, 24  # of the spline: it fits the curves of sRGB and of film to 4e-5
-_RISE = 1e-7  # least step of a coefficient over the one before: strictly monotone
+_RISE, _RIDGE = 1e-7, 1e-12  # least step between coefficients, of a strictly monotone curve; rounding errors
 
 # Knots lie closer at both ends, as toe and shoulder of a film curve need. With coefficients that never fall a
 # B-spline never falls. With coefficients _PLACES (Greville's abscissae) the curve is the identity.
@@ -51,24 +48,11 @@ _PLACES = np.lib.stride_tricks.sliding_window_view(_KNOTS[1:-1], _DEGREE).mean(a
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Response:
-    """Tables from codes in [0, 1] to linear sensor values.
+    """Tables (1, n) or (3, n) from n equally spaced codes in [0, 1] to linear sensor values, float64.
 
-    A table of n values stands for n equally spaced codes and is linear between and beyond them; nothing is
-    clipped. Tables of `calibrate` are 0 without light, so that a black offset makes their first values
-    negative.
+    A table never falls; it is linear between and beyond its codes. Those of `calibrate` are 0 without light,
+    their first values negative. InputError for other shapes, NaN, and a table that falls or never rises.
 
-    Attributes
-    ----------
-    values : (1, n) or (3, n)
-        float64, never falling, n at least 2; one table serves all channels.
-
-    Raises
-    ------
-    InputError
-        Another shape, NaN, a table that falls or never rises.
-
-    Examples
-    --------
     >>> gamma = Response(np.linspace(0, 1, 257) ** 2.0)
     >>> gamma.linear(np.array([[0.0, 0.5, 1.0]]))
     array([[0.  , 0.25, 1.  ]], dtype=float32)
@@ -101,24 +85,15 @@ class Response:
 
     def linear(self, image: Any) -> np.ndarray:
         """Linear sensor values of codes (..., [3]) in [0, 1]; float32, same shape."""
-
-        def value(codes: np.ndarray, table: np.ndarray) -> np.ndarray:
-            i, fraction = _interval(codes, table)
-            return table[i] + fraction * np.diff(table)[i]
-
-        return self._by_channel(image, value)
+        return self._by_channel(image, lambda codes, table: _interpolate(codes, table)[0])
 
     def derivative(self, image: Any) -> np.ndarray:
         """Linear value per code, at codes (..., [3]) in [0, 1]; float32, same shape."""
-        return self._by_channel(
-            image, lambda codes, table: (np.diff(table) * (len(table) - 1))[_interval(codes, table)[0]]
-        )
+        return self._by_channel(image, lambda codes, table: (len(table) - 1) * _interpolate(codes, table)[1])
 
     def codes(self, linear: Any) -> np.ndarray:
         """Codes (..., [3]) that have these linear values, within [0, 1]; float32, same shape."""
-        return self._by_channel(
-            linear, lambda light, table: np.interp(light, table, np.linspace(0.0, 1.0, len(table)))
-        )
+        return self._by_channel(linear, lambda x, table: np.interp(x, table, np.linspace(0, 1, len(table))))
 
     def _by_channel(self, image: Any, function: Any) -> np.ndarray:
         array = checks.real("image", image)
@@ -128,15 +103,16 @@ class Response:
             return np.asarray(function(array, self.values[0]), np.float32).reshape(array.shape)
         if array.shape[-1:] != (3,):
             raise InputError(f"image has shape {array.shape}; this response needs (..., 3)")
-        parts = [function(array[..., c], table) for c, table in enumerate(self.values)]
-        return np.stack(parts, axis=-1).astype(np.float32)
+        channels = [function(array[..., c], table) for c, table in enumerate(self.values)]
+        return np.stack(channels, axis=-1).astype(np.float32)
 
 
-def _interval(codes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The interval of the table that each code lies in, and where in it; beyond the ends outside [0, 1]."""
+def _interpolate(codes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value at codes, which may lie beyond the ends of the table, and how much it rises in their interval."""
     place = np.asarray(codes, np.float64) * (len(table) - 1)
     i = np.clip(place.astype(np.int32), 0, len(table) - 2)
-    return i, place - i
+    rise = np.diff(table)[i]
+    return table[i] + (place - i) * rise, rise
 
 
 def calibrate(
@@ -144,30 +120,10 @@ def calibrate(
 ) -> Response:
     """Estimate the camera's response from one scene at two exposures or more; four to eight are better.
 
-    Parameters
-    ----------
-    images : sequence of (H, W) or (H, W, 3)
-        uint8, uint16, or floats in [0, 1]; nothing may move between them. Pixels from black to white
-        determine it best: photographs under a black projector may be stacked next to those under a white one.
-    seconds : (K,)
-        Of each photograph, in any order.
-    levels : int, optional
-        Codes of the camera: 4096 for 12 bits in uint16. None: 256 or 65536 by the type, 0 of floats.
-    saturation : float
-        Codes above are not used, as fractions of the largest.
+    Photographs are as in `merge`, of a scene from black to white. Codes above `saturation` are not used. The
+    response has 4097 values a channel, 1 at the largest code and 0 without light. InputError for what `merge`
+    refuses, one exposure only, and too few pixels that are seen at two exposures.
 
-    Returns
-    -------
-    Response
-        4097 values a channel, 1 at the largest code and 0 without light.
-
-    Raises
-    ------
-    InputError
-        What `merge` refuses; one exposure only; too few pixels that are seen at two exposures.
-
-    Examples
-    --------
     >>> light = np.linspace(0.002, 0.9, 10000).reshape(100, 100)
     >>> seconds = [0.1, 0.2, 0.6, 1.2]
     >>> shots = [np.rint(255 * np.clip(light * t, 0, 1) ** 0.5).astype(np.uint8) for t in seconds]
@@ -176,38 +132,45 @@ def calibrate(
     """
     bracket = stack(images, seconds, levels)
     if bracket.seconds[0] == bracket.seconds[-1]:
-        raise InputError(
-            f"seconds is {seconds!r}: a response needs photographs at two different exposures at least"
-        )
+        raise InputError(f"seconds is {seconds!r}; it must hold at least two different exposures")
     checks.number("saturation", saturation, above=0.0, most=1.0)
-    curves = [_fit(_samples(bracket, c), bracket, saturation) for c in range(bracket.channels)]
+    codes = np.moveaxis(bracket.codes(MOST), -1, 0)
+    curves = [_fit(_samples(channel), bracket, saturation) for channel in codes]
     return Response(np.stack([_tabulate(theta, _TABLE) for theta in curves]))
 
 
-def _samples(bracket: Stack, channel: int) -> np.ndarray:
-    """Codes (K, P) of pixels that are spread over all levels of brightness."""
-    codes = np.stack([bracket.codes(k)[:, channel] for k in range(len(bracket.images))])
+def _samples(codes: np.ndarray) -> np.ndarray:
+    """Codes (K, P) of random pixels that are spread over all levels of brightness."""
     brightness = codes.mean(axis=0)
-    order = np.random.default_rng(0).permutation(brightness.size)
     low, high = brightness.min(), brightness.max()
-    bins = ((brightness[order] - low) * (_BINS / (high - low + 1e-9))).astype(int)
-    order = order[np.argsort(bins, kind="stable")]
-    place = np.sort(bins)
-    # The n-th pixel of its bin: all bins give their first ones until there are enough.
-    turn = np.arange(len(place)) - np.searchsorted(place, place)
-    return codes[:, order[np.argsort(turn, kind="stable")[:_SAMPLES]]].astype(np.float64)
+    bins = ((brightness - low) * (_BINS / (high - low + 1e-9))).astype(int)
+    # Weighted sampling without replacement (Efraimidis and Spirakis 2006), by 1 / size of a pixel's bin.
+    keys = np.random.default_rng(0).exponential(size=len(bins)) * np.bincount(bins)[bins]
+    return codes[:, np.argsort(keys)[:_SAMPLES]].astype(np.float64)
 
 
 def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
     """Coefficients of the curve of one channel, from its codes (K, P)."""
     t, grid = bracket.seconds[:, None], np.linspace(0.0, 1.0, _FINE)
     usable = (codes <= saturation) & (codes > (0.5 / (bracket.levels - 1) if bracket.levels else 0.0))
-    _check_seen(usable, t, float(codes.max()))
+    seen = int(np.count_nonzero((usable * t).max(axis=0) > np.where(usable, t, np.inf).min(axis=0)))
+    if codes.max() < BLACK:
+        raise InputError(f"images are black, with {codes.max():.1%} of full scale at most: {NO_LIGHT}")
+    if seen < _LEAST:
+        raise InputError(
+            f"images have {seen} sampled pixel(s) that are neither black nor saturated at two exposures; "
+            f"there must be {_LEAST}: take exposures closer to each other, or a scene with more between"
+        )
     noise = NoiseModel(levels=bracket.levels)
     # Weights of a first round: errors of 5 % of the code, and of a thousandth of full scale.
     theta, weight = _PLACES, usable / (0.05 * (0.02 + codes)) ** 2
     near, offset = codes, np.zeros_like(codes)  # codes c' to linearise about; f'(c') (c - c')
     for _ in range(_ROUNDS):
+        if not np.any(weight > 0):
+            raise InputError(
+                "images determine no response: no pixel grows with the seconds as light does; exposures of "
+                "the camera must be as listed, and the scene must be lit"
+            )
         theta = _solve(theta, weight, near, offset, t)
         table = _tabulate(theta, _FINE)
         light = np.interp(near, grid, table) + offset
@@ -225,32 +188,14 @@ def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
     return theta
 
 
-def _check_seen(usable: np.ndarray, t: np.ndarray, most: float) -> None:
-    """Refuse where hardly a pixel is seen at two exposures."""
-    seen = int(np.count_nonzero((usable * t).max(axis=0) > np.where(usable, t, np.inf).min(axis=0)))
-    if seen < _LEAST:
-        _refuse_black(most)
-        raise InputError(
-            f"images have {seen} sampled pixel(s) that are neither black nor saturated at two exposures; "
-            f"there must be {_LEAST}: take exposures closer to each other, or a scene with more between"
-        )
-
-
-def _refuse_black(most: float) -> None:
-    if most < BLACK:
-        raise InputError(f"images are black, with {most:.1%} of full scale at most: {NO_LIGHT}")
-
-
 def _solve(
     theta: np.ndarray, w: np.ndarray, near: np.ndarray, offset: np.ndarray, t: np.ndarray
 ) -> np.ndarray:
-    """The curve that is best with all L_p free: L_p = sum_k w t (f + offset) / sum_k w t^2."""
-    if not np.any(w > 0):
-        _refuse_black(float(near.max()))
-        raise InputError(
-            "images determine no response: no pixel grows with the seconds as light does; the exposure of "
-            "the camera must be what was asked for, and the scene must be lit"
-        )
+    """The monotone curve that is best with all L_p free: L_p = sum_k w t (f + offset) / sum_k w t^2.
+
+    It minimises theta^T M theta + 2 v^T theta, and keeps its value at one code: scaled at the code 1, where
+    hardly any pixel determines the curve, it would have a jump there.
+    """
     B = _design(near.ravel())
     C = ((w * t)[:, :, None] * B.reshape(*near.shape, _SIZE)).sum(axis=0)
     inverse = 1.0 / np.maximum((w * t**2).sum(axis=0), 1e-300)
@@ -260,27 +205,17 @@ def _solve(
     slopes = np.diff(np.eye(_SIZE), axis=0) / np.diff(_PLACES)[:, None]
     size = np.maximum(slopes @ theta, 1e-3)
     D = np.diff(slopes, axis=0) / np.minimum(size[1:], size[:-1])[:, None]
-    anchor = np.quantile(near[w > 0], [0.75])
-    return _monotone(M + _SMOOTH * D.T @ D, v, anchor, float((_design(anchor) @ theta)[0]))
-
-
-def _monotone(M: np.ndarray, v: np.ndarray, anchor: np.ndarray, value: float) -> np.ndarray:
-    """Minimise theta^T M theta + 2 v^T theta over monotone curves that are `value` at the code `anchor`.
-
-    A non-negative least squares problem in the steps between coefficients. The curve is scaled to 1 at the
-    code 1 afterwards: a scale set there, where hardly any pixel determines the curve, would be bought by a
-    jump at the end.
-    """
-    # theta = value + P d: P d sums the steps up to each coefficient, less the curve of that at the anchor.
-    P = np.tril(np.ones((_SIZE, _SIZE)), -1)[:, :-1]
-    P = P - _design(anchor) @ P
-    H, g = P.T @ M @ P, -P.T @ (M @ np.full(_SIZE, value) + v)
-    g = g - H @ np.full(_SIZE - 1, _RISE)
+    M = M + _SMOOTH * D.T @ D
+    # Non-negative least squares in steps d between coefficients, theta = value + P d.
+    anchor = _design(np.quantile(near[w > 0], [0.75]))
+    value, P = float((anchor @ theta)[0]), np.tril(np.ones((_SIZE, _SIZE)), -1)[:, :-1]
+    P = P - anchor @ P
+    H = P.T @ M @ P
+    g = -P.T @ (M @ np.full(_SIZE, value) + v) - H @ np.full(_SIZE - 1, _RISE)
     scale = 1.0 / np.sqrt(np.diagonal(H))
-    # NumPy's has OpenBLAS start threads for these few numbers: 0.05 ms become 20 where the cores are busy.
-    values, vectors = scipy.linalg.eigh(H * scale * scale[:, None])
-    root = np.sqrt(np.maximum(values, values[-1] * 1e-14))
-    steps, _ = scipy.optimize.nnls(root[:, None] * vectors.T, (vectors.T @ (g * scale)) / root, maxiter=1000)
+    root = scipy.linalg.cholesky(H * scale * scale[:, None] + _RIDGE * np.eye(_SIZE - 1))
+    right = scipy.linalg.solve_triangular(root, g * scale, trans=1)
+    steps, _ = scipy.optimize.nnls(root, right, maxiter=1000)
     theta = value + P @ (steps * scale + _RISE)
     return theta / theta[-1]
 
@@ -296,13 +231,14 @@ def _tabulate(theta: np.ndarray, count: int) -> np.ndarray:
 
 def _noise_of(residual: np.ndarray, x: np.ndarray, slope: np.ndarray, noise: NoiseModel) -> NoiseModel:
     """Electrons and read noise that explain the residuals, by their median size in 16 bins of light."""
-    parts = [part for part in np.array_split(np.argsort(x), 16) if len(part) > 10]
-    if len(parts) < 2:
+    bins = [places for places in np.array_split(np.argsort(x), 16) if len(places) > 10]
+    if len(bins) < 2:
         return noise
     # The median of |normal values| is 0.6745 standard deviations, 1 / 1.4826.
-    spread = np.array([(1.4826 * np.median(np.abs(residual[part]))) ** 2 for part in parts])
-    light = np.array([max(x[part].mean(), 0.0) for part in parts])
-    rounding = np.array([np.mean(noise.rounding(slope[part])) for part in parts])
+    spread = np.array([(1.4826 * np.median(np.abs(residual[places]))) ** 2 for places in bins])
+    light = np.array([max(x[places].mean(), 0.0) for places in bins])
+    code = 1.0 / (noise.levels - 1) if noise.levels > 1 else 0.0
+    rounding = np.array([np.mean(slope[places] ** 2) for places in bins]) * code**2 / 12.0
     spread = np.maximum(spread, rounding + 1e-12)
     columns = np.stack([light, np.ones_like(light)], axis=1) / spread[:, None]
     (gain, floor), _ = scipy.optimize.nnls(columns, (spread - rounding) / spread)

@@ -1,113 +1,96 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`LiveRig`: a camera on a cable photographs what a display shows.
 
-Before the first photograph `survey` measures latency and noise, and refuses a camera that adapts. Later each
-photograph must be as bright as an earlier one of the same codes and seconds, and each frame is checked:
+Frames are compared by the means of square cells, about 64 along the shorter side: fine enough for a torn
+strip or a single bright spot, coarse enough to average noise. Before the first photograph is measured:
 
-    wait        as long as the slowest flash of the survey took, and a margin; what comes is dropped
-    steady?     two frames in a row must be the same but for noise: no half-changed (torn) one passes
-    fresh?      where codes or exposure changed and the frame did not, or both changed, it may be an old one:
-                a flash, white or black, is shown in between and must be seen to come and to go
+    exposure    at most 1/15 s, halved until white saturates less than a hundredth of the cells
+    noise       the largest change of a cell between frames of the same picture, black and white
+    dimming     a strip of white, then all white: no cell may get darker, as by a fast automatic exposure
+    latency     from a flash until all but a hundredth of the cells show it, to a tenth of the contrast
+    drift       of the mean, right after a flash and a while later, by a slow automatic exposure or white
+                balance; later also between photographs of the same codes and seconds
 
-A frame that fails is taken again, some times, then refused by the photograph's number. An old frame passes
-only where the camera could not distinguish it from the right one.
+    steady?     After that time two frames in a row must be the same but for noise, none half-changed (torn).
+    fresh?      Where codes or exposure changed and the frame did not, or both changed, it may be an old one:
+                a flash, blocks at random, is shown in between and must be seen to come and to go.
 
 Most projectors show colours one after the other, or switch mirrors, within each picture. An exposure of n + f
-periods, 0 < f < 1, catches a part of one period that depends on when it begins: up to f / (n + f) of white
-light, three times that of a colour that is shown a third of the time. So exposures are offered only where the
-nearest whole number of periods is within 2 % of them, as it is of all long ones.
+periods, 0 < f < 1, catches up to f / (n + f) more or less of white light, three times that of a colour shown
+a third of the time. So exposures are offered only within 2 % of a whole number of periods.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-from dataclasses import asdict
-from typing import Any
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.fingerprint import shot_key
-from ltcl.acquisition.rig import (
-    LONGEST,
-    SHORTEST,
-    as_codes,
-    as_seconds,
-    check_photograph,
-    exact,
-    require_members,
-    to_unit,
-)
-from ltcl.acquisition.rigs.survey import (
-    BRIGHT,
-    Frame,
-    Stage,
-    Survey,
-    cells,
-    change,
-    drift,
-    is_saturated,
-    survey,
-)
+from ltcl.acquisition import rig
+from ltcl.acquisition.rig import Closing, as_codes, exact, require_members, shot_key, to_unit
 from ltcl.errors import AcquisitionError, InputError
 
 _log = logging.getLogger(__name__)
-_USUAL = 1 / 15  # seconds: the survey begins no longer than that
-_TRIALS = 6  # exposures for the survey, each half the one before
+_ACROSS = 64  # cells
+_USUAL, _TRIALS = 1 / 15, 6  # seconds of the longest exposure that is tried; exposures that are
+_FRAMES, _FLASHES = 6, 4  # of the same picture; to white, and as many to black
+_ARRIVED, _OUTLIERS = 0.1, 0.01  # difference from a flash, of white; share of cells that may differ more
+_SAFETY = 1.5  # over the largest noise that was seen in some ten thousand differences
+_STEP = 1 / 255  # a code of the coarsest camera: changes below are none
+_VISIBLE = 4.0  # times the noise: what must be seen
+_FLICKER = 0.1  # of full scale: more noise than that
+_BRIGHT = 0.98  # of full scale: here a pixel may hold no more
 _DIM = 0.1  # of full scale: brightness is compared relative to that at least
-_BROKEN = 0.02  # of an exposure, beside whole periods
+_MARGIN = 0.02  # seconds to wait beyond the slowest flash
+_TRIES = 6  # frames before a photograph is refused
 _TWINS = 3  # frames without any difference before a camera counts as free of noise
-_PLAIN = 4.0  # times the tolerance: what must be seen
-_STEPS = (1, 2, 3, 4, 6, 8, 12, 16)  # periods, about half a stop apart, then doubled on and on
+_FRACTION = 0.02  # of an exposure, which is no whole period
+_PERIODS = sorted(count << k for count in (1, 3) for k in range(20))  # of an exposure: 1, 2, 3, 4, 6, 8, 12
 
 
-class LiveRig(contextlib.AbstractContextManager):
-    """A camera and a display.
+class Frame(NamedTuple):
+    """A frame as the camera gave it, its cells, and when it came or its shutter opened."""
 
-    Parameters
-    ----------
-    camera : object
-        `OpenCVCamera`, `GPhoto2Camera`, or any with `channels`, 1 or 3; `stream`, whether frames come by
-        themselves and may wait in a queue; `expose(seconds)`; and `frame()`, uint8, uint16 or float, (H, W)
-        or (H, W, 3). Used where it has them: `exposures`, seconds, ascending (else any within `limits`, else
-        1e-4 to 30); `bits` of uint16 (else 16); `describe()`, a dict of plain JSON; `close()`.
-    display : object
-        `Display`, or any with `grid`, `period` and `show(codes)`.
-    period : "display", float or None
-        Seconds of one picture of the projector: only multiples of it are offered as `exposures`. "display":
-        as its driver says. None: the projector's light is steady (LCD, LCoS), and any exposure will do.
-    margin : float
-        Seconds to wait beyond the slowest flash.
-    drift : float
-        Largest relative difference of brightness between identical shots, in excess of noise.
-    retakes : int
-        Further frames before a photograph is refused.
-    flashes : int
-        For the latency, half of them to white.
-    patience : float
-        Seconds within which everything is at rest; no latency may be longer.
+    codes: np.ndarray  # (H, W) or (H, W, 3)
+    cells: np.ndarray  # (a, b, channels) float32, of full scale
+    waited: float  # seconds since the last change
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the tests measured; of full scale where nothing else is said."""
+
+    latency: float  # the most seconds from a change to its first frame
+    seconds: float  # exposure of the tests
+    tolerance: float  # change of a cell that noise explains
+    contrast: float  # largest difference of a cell between white and black
+    drift: float  # relative change of the brightness between identical frames
+
+
+class LiveRig(Closing):
+    """A camera and a display; `survey` is what their tests measured, None before the first photograph.
+
+    A camera is `OpenCVCamera`, `GPhoto2Camera`, or any with `channels`, 1 or 3; `stream`, whether frames come
+    by themselves and may wait in a queue; `expose(seconds)`; and `frame()`, uint8, uint16 or float, (H, W) or
+    (H, W, 3). Used where it has them: `exposures`, seconds, ascending (else any within `limits`, else 1e-4 to
+    30); `bits` of uint16 (else 16); `describe()`, a dict of plain JSON; `close()`. A display is `Display`, or
+    any with `grid`, `period` and `show(codes)`.
+
+    `period` is that of the projector's pictures, whose multiples are offered as `exposures`: seconds, as the
+    "display" says, or None for steady light (LCD, LCoS). `drift` is the largest relative difference of
+    brightness between identical shots. Within `patience` seconds everything is at rest.
 
     Examples
     --------
-    A camera that sees the display as it is, without latency or noise:
-
-    >>> class Screen:
-    ...     grid, period = (2, 2), None
-    ...
-    ...     def show(self, codes):
-    ...         self.codes = codes
-    >>> class Eye:
-    ...     channels, stream, exposures = 1, False, (0.01,)
-    ...
-    ...     def expose(self, seconds): ...
-    ...     def frame(self):
-    ...         return np.rint(screen.codes * 200).astype(np.uint8)
-    >>> screen = Screen()
-    >>> rig = LiveRig(Eye(), screen, patience=0.01)
-    >>> rig.photograph(np.eye(2), 0.01)
-    array([[200,   0],
-           [  0, 200]], dtype=uint8)
+    >>> LiveRig(camera=0, display=1)
+    Traceback (most recent call last):
+    ltcl.errors.InputTypeError: camera is a int without channels, stream, expose, frame
     """
 
     def __init__(
@@ -116,10 +99,7 @@ class LiveRig(contextlib.AbstractContextManager):
         display: Any,
         *,
         period: str | float | None = "display",
-        margin: float = 0.02,
         drift: float = 0.02,
-        retakes: int = 5,
-        flashes: int = 8,
         patience: float = 1.0,
     ) -> None:
         require_members("camera", camera, "channels", "stream", "expose", "frame")
@@ -127,49 +107,45 @@ class LiveRig(contextlib.AbstractContextManager):
         self.projector_grid = checks.grid("display.grid", display.grid)
         self.channels = checks.one_of("camera.channels", camera.channels, (1, 3))
         self.bits = getattr(camera, "bits", None)
+        self.exposures = getattr(camera, "exposures", None)
         if period == "display" and display.period is None:
             _log.warning("the display has no known period: exposures are not checked for whole periods")
         period = display.period if period == "display" else period
         self._period = None if period is None else checks.number("period", period, above=0.0, most=1.0)
-        self.exposures = getattr(camera, "exposures", None)
         if self._period is not None:
-            limits = getattr(camera, "limits", (SHORTEST, LONGEST))
+            limits = getattr(camera, "limits", (rig.SHORTEST, rig.LONGEST))
             self.exposures = _whole_periods(self.exposures, self._period, limits)
-        self._margin = checks.number("margin", margin, least=0.0, most=10.0)
         self._drift = checks.number("drift", drift, above=0.0, below=1.0)
-        self._retakes = checks.count("retakes", retakes, least=0)
-        self._flashes = checks.count("flashes", flashes, least=2)
         self._patience = checks.number("patience", patience, above=0.0, most=60.0)
-        self._stage = Stage(camera, display)
-        self._freshness: Freshness | None = None
+        self._camera, self._display = camera, display
+        self.survey: Survey | None = None
+        self._seconds = 0.0  # of exposure, once set
+        self._changed = -float("inf")
+        self._first: tuple[tuple[int, ...], np.dtype] | None = None
         self._count = 0
         self._brightness: dict[str, np.ndarray] = {}
+        self._shown: np.ndarray | None = None
+        self._last: Frame | None = None
+        self._latency = 0.0
+        self._random = np.random.default_rng(0)
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
         """What the camera gives under `codes`, (h, w) or (h, w, 3) in [0, 1], checked: as `camera.frame()`.
 
-        InputError for unusable codes or seconds; AcquisitionError where the camera is gone, adapts, drifts,
-        or shows old or half-changed frames: the number of the photograph and the figure are named.
+        AcquisitionError, with the photograph's number, where the camera is gone, adapts, drifts, or shows old
+        or half-changed frames.
         """
         codes, seconds = self._validate(codes, seconds)
         try:
-            if self._freshness is None:
-                measured = survey(
-                    self._stage,
-                    self._survey_exposure(),
-                    flashes=self._flashes,
-                    patience=self._patience,
-                    accepted=self._drift,
-                )
-                _log.info("%s", measured)
-                self._freshness = Freshness(self._stage, measured, self._margin, self._retakes)
-            frame = self._freshness.frame(codes, seconds)
+            if self.survey is None:
+                self.survey = self._measure()
+                self._latency = self.survey.latency
+            frame = self._fresh(codes, seconds, self.survey)
             mean = frame.cells.mean(axis=(0, 1))
             before = self._brightness.setdefault(shot_key(codes, seconds), mean)
-            relative, beyond = drift(mean, before, _DIM, self._freshness.survey.noise)
-            if beyond > self._drift:
+            if (drift := _drift(mean, before, _DIM)) > self._drift:
                 raise AcquisitionError(
-                    f"brightness deviates by {relative:.1%} from an earlier one of the same codes and "
+                    f"brightness deviates by {drift:.1%} from an earlier one of the same codes and "
                     f"seconds, drift={self._drift:g}: camera, projector or the light of the room drifts"
                 )
         except AcquisitionError as error:
@@ -179,21 +155,14 @@ class LiveRig(contextlib.AbstractContextManager):
 
     def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
         """Remember a photograph of an earlier session: one of the same shot must be as bright."""
-        codes, seconds = self._validate(codes, seconds)
-        check_photograph("image", image, self.channels)
-        brightness = cells(to_unit("image", image, self._stage.camera)).mean(axis=(0, 1))
-        self._brightness.setdefault(shot_key(codes, seconds), brightness)
+        key = shot_key(*self._validate(codes, seconds))
+        self._brightness.setdefault(key, _cells(to_unit("image", image, self)).mean(axis=(0, 1)))
         self._count += 1
-
-    @property
-    def survey(self) -> Survey | None:
-        """What was measured; None before the first photograph."""
-        return None if self._freshness is None else self._freshness.survey
 
     def describe(self) -> dict[str, Any]:
         """The rig as plain JSON."""
-        parts = (self._stage.camera, self._stage.display)
-        camera, display = (getattr(p, "describe", lambda p=p: {"kind": type(p).__name__})() for p in parts)
+        ends = (self._camera, self._display)
+        camera, display = (getattr(e, "describe", lambda e=e: {"kind": type(e).__name__})() for e in ends)
         return {
             "kind": "live",
             "projector_grid": list(self.projector_grid),
@@ -207,130 +176,201 @@ class LiveRig(contextlib.AbstractContextManager):
 
     def close(self) -> None:
         """Close camera and display, where they can be closed."""
-        for part in (self._stage.camera, self._stage.display):
-            getattr(part, "close", lambda: None)()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        for end in (self._camera, self._display):
+            getattr(end, "close", lambda: None)()
 
     def _validate(self, codes: Any, seconds: Any) -> tuple[np.ndarray, float]:
-        codes, seconds = as_codes(codes, self.projector_grid, self.channels), as_seconds(seconds)
-        return codes, seconds if self.exposures is None else exact("seconds", seconds, self.exposures)
+        codes = as_codes(codes, self.projector_grid, self.channels)
+        return codes, exact("seconds", seconds, self.exposures)
 
-    def _survey_exposure(self) -> float:
-        """An exposure in which white is not saturated."""
-        offered = self.exposures or tuple(_USUAL / 2**k for k in reversed(range(_TRIALS)))
-        seconds = max((s for s in offered if s <= _USUAL), default=offered[0])
-        for _ in range(_TRIALS):
-            if not is_saturated(self._stage, seconds, self._patience):
-                return seconds
-            shorter = [s for s in offered if s <= seconds / 2]
-            if not shorter:
-                break
-            seconds = shorter[-1]
-        raise AcquisitionError(
-            f"white is saturated at {seconds:.4g} s; close the aperture, or lower the gain"
-        )
-
-
-class Freshness:
-    """Takes frames and checks them: waits `margin` seconds beyond the slowest flash, retakes so many."""
-
-    def __init__(self, stage: Stage, survey: Survey, margin: float, retakes: int) -> None:
-        self.survey = survey
-        self._stage, self._margin, self._retakes = stage, margin, retakes
-        self._shown: np.ndarray | None = None
-        self._last: Frame | None = None
-
-    def frame(self, codes: np.ndarray, seconds: float) -> Frame:
+    def _fresh(self, codes: np.ndarray, seconds: float, survey: Survey) -> Frame:
         """A frame of `codes`, exposed for `seconds`; AcquisitionError where frames stay unsteady or old."""
         shown, last = self._shown, self._last
         self._shown = self._last = None  # after an error nothing is known of the frames to come
         moved = shown is None or not np.array_equal(shown, codes)
-        timed = self._stage.seconds != seconds
-        self._stage.expose(seconds)
+        timed = self._seconds != seconds
+        self._expose(seconds)
         if moved:
-            self._stage.show(codes)
-        frame = self._steady()
-        seen = last is not None and self._unlike(frame, last)
+            self._show(codes)
+        frame = self._steady(survey)
+        seen = last is not None and _change(frame, last) > survey.tolerance
         if (moved and timed) or ((moved or timed) and not seen):
-            frame = self._after_flash(codes, frame)
+            frame = self._after_flash(codes, frame, survey)
         self._shown, self._last = codes.copy(), frame
         return frame
 
-    def _unlike(self, a: Frame, b: Frame) -> bool:
-        return change(a, b) > self.survey.tolerance
-
-    def _steady(self) -> Frame:
+    def _steady(self, survey: Survey) -> Frame:
         """The second of two frames in a row that are the same but for noise."""
-        wait = self.survey.worst + self._margin
-        if self._stage.camera.stream and self._stage.seconds is not None:
-            # A frame comes at the end of its exposure, and the survey's was not that long.
-            wait += max(0.0, self._stage.seconds - self.survey.seconds)
-        self._stage.settle(wait)
-        first, twins, changed, tries = self._stage.frame(), 0, 0.0, self._retakes + 1
+        wait = self._latency + _MARGIN
+        if self._camera.stream:  # a frame comes at the end of its exposure, which may be longer now
+            wait += max(0.0, self._seconds - survey.seconds)
+        self._settle(wait)
+        first, twins, changed, tries = self._frame(), 0, 0.0, _TRIES
         while tries:
-            second = self._stage.frame()
+            second = self._frame()
             if np.array_equal(first.codes, second.codes) and twins < _TWINS:
                 twins += 1  # the same frame once more, perhaps
                 continue
-            changed = change(first, second)
-            if changed <= self.survey.tolerance:
+            changed = _change(first, second)
+            if changed <= survey.tolerance:
                 return second
             first, twins, tries = second, 0, tries - 1
         raise AcquisitionError(
-            f"frames still change by {changed:.1%} of full scale, {self.survey.tolerance:.1%} is noise: "
+            f"frames still change by {changed:.1%} of full scale, {survey.tolerance:.1%} is noise: "
             "half-changed frames, flicker, or something moves"
         )
 
-    def _after_flash(self, codes: np.ndarray, frame: Frame) -> Frame:
-        """A frame that is newer than a flash which was seen to come."""
-        flash = self._flash(codes, frame)
-        for _ in range(self._retakes + 1):
-            self._stage.show(codes)
-            fresh = self._steady()
-            if flash is None or self._unlike(fresh, flash):
-                return fresh
-        raise AcquisitionError(f"the frame is stale: {self._retakes + 1} frames showed the pattern before")
+    def _after_flash(self, codes: np.ndarray, frame: Frame, survey: Survey) -> Frame:
+        """A frame that looks the same before and after a flash, which looks different.
 
-    def _flash(self, codes: np.ndarray, frame: Frame) -> Frame | None:
-        """The frame of a flash unlike `frame`; None where none differs from it in this exposure.
-
-        White only adds light, black only removes it: unlike `frame` alone could be an earlier flash, late.
+        Frames come in the order in which pictures were shown, and of these only `codes` were shown twice:
+        flashes are blocks at random. Where that fails, latency has grown, and from now on `patience` passes
+        before each frame. In an exposure too short to see a flash, or where all is saturated, frames could
+        not be distinguished.
         """
-        first = 1.0 if float(codes.mean()) < 0.5 else 0.0
-        tolerance = self.survey.tolerance
-        part = min(1.0, (self._stage.seconds or 0.0) / self.survey.seconds)
-        must_differ = self.survey.contrast * part > _PLAIN * tolerance and frame.cells.min() < BRIGHT
-        for code in (first, 1.0 - first):
-            for _ in range(self._retakes + 1 if must_differ else 1):
-                self._stage.show(code)
-                flash = self._steady()
-                step = (flash.cells - frame.cells) * (2 * code - 1)
-                if step.max() > tolerance and step.min() >= -tolerance:
-                    return flash
-        if must_differ:
-            raise AcquisitionError("the frame is stale: the camera sees no flash of the display any more")
-        return None
+        h, w = self.projector_grid
+        light = survey.contrast * min(1.0, self._seconds / survey.seconds)
+        is_visible = light > _VISIBLE * survey.tolerance and frame.cells.min() < _BRIGHT
+        for _ in range(_TRIES):
+            blocks = self._random.integers(0, 2, (4, 4)).astype(np.float32)
+            self._show(cv2.resize(blocks, (w, h), interpolation=cv2.INTER_NEAREST))
+            between = self._steady(survey)
+            self._show(codes)
+            before, frame = frame, self._steady(survey)
+            is_seen = min(_change(between, before), _change(between, frame)) > survey.tolerance
+            if not is_visible or (is_seen and _change(frame, before) <= survey.tolerance):
+                return frame
+            self._latency = max(self._latency, self._patience)
+        raise AcquisitionError(f"the frame is stale: in {_TRIES} trials no flash of the display is seen")
+
+    def _show(self, codes: Any) -> None:
+        """Show codes, or one code everywhere."""
+        self._display.show(codes if np.ndim(codes) else np.full(self.projector_grid, codes, np.float32))
+        self._changed = time.monotonic()
+
+    def _expose(self, seconds: float) -> None:
+        if seconds != self._seconds:
+            self._seconds = 0.0
+            self._camera.expose(seconds)
+            self._seconds, self._changed = seconds, time.monotonic()
+
+    def _settle(self, seconds: float) -> None:
+        """Wait until so many seconds after the last change, and drop the frames of a stream meanwhile."""
+        while (left := self._changed + seconds - time.monotonic()) > 0:
+            if self._camera.stream:
+                self._camera.frame()
+            else:
+                time.sleep(left)
+
+    def _frame(self) -> Frame:
+        released = time.monotonic()
+        codes = np.asarray(self._camera.frame())
+        moment = time.monotonic() if self._camera.stream else released
+        scaled = to_unit("the frame", codes, self._camera, self._first)
+        self._first = codes.shape, codes.dtype
+        return Frame(codes, _cells(scaled), moment - self._changed)
+
+    def _still(self, codes: Any, count: int = 1) -> np.ndarray:
+        """Cells of frames of codes at rest: (count, a, b, channels)."""
+        self._show(codes)
+        self._settle(self._patience + self._seconds)
+        return np.stack([self._frame().cells for _ in range(count)])
+
+    def _measure(self) -> Survey:
+        """Run the tests, in an exposure in which white is not saturated."""
+        halved = [_USUAL / 2**k for k in range(_TRIALS)]
+        offered, seconds = self.exposures or halved, _USUAL
+        for most in halved:
+            seconds = max((s for s in offered if s <= most), default=min(offered))
+            self._expose(seconds)
+            if np.mean(self._still(1.0) > _BRIGHT) <= _OUTLIERS:
+                break
+        else:
+            raise AcquisitionError(f"white is saturated at {seconds:.4g} s; reduce aperture or gain")
+        dark, lit = self._still(0.0, _FRAMES), self._still(1.0, _FRAMES)
+        noise = max(float(np.abs(np.diff(frames, axis=0)).max()) for frames in (dark, lit))
+        if noise > _FLICKER:
+            raise AcquisitionError(
+                f"frames of the same picture differ by {noise:.1%} of full scale: something flickers or "
+                "moves, or the exposure is no multiple of the display's period"
+            )
+        black, white = dark[-1], lit[-1]
+        contrast = float((white - black).max())
+        if contrast < _VISIBLE * max(noise, _STEP):
+            raise AcquisitionError(
+                f"the camera does not see the display: white is {contrast:.2%} of full scale above black, "
+                f"noise {noise:.2%}, exposure {seconds:.4g} s; open the aperture, or point the camera there"
+            )
+        tolerance = _SAFETY * (noise + _STEP)
+        h, w = self.projector_grid
+        strip = np.broadcast_to(np.arange(w) < max(1, w // 4), (h, w)).astype(np.float32)
+        dimmed = float((self._still(strip)[0] - white).max())
+        if dimmed > tolerance:
+            raise AcquisitionError(
+                f"the camera adapts: a strip is {dimmed:.1%} of full scale darker when the rest is lit as "
+                "well; switch off the camera's automatic exposure and the projector's dynamic contrast"
+            )
+        self._still(0.0)
+        accuracy = max(tolerance, _ARRIVED * contrast)
+        flashes = [(1.0, white), (0.0, black)] * _FLASHES
+        latency = max(self._wait_for(code, cells, accuracy) for code, cells in flashes)
+        self._still(0.0)
+        self._show(1.0)
+        means = []
+        for wait in (latency, latency + self._patience):
+            self._settle(wait)
+            frames = [self._frame().cells for _ in range(3)][1:]  # the first may have begun before
+            means.append(np.mean(frames, axis=(0, 1, 2)))
+        if (drift := _drift(means[1], means[0], _STEP)) > self._drift:
+            raise AcquisitionError(
+                f"the camera drifts by {drift:.1%} between identical shots, {self._drift:.1%} is accepted: "
+                "switch off automatic exposure and white balance, and lamps that flicker"
+            )
+        return Survey(latency, seconds, tolerance, contrast, drift)
+
+    def _wait_for(self, code: float, after: np.ndarray, tolerance: float) -> float:
+        """Seconds until a flash of a code shows, as the cells `after`."""
+        self._show(code)
+        while True:
+            frame = self._frame()
+            if np.mean(np.abs(frame.cells - after) > tolerance) <= _OUTLIERS:
+                return max(frame.waited, 0.0)
+            if frame.waited > self._patience + self._seconds:
+                raise AcquisitionError(f"no flash of the display is seen within {frame.waited:.2g} s")
+
+
+def _cells(image: np.ndarray) -> np.ndarray:
+    """Means over square cells: (H, W) or (H, W, c) -> (a, b, c), float32."""
+    h, w = image.shape[:2]
+    side = max(1, min(h, w) // _ACROSS)
+    small = image if side == 1 else cv2.resize(image, (w // side, h // side), interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(small.reshape(*small.shape[:2], -1), np.float32)
+
+
+def _change(a: Frame, b: Frame) -> float:
+    """The largest difference of a cell, of full scale."""
+    return float(np.abs(a.cells - b.cells).max())
+
+
+def _drift(now: np.ndarray, before: np.ndarray, least: float) -> float:
+    """Difference of two means, (channels,), relative to at least `least`, of the worst one."""
+    return float(np.max(np.abs(now - before) / np.maximum(before, least)))
 
 
 def _whole_periods(
-    offered: tuple[float, ...] | None, period: float, limits: tuple[float, float]
+    offered: Sequence[float] | None, period: float, limits: tuple[float, float]
 ) -> tuple[float, ...]:
-    """The camera's exposures that see whole periods; multiples of the period where it has any in `limits`.
+    """The camera's exposures that see whole periods; where it has any in `limits`, multiples of the period.
 
     >>> _whole_periods((1 / 125, 1 / 60, 1 / 50, 1 / 30), 1 / 60, (1e-4, 30))
     (0.016666666666666666, 0.03333333333333333)
     """
+    least, most = limits if offered is None else (offered[0], offered[-1])
     if offered is None:
-        most = int(limits[1] / period * (1 + 1e-9))
-        counts = {step << k for step in _STEPS for k in range(most.bit_length()) if step << k <= most}
-        whole = tuple(count * period for count in sorted(counts) if count * period >= limits[0])
-    else:
-        counts = {seconds: round(seconds / period) for seconds in offered}
-        whole = tuple(t for t, n in counts.items() if n and abs(t - n * period) <= _BROKEN * t)
-        limits = offered[0], offered[-1]
+        offered = [n * period for n in _PERIODS if least <= n * period <= most * (1 + 1e-9)]
+    counts = {seconds: round(seconds / period) for seconds in offered}
+    whole = tuple(t for t, n in counts.items() if n and abs(t - n * period) <= _FRACTION * t)
     if not whole:
-        span = f"{limits[0]:.4g} to {limits[1]:.4g} s"
+        span = f"{least:.4g} to {most:.4g} s"
         raise InputError(f"period is {period:.4g} s; exposures of the camera, {span}, hold no multiple of it")
     return whole

@@ -1,32 +1,166 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`VirtualRig`: photographs of a scene whose light transport T is known, as a real camera would take them.
+"""`VirtualRig`: photographs of a scene whose light transport T is known; `SimulatedRig`: their sensor.
 
-With codes x (h, w[, 3]) in [0, 1], N = h w projector pixels, light p of the projector and channels c, d:
+Codes x (h, w[, 3]) in [0, 1], N = h w projector pixels, channels c and d, projector curve g with light b at
+code 0, ambient light a (M,), and C (H W, M): what camera pixels see of the M pixels of T.
 
-    q_c = sum_d mixing[c, d] p_d            the light that channel c of T answers to, (N,)
-    L_c = C (T_c q_c + a_c)                 radiance on the camera's pixels: ambient a (M,), warp C (H W, M)
+    p_d = b + (1 - b) g_d(x_d)              light of the projector
+    q_c = sum_d mixing[c, d] p_d            light that channel c of T answers to, (N,)
+    L_c = C (T_c q_c + a_c)                 radiance on the camera's pixels
+    v   = max(sensitivity seconds L, 0)     linear value; 1 fills a pixel of E electrons
+    n   = Poisson(E v) / E + Normal(0, r)   photons, and read noise r
+    c   = o + (1 - o) f(min(n, 1))          offset o and camera curve f, where n < 0 as -f(-n)
+    code = round(c (2^bits - 1))            in [0, 2^bits - 1]; or c itself of a float camera
 
-`sensor` makes p of x and codes of L. Light is linear throughout; its unit is that of T, so a T whose rows sum
-to 1 gives 1 per second at full white. Radiance is uniform on each pixel of T; C averages it over what each
-camera pixel covers. Known limit: no blur, no light that reaches the camera outside T.
+The unit of light is that of T: rows that sum to 1 give 1 per second under white. Known limit: no blur but
+that of C, no light that reaches the camera outside T.
 """
 
 from __future__ import annotations
 
+import hashlib
+import itertools
+from collections import Counter
 from collections.abc import Callable
-from functools import cached_property
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl import checks, layout
-from ltcl.acquisition.fingerprint import fingerprint
-from ltcl.acquisition.rigs.sensor import SimulatedRig
+from ltcl.acquisition.rig import as_codes, as_seconds, fingerprint, shot_key
 from ltcl.errors import InputError
+from ltcl.images import from_srgb, to_srgb
 
-_FEW = 8  # with one lit pixel of so many, gathering columns beats the whole product
+Curve = Callable[[np.ndarray], np.ndarray]
 Place = Callable[[np.ndarray, np.ndarray], tuple[Any, Any]]
+# film: c = (1 + m^g) l^g / (l^g + m^g), a logistic in log l, as characteristic curves (Hurter and Driffield)
+_G, _M = 1.2, 0.25**1.2
+# Light to code of a camera, and code to light of a projector, by name; 0 to 0 and 1 to 1.
+CURVES: dict[str, tuple[Curve, Curve]] = {
+    "linear": (np.array, np.array),
+    "srgb": (to_srgb, from_srgb),
+    "film": (lambda x: (1 + _M) * x**_G / (x**_G + _M), lambda c: (_M * c / (1 + _M - c)) ** (1 / _G)),
+    "gamma2.2": (lambda light: light ** (1 / 2.2), lambda code: code**2.2),
+}
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Camera and projector of a simulated rig.
+
+    `response` and `projector_response` are "linear", "srgb", "gamma2.2" or "film", or three of these. `bits`
+    8 gives uint8, 9 to 16 uint16, "float" float32. `black` is the offset of the codes, of full scale,
+    `projector_black` the light at code 0, of full white. `gain` are electrons at full scale, None for no
+    photon noise; `read`, of full scale, the deviation of the read noise; `exposures` seconds, None for any.
+    """
+
+    response: Any = "srgb"
+    projector_response: Any = "srgb"
+    bits: int | str = 8
+    black: float = 0.004
+    projector_black: float = 0.0
+    gain: float | None = 10000.0
+    read: float = 0.0005
+    exposures: Any = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.bits != "float" and (type(self.bits) is not int or self.bits not in range(8, 17)):
+            raise InputError(f'bits is {self.bits!r}; it must be 8 to 16, or "float"')
+        for name in ("black", "projector_black", "read"):
+            checks.number(name, getattr(self, name), least=0.0, below=1.0)
+        if self.gain is not None:
+            checks.number("gain", self.gain, least=1.0, most=1e9)
+        checks.count("seed", self.seed, least=0)
+
+
+class SimulatedRig:
+    """A projector and a camera whose light comes from `_radiance(codes)` of a subclass.
+
+    Noise depends on seed, codes, seconds and the earlier photographs of the same, so that a run can resume.
+    """
+
+    sensitivity = 1.0
+
+    def __init__(self, projector_grid: tuple[int, int], channels: int, sensor: dict[str, Any]) -> None:
+        self.sensor = Sensor(**sensor)
+        self.projector_grid, self.channels = projector_grid, channels
+        self.exposures = None if self.sensor.exposures is None else tuple(self.sensor.exposures)
+        self.bits = None if isinstance(self.sensor.bits, str) else self.sensor.bits
+        self._encode, _ = _curves("response", self.sensor.response, channels)
+        _, self._decode = _curves("projector_response", self.sensor.projector_response, channels)
+        self._facts: dict[str, Any] = {}  # of the subclass, for `describe`
+        self._repeats: Counter[str] = Counter()
+        self._last: tuple[np.ndarray, np.ndarray] | None = None  # a bracket repeats its codes
+
+    def photograph(self, codes: Any, seconds: float) -> np.ndarray:
+        """What the camera gives for codes (h, w[, 3]) in [0, 1]: uint8, uint16 or float32, (H, W[, 3])."""
+        codes, seconds = as_codes(codes, self.projector_grid, self.channels), as_seconds(seconds)
+        value = np.maximum(self.sensitivity * seconds * self.radiance(codes), 0.0)
+        noise, sensor = self._noise(codes, seconds), self.sensor
+        if sensor.gain is not None:
+            # Far beyond saturation nothing changes, and Poisson draws end at about 2^63.
+            value = noise.poisson(sensor.gain * np.minimum(value, 1e6)) / sensor.gain
+        value = value + noise.normal(0.0, sensor.read, value.shape)
+        code = sensor.black + (1.0 - sensor.black) * _apply(self._encode, np.minimum(value, 1.0))
+        if self.bits is None:
+            return code.astype(np.float32)
+        largest = (1 << self.bits) - 1
+        return np.rint(np.clip(code, 0.0, 1.0) * largest).astype(np.uint8 if largest == 255 else np.uint16)
+
+    def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
+        """Skip the noise of a photograph that was taken in an earlier session."""
+        self._noise(as_codes(codes, self.projector_grid, self.channels), as_seconds(seconds))
+
+    def radiance(self, codes: Any) -> np.ndarray:
+        """L without a sensor, to compare photographs with: float64, (H, W) or (H, W, 3)."""
+        codes = as_codes(codes, self.projector_grid, self.channels)
+        if self._last is None or not np.array_equal(self._last[0], codes):
+            self._last = codes.copy(), self._radiance(codes)
+        return self._last[1].copy()
+
+    def describe(self) -> dict[str, Any]:
+        """What makes the photographs, as plain JSON."""
+        sensor = {name: value for name, value in asdict(self.sensor).items() if name != "exposures"}
+        shape = {"projector_grid": list(self.projector_grid), "channels": self.channels}
+        return self._facts | shape | sensor | {"sensitivity": self.sensitivity}
+
+    def _radiance(self, codes: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def _light(self, codes: np.ndarray) -> np.ndarray:
+        """p: float64, (h, w) or (h, w, 3), of the projector's channels."""
+        light = codes.astype(np.float64)
+        if self.channels == 3 and light.ndim == 2:
+            light = np.repeat(light[..., None], 3, axis=-1)
+        black = self.sensor.projector_black
+        return black + (1.0 - black) * _apply(self._decode, light)
+
+    def _noise(self, codes: np.ndarray, seconds: float) -> np.random.Generator:
+        """The counter-based stream (Philox) of the next photograph of `codes` for `seconds`."""
+        shot = shot_key(codes, seconds)
+        text = bytes.fromhex(shot) + f"{self.sensor.seed} {self._repeats[shot]}".encode()
+        self._repeats[shot] += 1
+        key = int.from_bytes(hashlib.blake2b(text, digest_size=16).digest(), "little")
+        return np.random.Generator(np.random.Philox(key=key))
+
+
+def _curves(argument: str, value: Any, channels: int) -> tuple[list[Curve], list[Curve]]:
+    names = list(value) if isinstance(value, (list, tuple)) else [value] * channels
+    if len(names) != channels:
+        raise InputError(f"{argument} has {len(names)} curves; it must be one curve, or {channels}")
+    pairs = [CURVES[checks.one_of(argument, name, CURVES)] for name in names]
+    return [encode for encode, _ in pairs], [decode for _, decode in pairs]
+
+
+def _apply(curves: list[Curve], value: np.ndarray) -> np.ndarray:
+    """The curve of each channel, odd about 0."""
+    size = np.abs(value)
+    if size.ndim == 2:
+        return np.copysign(curves[0](size), value)
+    return np.copysign(np.stack([curve(size[..., c]) for c, curve in enumerate(curves)], axis=-1), value)
 
 
 class VirtualRig(SimulatedRig):
@@ -34,24 +168,14 @@ class VirtualRig(SimulatedRig):
 
     Parameters
     ----------
-    T : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3, or a Transport
-        Row-major pixels; negative light counts as none. A `ltcl.Transport` brings its own mixing.
-    grid : (h, w)
-        Of the projector, N = h w.
-    camera_grid : (H, W), optional
-        Of the photographs; needed where that is not `grid`.
-    camera_map : (H W, M) matrix, optional
-        C: what each camera pixel sees of the M pixels of T, by area, such as `camera_map` makes it from a
-        function; without it M = H W and C = I.
-    mixing : (3, 3), optional
-        Of the projector's colours.
-    ambient : float, (3,), (M,) or (M, 3)
-        a: radiance without the projector; colours of a rig with three channels.
-    sensitivity : float
-        Linear sensor value for radiance 1 in one second.
-    **sensor
-        response, projector_response, bits, black, projector_black, gain, read, exposures, seed: see
-        `ltcl.acquisition.rigs.sensor.SimulatedRig`.
+    T : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3, or a Transport, with its mixing
+    grid, camera_grid : (h, w), (H, W)
+        Of the projector, N = h w; of the photographs, needed where that is another.
+    camera_map, mixing : (H W, M) matrix, (3, 3), optional
+        C, such as `camera_map` makes it, without it M = H W and C = I; of the projector's colours.
+    ambient, sensitivity : float, (channels,), (M,) or (M, channels); float
+        a: radiance without the projector; linear value for radiance 1 in one second.
+    **sensor : of `ltcl.acquisition.rigs.virtual.Sensor`
 
     Examples
     --------
@@ -59,8 +183,6 @@ class VirtualRig(SimulatedRig):
     >>> rig = VirtualRig(T, grid=(1, 2), response="linear", gain=None, read=0.0, black=0.0)
     >>> rig.photograph(np.array([[1.0, 0.0]]), seconds=1.0)
     array([[128,  26]], dtype=uint8)
-    >>> rig.radiance(np.array([[1.0, 0.0]]))
-    array([[0.5, 0.1]])
     """
 
     def __init__(
@@ -75,48 +197,44 @@ class VirtualRig(SimulatedRig):
         sensitivity: float = 1.0,
         **sensor: Any,
     ) -> None:
-        self._T = _matrices(T)
+        if getattr(T, "blocks", None) is not None:
+            raise InputError("T has blocks between colours; it must have one matrix a channel, and a mixing")
+        matrices = layout.matrices(getattr(T, "matrices", T), "T")
+        self._T = [A.astype(np.float32) if A.dtype.kind in "iub" else A for A in matrices]
         rows, columns = self._T[0].shape
-        super().__init__(checks.grid("grid", grid, columns), len(self._T), **sensor)
+        super().__init__(checks.grid("grid", grid, columns), len(self._T), sensor)
         self._map, pixels = None, rows
         if camera_map is not None:
-            self._map, *others = layout.matrices(camera_map, "camera_map")
-            if others or self._map.shape[1] != rows:
-                kind = "three channels" if others else f"shape {self._map.shape}"
-                raise InputError(f"camera_map has {kind}; it must be (H W, M) with M = {rows}, the rows of T")
-            pixels = self._map.shape[0]
+            maps = layout.matrices(camera_map, "camera_map")
+            (pixels, width), self._map = maps[0].shape, maps[0]
+            if len(maps) > 1 or width != rows:
+                shape = f"{len(maps)} x {(pixels, width)}"
+                raise InputError(f"camera_map has shape {shape}; it must be 1 x (H W, {rows}), the rows of T")
         if camera_grid is None and pixels != columns:
             raise InputError(f"camera_grid is None; it must be (H, W) of the {pixels} camera pixels")
         self.camera_grid = checks.grid("camera_grid", grid if camera_grid is None else camera_grid, pixels)
         mixing = getattr(T, "mixing", None) if mixing is None else mixing
         self._mixing = None if mixing is None else layout.mixing(mixing, self.channels, None)
-        self._ambient = _ambient(ambient, rows, self.channels)
+        a = checks.finite("ambient", checks.real("ambient", ambient)).astype(np.float64)
+        checks.shape("ambient", a, (), (self.channels,), (rows,), (rows, self.channels))
+        if a.min() < 0:
+            raise InputError(f"ambient is as low as {a.min():g}; light is never negative")
+        self.ambient = a[:, None] if a.shape == (rows,) != (self.channels,) else np.atleast_2d(a)
         self.sensitivity = checks.number("sensitivity", sensitivity, above=0.0)
-
-    def describe(self) -> dict[str, Any]:
-        """What makes the photographs, as plain JSON."""
-        return {
+        self._facts = {
             "kind": "virtual",
-            **super().describe(),
             "camera_grid": list(self.camera_grid),
             "mixing": None if self._mixing is None else self._mixing.tolist(),
-            "ambient": [float(mean) for mean in self._ambient.mean(axis=0)],
-            "digests": self._digests,
+            "ambient": self.ambient.mean(axis=0).tolist(),
+            "digests": {"transport": fingerprint(*self._T), "ambient": fingerprint(self.ambient)},
         }
-
-    @cached_property
-    def _digests(self) -> dict[str, Any]:
-        """Of what is too large for the records."""
-        return {
-            "transport": fingerprint(*self._T),
-            "camera_map": None if self._map is None else fingerprint(self._map),
-            "ambient": fingerprint(self._ambient),
-        }
+        self._facts["digests"]["camera_map"] = None if self._map is None else fingerprint(self._map)
 
     def _radiance(self, codes: np.ndarray) -> np.ndarray:
         p = self._light(codes)
         q = (p if self._mixing is None else p @ self._mixing.T).reshape(-1, self.channels)
-        L = np.stack([_product(T, q[:, c]) for c, T in enumerate(self._T)], axis=-1) + self._ambient
+        # In the precision of T, which would be copied otherwise.
+        L = np.stack([T @ q[:, c].astype(T.dtype) for c, T in enumerate(self._T)], axis=-1) + self.ambient
         L = L if self._map is None else self._map @ L
         return L.reshape(self.camera_grid if self.channels == 1 else (*self.camera_grid, 3))
 
@@ -126,24 +244,11 @@ def camera_map(
 ) -> scipy.sparse.csr_array:
     """C for `VirtualRig`: the part of the rays through camera pixel m that end in projector pixel n.
 
-    A camera pixel integrates radiance over its square; a regular lattice of rays stands for that.
+    C is (H W, h w), float64. place(u, v) gives column and row of the projector (x, y) that the ray through
+    column u and row v of the camera hits, arrays of one shape, centres of pixels at integers; NaN or a place
+    outside the grid for nothing lit. Entries are good to about 1 / points^1.5, of `points` rays a side.
 
-    Parameters
-    ----------
-    place : function of u, v
-        Column and row of the projector (x, y) that the ray through column u and row v of the camera hits:
-        pixels, centres at integers, arrays of any shape. NaN, or a place outside the grid: nothing lit. Folds
-        and occluders are jumps of it. InputError where it returns arrays of another shape.
-    camera_grid, grid : (H, W), (h, w)
-        Of the camera and of the projector: C is (H W, h w), float64.
-    points : int
-        Rays to each side of a camera pixel: entries are good to about 1 / points^1.5.
-
-    Examples
-    --------
-    A camera twice as coarse as the projector sees two pixels evenly:
-
-    >>> camera_map(lambda u, v: (2 * u + 0.5, v), (1, 2), (1, 4)).toarray()
+    >>> camera_map(lambda u, v: (2 * u + 0.5, v), (1, 2), (1, 4)).toarray()  # twice as coarse
     array([[0.5, 0.5, 0. , 0. ],
            [0. , 0. , 0.5, 0.5]])
     """
@@ -152,45 +257,10 @@ def camera_map(
     v, u = np.mgrid[:H, :W].astype(np.float64)
     offsets = (np.arange(k) + 0.5) / k - 0.5
     C = scipy.sparse.csr_array((H * W, h * w))
-    for dv in offsets:
-        for du in offsets:
-            x, y = (np.asarray(axis, np.float64) for axis in place(u + du, v + dv))
-            if x.shape != u.shape or y.shape != u.shape:
-                raise InputError(
-                    f"place gives {x.shape} and {y.shape}; they must be {u.shape}, as of u and v"
-                )
-            column, row = np.floor(x + 0.5).ravel(), np.floor(y + 0.5).ravel()
-            hit = np.flatnonzero((column >= 0) & (column < w) & (row >= 0) & (row < h))  # NaN is nowhere
-            n = (row[hit] * w + column[hit]).astype(np.int64)
-            C = C + scipy.sparse.csr_array((np.ones(len(hit)), (hit, n)), shape=C.shape)
+    for dv, du in itertools.product(offsets, offsets):
+        x, y, _ = np.broadcast_arrays(*place(u + du, v + dv), u)
+        column, row = np.floor(x + 0.5).ravel(), np.floor(y + 0.5).ravel()
+        hit = np.flatnonzero((column >= 0) & (column < w) & (row >= 0) & (row < h))  # NaN is nowhere
+        n = (row[hit] * w + column[hit]).astype(np.int64)
+        C = C + scipy.sparse.csr_array((np.ones(len(hit)), (hit, n)), shape=C.shape)
     return scipy.sparse.csr_array(C / k**2)
-
-
-def _matrices(T: Any) -> tuple[Any, ...]:
-    if getattr(T, "blocks", None) is not None:
-        raise InputError("T has blocks between colours; it must have one matrix per channel, and a mixing")
-    checked = layout.matrices(getattr(T, "matrices", T), "T")
-    return tuple(matrix.astype(np.float32) if matrix.dtype.kind in "iub" else matrix for matrix in checked)
-
-
-def _product(T: Any, q: np.ndarray) -> np.ndarray:
-    """T q in the precision of T, which would be copied otherwise; of a dense T only the lit columns."""
-    q = q.astype(T.dtype)
-    if isinstance(T, np.ndarray):
-        lit = np.flatnonzero(q)
-        if _FEW * len(lit) < len(q):
-            return T[:, lit] @ q[lit]
-    return T @ q
-
-
-def _ambient(value: Any, rows: int, channels: int) -> np.ndarray:
-    """(M, channels) of radiance, or what broadcasts to it."""
-    a = checks.finite("ambient", checks.real("ambient", value)).astype(np.float64)
-    allowed = {(): (1, 1), (rows,): (rows, 1), (rows, channels): (rows, channels)}
-    if channels == 3:
-        allowed[(3,)] = (1, 3)  # colours, even of a T with three rows
-    if a.shape not in allowed:
-        raise InputError(f"ambient has shape {a.shape}; it must be one of {', '.join(map(str, allowed))}")
-    if a.min() < 0:
-        raise InputError(f"ambient is as low as {a.min():g}; light is never negative")
-    return a.reshape(allowed[a.shape])

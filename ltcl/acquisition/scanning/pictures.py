@@ -9,23 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from itertools import islice
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+import scipy.sparse
 
 from ltcl.acquisition import anchor
-from ltcl.acquisition.agreement import Deviation
 from ltcl.acquisition.calibration import Calibration
-from ltcl.acquisition.exposure import acquisition_error
+from ltcl.acquisition.geometry.resample import Blocks
 from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
-from ltcl.acquisition.scanning.cells import Blocks
 from ltcl.acquisition.scanning.checks import Checks, Shot
+from ltcl.acquisition.session import acquisition_error
+from ltcl.errors import AcquisitionError
 from ltcl.store import BlockStore
 
 UNKNOWN = np.float32(1e12)
 """The variance of a value of which nothing is known."""
-_CLEAR = 5.0  # standard deviations of white
 _SEEN = 0.5  # of what a projector pixel is seen by: less of it valid tells nothing
 
 
@@ -37,62 +37,49 @@ class Picture(NamedTuple):
 
 
 class Seen:
-    """What a calibration tells of the pixels of the scan.
+    """What a calibration shows of the pixels of the scan.
 
     Attributes
     ----------
-    calibration : Calibration
-    grid : (h, w)
+    grid, channels : (h, w), 1 or 3
         Of the scan: M = N = h w.
-    channels : 1 or 3
-    ambient : (channels, M)
-        Variance of what is subtracted from each picture, the same in all.
-    white : Picture
-        Under all of the projector: row sums of T.
+    white, ambient : Picture, (channels, M)
+        Row sums of T; the variance of the ambient light, which is subtracted from each picture.
     seen : (M,) bool
-        Pixels that the camera sees.
-    sharpness : Sharpness or None
-        Of the camera on these.
+        Pixels that the camera sees, with `sharpness` (None: exactly).
     """
 
     def __init__(self, calibration: Calibration, side: int = 1) -> None:
         self.calibration, self.channels = calibration, len(calibration.offset)
         self.blocks = Blocks(calibration.resampling.grid, side)
         self.grid = self.blocks.grid
-        self._scale = calibration.light.astype(np.float32)[:, None]
         self.seen = self.blocks.sum(calibration.resampling.seen.astype(np.float32)).ravel() > 0
-        sharp = calibration.sharpness
-        self.sharpness = None if sharp is None else sharp.of_blocks(side)
-        self._dark = self._on_grid(calibration.ambient)
-        self.ambient = np.where(self._dark.variance < UNKNOWN, self._dark.variance, 0.0) / self._scale**2
-        white = self._on_grid(calibration.white)
-        self.white = Picture(white.value / self._scale, white.variance / self._scale**2)
+        self.sharpness = calibration.sharpness and calibration.sharpness.of_blocks(side)
+        self.white, self._dark = self._on_grid(calibration.white), self._on_grid(calibration.ambient)
+        self.ambient = np.where(self._dark.variance < UNKNOWN, self._dark.variance, 0.0)
 
     @classmethod
     def of(cls, store: BlockStore) -> Self:
         """Of a store that `ltcl.acquire` made."""
-        told = store.attributes
-        return cls(Calibration.of(store), told["settings"]["block"] if told["strategy"] == "block" else 1)
+        facts = store.attributes
+        side = facts["settings"]["block"] if facts["strategy"] == "block" else 1
+        return cls(Calibration.of(store), side)
 
     def _on_grid(self, light: Radiance) -> Picture:
         """Means over the blocks of the scan, as far as they are seen and valid."""
-        R, n = self.calibration.resampling, self.channels
-        known = light.valid.astype(np.float32)
-        value = R.apply(np.where(light.valid, light.value, 0.0))
-        variance = R.variance(np.where(light.valid, light.variance, 0.0))
-        if light.valid.all():
-            weight = R.seen.astype(np.float32)[..., None]
-        else:
-            weight = R.apply(known).reshape(*R.grid, n)
-        good = weight >= _SEEN
-        part = np.where(good, 1.0 / np.maximum(weight, _SEEN), 0.0)
-        value = self.blocks.sum(value.reshape(*R.grid, n) * part)
-        variance = self.blocks.sum(variance.reshape(*R.grid, n) * part**2)
-        count = self.blocks.sum(np.broadcast_to(good, (*R.grid, n)).astype(np.float32))
-        told = np.moveaxis(count, -1, 0).reshape(n, -1)
-        value, variance = (np.moveaxis(part, -1, 0).reshape(n, -1) for part in (value, variance))
-        pixels = np.maximum(told, 1.0)
-        variance = np.where(told > 0, variance / pixels**2, UNKNOWN)
+        R, valid, n = self.calibration.resampling, light.valid, self.channels
+        value = R.apply(np.where(valid, light.value, 0.0))
+        variance = R.variance(np.where(valid, light.variance, 0.0))
+        weight = R.seen if valid.all() else R.apply(valid.astype(np.float32))
+        value, variance, weight = (x.reshape(*R.grid, -1) for x in (value, variance, weight))
+        good = np.broadcast_to(weight >= _SEEN, value.shape)
+        share = np.where(good, 1.0 / np.maximum(weight, _SEEN), 0.0)
+        value, variance, count = (
+            np.moveaxis(self.blocks.sum(x), -1, 0).reshape(n, -1)
+            for x in (value * share, variance * share**2, good.astype(np.float32))
+        )
+        pixels = np.maximum(count, 1.0) * self.calibration.light[:, None]
+        variance = np.where(count > 0, variance / pixels**2, UNKNOWN)
         return Picture((value / pixels).astype(np.float32), variance.astype(np.float32))
 
 
@@ -101,83 +88,111 @@ class Pictures(Seen):
 
     def __init__(self, shots: Shots, calibration: Calibration, side: int = 1) -> None:
         super().__init__(calibration, side)
-        self.shots = shots
-        self.checks = Checks(calibration, shots.name)
+        self.shots, self._checks = shots, Checks(calibration, self.white, shots.name)
 
     def announce(self, patterns: Iterable[np.ndarray], size: int) -> None:
         """Tell the rig of patterns that come next, in batches of `size`, to be photographed in one go."""
-        rest = iter(patterns)
-        while batch := list(islice(rest, size)):
-            self.shots.prepare(self._listed([self._codes(part) for part in batch]))
+        rest, times = iter(patterns), self.calibration.exposures
+        while batch := [self.blocks.enlarged(pattern) for pattern in islice(rest, size)]:
+            shots = [(codes, t) for codes in batch for t in times]
+            self.shots.prepare([*shots, (anchor.marked(batch), times[0])])
 
-    def _listed(self, batch: list[np.ndarray]) -> list[tuple[np.ndarray, float]]:
-        """What is photographed for a batch of codes: each at all exposures, then the anchor."""
-        times = self.calibration.exposures
-        return [*((part, t) for part in batch for t in times), (anchor.marked(batch), times[0])]
+    def take(self, patterns: Iterable[np.ndarray], progress: Callable[[int], None]) -> list[Picture]:
+        """A picture under each pattern (h, w) of the scan, on where it is not 0; `progress(1)` after each.
 
-    def take(self, patterns: Iterable[np.ndarray], tell: Callable[[], None]) -> list[Picture]:
-        """A picture under each pattern (h, w) of the scan, on where it is not 0; told of each.
-
-        Raises
-        ------
-        AcquisitionError
-            Photographs deviate from what is known of them (`checks`).
+        AcquisitionError where photographs deviate from what is known of them (`checks`).
         """
-        patterns = list(patterns)
-        codes = [self._codes(pattern) for pattern in patterns]
-        self.shots.prepare(self._listed(codes))
-        merged: list[tuple[Shot, Radiance]] = []
-        deviations: list[tuple[Shot, Deviation]] = []
-        following = None
-        for part in codes:
-            shot = self._photographed(part, self.calibration.exposures)
-            found = self.checks.deviation(shot)
-            following = shot if deviations and following is None else following
-            if found is not None:
-                deviations.append((shot, found))
-            if len(deviations) > 1:
-                break
-            if not deviations:
-                merged.append((shot._replace(images=[]), self._merged(shot)))
-            tell()
-        self.checks.refuse(deviations, following)
-        pictures = [self._picture(light) for _, light in merged]
-        self._check_places(patterns, pictures, [shot.numbers for shot, _ in merged])
-        blocks = self._photographed(anchor.marked(codes), self.calibration.exposures[:1])
-        self.checks.refuse_moved(blocks, merged)
+        patterns, times = list(patterns), self.calibration.exposures
+        batch = [self.blocks.enlarged(pattern) for pattern in patterns]
+        pictures: list[Picture] = []
+        shots: list[Shot] = []
+        for k, codes in enumerate(batch):
+            shot = self._photograph(codes, times)
+            if self._checks.deviation(shot) is not None:
+                self._checks.refuse([shot, *(self._photograph(c, times) for c in batch[k + 1 : k + 2])])
+            light = self._merge(shot)
+            pictures.append(self._less_ambient(light))
+            shots.append(shot._replace(images=[anchor.compact(light)]))
+            progress(1)
+        self._checks.refuse_misplaced(patterns, pictures, shots)
+        blocks = self._photograph(anchor.marked(batch), times[:1])
+        shots.append(blocks._replace(images=[anchor.compact(self._merge(blocks))]))
+        self._checks.refuse_moved(blocks, shots)
         return pictures
 
-    def _check_places(
-        self, patterns: list[np.ndarray], pictures: list[Picture], numbers: list[range]
-    ) -> None:
-        """Refuse pictures that show other patterns of their batch, where white is well above its noise."""
-        white = self.white.value.sum(axis=0)
-        clear = white > _CLEAR * np.sqrt(self.white.variance.sum(axis=0))
-        value = np.stack([picture.value.sum(axis=0) for picture in pictures])[:, clear] / white[clear]
-        variance = (
-            np.stack([picture.variance.sum(axis=0) for picture in pictures])[:, clear] / white[clear] ** 2
-        )
-        lit = np.stack(patterns).reshape(len(patterns), -1)[:, clear] > 0
-        self.checks.refuse_misplaced(lit, value, variance, numbers)
-
-    def _codes(self, pattern: np.ndarray) -> np.ndarray:
-        return self.blocks.enlarged(np.asarray(pattern, np.float32))
-
-    def _photographed(self, codes: np.ndarray, seconds: tuple[float, ...]) -> Shot:
+    def _photograph(self, codes: np.ndarray, seconds: tuple[float, ...]) -> Shot:
         images = [self.shots.photograph(codes, t) for t in seconds]
-        return Shot(codes, images, range(self.shots.number + 1 - len(images), self.shots.number + 1))
+        return Shot(codes, images, seconds, range(self.shots.number + 1 - len(images), self.shots.number + 1))
 
-    def _merged(self, shot: Shot) -> Radiance:
-        told = self.calibration
-        levels = told.noise.levels or None
+    def _merge(self, shot: Shot) -> Radiance:
+        known = self.calibration
+        levels = known.noise.levels or None
         with acquisition_error(f"photographs {shot.numbers[0]} to {shot.numbers[-1]}"):
             return merge(
-                shot.images, told.exposures, told.response, told.noise, levels=levels, black=told.offset
+                shot.images, shot.seconds, known.response, known.noise, levels=levels, black=known.offset
             )
 
-    def _picture(self, merged: Radiance) -> Picture:
-        lit = self._on_grid(merged)
-        variance = np.where(lit.variance < UNKNOWN, lit.variance / self._scale**2, UNKNOWN)
-        known = (variance < UNKNOWN) & (self._dark.variance < UNKNOWN)
-        value = np.where(known, lit.value - self._dark.value, np.float32(0.0)) / self._scale
-        return Picture(value, np.where(known, variance, UNKNOWN).astype(np.float32))
+    def _less_ambient(self, light: Radiance) -> Picture:
+        lit = self._on_grid(light)
+        known = (lit.variance < UNKNOWN) & (self._dark.variance < UNKNOWN)
+        value = np.where(known, lit.value - self._dark.value, np.float32(0.0))
+        return Picture(value, np.where(known, lit.variance, UNKNOWN))
+
+
+class Log:
+    """Pictures in the order in which an adaptive scan asks for them, a batch in each block of a store.
+
+    What it asks for next depends on nothing but the pictures before. So a scan that was stopped is run again
+    from its start with the pictures of the log, to the bit the same, until it asks for a new one. `done`
+    counts those that were asked for.
+    """
+
+    def __init__(self, store: BlockStore, pictures: Pictures, progress: Callable[[int], None]) -> None:
+        self._store, self._pictures, self._progress = store, pictures, progress
+        self._batches = 0
+        self.done = 0
+
+    def announce(self, patterns: Iterable[np.ndarray]) -> None:
+        """Tell the rig of the patterns of the next batches that are not in the store."""
+        number = self._batches
+        while self._written(number):
+            number += 1
+        size = self._store.layout.block_rows
+        self._pictures.announce(islice(patterns, (number - self._batches) * size, None), size)
+
+    def _written(self, number: int) -> bool:
+        return all((c, number) in self._store.written for c in range(self._pictures.channels))
+
+    def take(self, patterns: list[np.ndarray]) -> list[Picture]:
+        """The pictures of the next batch of patterns, as many as a block has at most."""
+        number, self._batches = self._batches, self._batches + 1
+        if self._written(number):
+            pictures = self._read(number, len(patterns))
+            self._count(len(patterns))
+        else:
+            pictures = self._pictures.take(patterns, self._count)
+            for c in range(self._pictures.channels):
+                self._write(number, c, pictures)
+        return pictures
+
+    def _count(self, pictures: int) -> None:
+        self.done += pictures
+        self._progress(self.done)
+
+    def _read(self, number: int, count: int) -> list[Picture]:
+        blocks = [self._store.block(c, number) for c in range(self._pictures.channels)]
+        pixels = self._store.layout.shape[0]
+        data: Any = [(block.matrix.data, block.variance) for block in blocks]
+        value, variance = np.reshape(data, (len(blocks), 2, -1, pixels)).transpose(1, 2, 0, 3)
+        if len(value) != count:
+            what = f"{len(value)} pictures in batch {number}; they must be {count}"
+            raise AcquisitionError(f"{self._store.path} holds {what}: it is that of another scan")
+        return list(map(Picture, value, variance))
+
+    def _write(self, number: int, c: int, pictures: list[Picture]) -> None:
+        rows, pixels = self._store.layout.block_shape(number, "columns")
+        value, variance = np.concatenate([(p.value[c], p.variance[c]) for p in pictures], axis=1)
+        places = np.tile(np.arange(pixels, dtype=np.int32), len(pictures))
+        ends = np.minimum(np.arange(rows + 1), len(pictures)) * pixels  # rows without a picture are empty
+        matrix = scipy.sparse.csr_array((value, places, ends), shape=(rows, pixels))
+        self._store.write(c, number, matrix, variance)

@@ -110,9 +110,9 @@ def _settle(E: Any, share: np.ndarray, lost: np.ndarray) -> Any:
     """d E d with d (E d + lost) = share; the last step scales rows alone, to make that exact."""
     scale = np.ones(len(share))
     for _ in range(_ROUNDS):
-        off = share / (scale * (E @ scale + lost))
-        scale *= np.sqrt(off)
-        if np.abs(off - 1).max() < _CLOSE:
+        correction = share / (scale * (E @ scale + lost))
+        scale *= np.sqrt(correction)
+        if np.abs(correction - 1).max() < _CLOSE:
             break
     rows = share / (E @ scale + lost)
     return scipy.sparse.diags_array(rows) @ E @ scipy.sparse.diags_array(scale)

@@ -141,9 +141,9 @@ class GlossyScene:
             self.channels * 8 * patches**2 + 4 * block,
         )
         light = np.eye(patches)
-        parts = [slice(start, start + _COLUMNS) for start in range(0, patches, _COLUMNS)]
+        slices = [slice(start, start + _COLUMNS) for start in range(0, patches, _COLUMNS)]
         return tuple(
-            np.concatenate([sum(self._pictures(albedo, light[:, part])) for part in parts], axis=1)
+            np.concatenate([sum(self._pictures(albedo, light[:, columns])) for columns in slices], axis=1)
             for albedo in self.matte.albedo
         )
 
@@ -342,10 +342,10 @@ def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, Viewer]:
 
 def _blocks(room: Any, more: Any) -> tuple[tuple[Block, ...], np.ndarray]:
     """All blocks, and their corners (B, 2, 3)."""
-    given = tuple(more) if isinstance(more, Sequence) else (more,)
-    if not all(isinstance(block, Block) for block in given):
+    added = tuple(more) if isinstance(more, Sequence) else (more,)
+    if not all(isinstance(block, Block) for block in added):
         raise InputTypeError(f"blocks is {more!r}; it must be a sequence of ltcl.scenes.Block")
-    every = (*(room.blocks if isinstance(room, Scene) else ()), *given)
+    every = (*(room.blocks if isinstance(room, Scene) else ()), *added)
     return every, np.array([(block.low, block.high) for block in every]).reshape(-1, 2, 3)
 
 

@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A projector and a camera with a known map between them, and maps to choose from."""
+"""Maps from a camera to a projector, a camera whose direct light is known, and photographs of Gray code."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 from scipy.special import ndtr
+
+from ltcl.acquisition.geometry import GrayCode
 
 Map = tuple[np.ndarray, np.ndarray]
 
@@ -25,59 +30,51 @@ def folded(camera: tuple[int, int], grid: tuple[int, int]) -> Map:
     return x - 0.3 * bend * (grid[1] - 1) / 2, y + 0.08 * bend * (grid[0] - 1)
 
 
-def distorted(camera: tuple[int, int], grid: tuple[int, int]) -> Map:
-    """Radial distortion of a lens, five per cent at the corners."""
-    x, y = homography(camera, grid)
-    cx, cy = (grid[1] - 1) / 2, (grid[0] - 1) / 2
-    r2 = ((x - cx) ** 2 + (y - cy) ** 2) / (cx**2 + cy**2)
-    return cx + (x - cx) * (1 - 0.05 * r2), cy + (y - cy) * (1 - 0.05 * r2)
-
-
-MAPS = {"homography": homography, "fold": folded, "distortion": distorted}
+MAPS = {"homography": homography, "fold": folded}
 
 
 def light_transport(x: np.ndarray, y: np.ndarray, grid: tuple[int, int], blur: float = 0.35):
     """Direct light (M, N): projector pixels are squares blurred by `blur`; camera pixels average."""
     slopes = [np.gradient(a, axis=k) if a.shape[k] > 1 else 0 * a for a in (x, y) for k in (0, 1)]
-    sx = np.sqrt(blur**2 + (slopes[0] ** 2 + slopes[1] ** 2) / 6).ravel()
-    sy = np.sqrt(blur**2 + (slopes[2] ** 2 + slopes[3] ** 2) / 6).ravel()
-    wide = [list(_weights(c.ravel(), s, n)) for c, s, n in ((x, sx, grid[1]), (y, sy, grid[0]))]
     total = scipy.sparse.csr_array((x.size, grid[0] * grid[1]))
     rows = np.arange(x.size)
-    for a, wa, ina in wide[0]:
-        for b, wb, inb in wide[1]:
-            seen = ina & inb
-            entries = ((wa * wb)[seen], (rows[seen], (b * grid[1] + a)[seen]))
+    wide = []
+    for c, n, (a, b) in ((x, grid[1], slopes[:2]), (y, grid[0], slopes[2:])):
+        centre, s = c.ravel(), np.sqrt(blur**2 + (a**2 + b**2) / 6).ravel()
+        reach = int(np.ceil(4 * s.max())) + 1
+        places = [np.round(centre).astype(int) + k for k in range(-reach, reach + 1)]
+        wide.append([(p, ndtr((p + 0.5 - centre) / s) - ndtr((p - 0.5 - centre) / s), n) for p in places])
+    for column, weight_x, w in wide[0]:
+        for row, weight_y, h in wide[1]:
+            seen = (column >= 0) & (column < w) & (row >= 0) & (row < h)
+            entries = ((weight_x * weight_y)[seen], (rows[seen], (row * w + column)[seen]))
             total = total + scipy.sparse.csr_array(entries, shape=total.shape)
     return total
 
 
-def _weights(centre: np.ndarray, s: np.ndarray, n: int):
-    reach = int(np.ceil(4 * s.max())) + 1
-    for k in range(-reach, reach + 1):
-        place = np.round(centre).astype(int) + k
-        weight = ndtr((place + 0.5 - centre) / s) - ndtr((place - 0.5 - centre) / s)
-        yield place, weight, (place >= 0) & (place < n)
+def photographs(x: np.ndarray, y: np.ndarray, grid: tuple[int, int], noise: float, random: Any, **light: Any):
+    """Of Gray code: albedo 0.6, an even part `indirect` of all light, and noise."""
+    T, indirect = light_transport(x, y, grid), light.get("indirect", 0.0)
+    for codes in GrayCode(grid).patterns():
+        image = 0.6 * (T @ codes.ravel()).reshape(x.shape) + indirect * codes.mean()
+        yield np.maximum(image + noise * random.standard_normal(x.shape), 0.0).astype(np.float32)
 
 
-class Rig:
-    """Photographs of a scene: direct light, an even share of all light, noise, 8 bits or none."""
+Place = Callable[[Any, Any], tuple[Any, Any]]
 
-    def __init__(
-        self, x, y, grid, *, noise=0.005, indirect=0.0, gamma=1.0, bits=None, albedo=0.6, full=1 / 60, seed=1
-    ) -> None:
-        self.T = light_transport(x, y, grid)
-        self.shape, self.noise, self.indirect, self.gamma = x.shape, noise, indirect, gamma
-        self.bits, self.albedo, self.full = bits, albedo, full
-        self.rng, self.count = np.random.default_rng(seed), 0
 
-    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
-        """The scene under `codes`; `full` seconds give the albedo its own value."""
-        self.count += 1
-        light = codes.astype(np.float64) ** self.gamma
-        image = self.albedo * (self.T @ light.ravel()).reshape(self.shape) + self.indirect * light.mean()
-        image = image * seconds / self.full + self.noise * self.rng.standard_normal(self.shape)
-        image = np.clip(image, 0.0, 1.0)
-        if self.bits:
-            image = np.round(image * (2**self.bits - 1)) / (2**self.bits - 1)
-        return image.astype(np.float32)
+def turned(grid: tuple[int, int], size: float, turn: float, shift: tuple[float, float] = (0, 0), wide=1.25):
+    """Places of a camera of `size` pixels to one of the projector's, turned and shifted; its grid."""
+    (h, w), (H, W) = grid, (int(wide * size * n) for n in grid)
+
+    def place(u: Any, v: Any) -> tuple[Any, Any]:
+        a, b = (u - W / 2) / size, (v - H / 2) / size
+        return a + turn * b + (w - 1) / 2 + shift[0], b - turn * a + (h - 1) / 2 + shift[1]
+
+    return place, (H, W)
+
+
+def places(place: Place, camera: tuple[int, int]) -> Map:
+    """x and y of the middle of every camera pixel."""
+    v, u = np.mgrid[: camera[0], : camera[1]].astype(float)
+    return place(u, v)

@@ -12,15 +12,7 @@ import pytest
 import scipy.ndimage
 import scipy.sparse
 
-from ltcl.acquisition import (
-    Calibration,
-    Report,
-    Setup,
-    VirtualRig,
-    acquire,
-    camera_map,
-    forecast_picture,
-)
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire, camera_map, forecast_picture
 from ltcl.acquisition.calibrate import measure as calibrate
 from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness
 from ltcl.acquisition.radiometry import Response
@@ -29,6 +21,7 @@ from ltcl.errors import AcquisitionError, FileError
 from ltcl.store import BlockStore
 
 from ..scanning.helpers import corner
+from .scenes import turned
 
 GRID = (8, 16)
 random = np.random.default_rng()
@@ -43,54 +36,32 @@ def shown(codes: np.ndarray, q: tuple[float, float]) -> np.ndarray:
     return codes
 
 
-@pytest.mark.parametrize("q", [(0.0, 0.0), (0.1, 0.3), (0.45, 0.02)])
+@pytest.mark.parametrize("q", [(0.0, 0.0), (0.1, 0.3), (0.45, 0.02), (0.2, 0.2)])
 @pytest.mark.parametrize("grid", [(8, 16), (32, 40)])
-@pytest.mark.parametrize("narrow", [False, True])
-def test_blur_is_measured(q: tuple[float, float], grid: tuple[int, int], narrow: bool) -> None:
+def test_blur_is_measured_and_the_error_of_pictures_of_noise(
+    q: tuple[float, float], grid: tuple[int, int]
+) -> None:
     """With noise and with light from elsewhere, which is even; of walls that are not."""
     albedo = random.uniform(0.3, 0.9, grid)
-    photographs = [
-        (codes, albedo * (shown(codes, q) + 0.2 * codes.mean()) + 0.003 * random.normal(size=grid))
-        for codes in GrayCode(grid, narrow).patterns()
+    light = [
+        albedo * (shown(codes, q) + 0.2 * codes.mean()) + 0.003 * random.normal(size=grid)
+        for codes in GrayCode(grid).patterns()
     ]
-    photographs = [(codes, image.astype(np.float32)) for codes, image in photographs]
-    found = Sharpness.of(Correspondence.aligned(grid), Resampling.aligned(grid), photographs)
-    np.testing.assert_allclose(found.leak, q, atol=0.02)
-
-
-def test_with_too_few_patterns_the_map_decides() -> None:
-    """Three pairs of photographs without blur are too few; camera pixels half a pixel further mix two."""
-    y, x = np.mgrid[: GRID[0], : GRID[1]] * 1.0
-    half = Correspondence(x - 0.5, y - 0.5, np.ones(GRID), np.ones(GRID, bool), GRID)
-    R = Resampling.of(half)
-    photographs = [(codes, codes) for codes in GrayCode(GRID).patterns()]
-    for part in (photographs[:6], ()):
-        found = Sharpness.of(half, R, part)
-        assert all(0.3 < q < 0.6 for q in found.leak)
-        with pytest.raises(AcquisitionError, match="camera pixels are"):
-            found.check()
-
-
-@pytest.mark.parametrize("q", [(0.1, 0.1), (0.2, 0.3), (0.4, 0.0)])
-def test_blur_is_the_error_of_pictures_of_noise(q: tuple[float, float]) -> None:
+    sharpness = Sharpness.of(Correspondence.aligned(grid), Resampling.aligned(grid), light)
+    np.testing.assert_allclose(sharpness.leak, q, atol=0.02)
     p = random.random((200, 200))
     wrong = np.linalg.norm(shown(p, q) - p) / np.linalg.norm(p)
-    assert Sharpness(q, 0.2).blur == pytest.approx(wrong, rel=0.15)
+    assert Sharpness(q, 0.0).blur == pytest.approx(wrong, rel=0.05)
 
 
 def view(size: float, blur: float = 0.0) -> tuple[scipy.sparse.csr_array, tuple[int, int]]:
-    """A camera of `size` pixels to one of the projector's, slightly turned, and out of focus."""
-    (h, w), (H, W) = GRID, (round(1.15 * size * n) for n in GRID)
-
-    def place(u: Any, v: Any) -> tuple[Any, Any]:
-        a, b = (u - W / 2) / size, (v - H / 2) / size
-        return a + 0.06 * b + w / 2 - 0.4, b - 0.06 * a + h / 2 - 0.6
-
-    C = camera_map(place, (H, W), GRID)
-    if blur:
-        one = C.toarray().reshape(H, W, -1)
-        C = scipy.sparse.csr_array(scipy.ndimage.gaussian_filter(one, (blur, blur, 0)).reshape(H * W, -1))
-    return C, (H, W)
+    """What a camera of `size` pixels to one of the projector's sees, slightly turned, and out of focus."""
+    place, (H, W) = turned(GRID, size, 0.06, (0.1, -0.1), 1.15)
+    C = camera_map(place, (H, W), GRID).toarray().reshape(H, W, -1)
+    return scipy.sparse.csr_array(scipy.ndimage.gaussian_filter(C, (blur, blur, 0)).reshape(H * W, -1)), (
+        H,
+        W,
+    )
 
 
 def camera(size: float, blur: float = 0.0, T: Any = None, **options: Any) -> VirtualRig:
@@ -134,18 +105,17 @@ def test_it_is_stored_reported_and_forecast(tmp_path: Path) -> None:
     stored, report = Calibration.of(path).sharpness, Report.of(path)
     assert stored is not None
     assert (report.sharpness, report.blur) == (stored.own, stored.blur)
-    assert Setup.of(path).calibration.resampling.doubtful is not None
     p = random.random(GRID)
     seen, truth = np.asarray(T @ p).ravel()[~T.masked], (corner() @ p.ravel())[~T.masked]
     scale = (seen @ truth) / (seen @ seen)
     error = np.linalg.norm(scale * seen - truth) / np.linalg.norm(truth)
-    forecast = forecast_picture(path, p, draws=4).ravel()[~T.masked]
+    forecast = forecast_picture(path, p).ravel()[~T.masked]
     assert error > 0.05
     assert 0.5 * error < np.linalg.norm(forecast) / np.linalg.norm(seen) < 1.5 * error
 
 
 def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_path: Path) -> None:
-    """Gray code does not decode in it: pixels at its rim were made of camera pixels of the bright walls."""
+    """Few camera pixels there are decoded: pixels at its rim were made of those of the bright walls."""
     albedo, patch = np.full(GRID, 0.8), np.zeros(GRID, bool)
     patch[2:6, 3:7] = True
     albedo[patch] = 0.015
@@ -153,7 +123,7 @@ def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_pat
     between = corner() / 0.6 - np.eye(len(rho))  # light between walls, of rows of albedo 0.6
     truth = rho[:, None] * (np.eye(len(rho)) + between * rho)
     path = tmp_path / "T.zarr"
-    T = acquire(camera(3.7, T=truth, response="srgb"), strategy="hadamard", store=path)
+    T = acquire(camera(2.5, T=truth, response="srgb"), strategy="hadamard", store=path)
     doubtful = Calibration.of(path).resampling.doubtful
     assert doubtful is not None
     assert doubtful.any()
@@ -168,15 +138,12 @@ def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_pat
     assert scale * rows.min() > -0.01 * exact.max()  # what errors of the map make of bright walls
 
 
-def test_a_store_of_an_earlier_ltcl_is_named(tmp_path: Path) -> None:
+def test_a_store_of_an_earlier_ltcl_is_named(tmp_path: Path, monkeypatch: Any) -> None:
     path = tmp_path / "T.zarr"
     acquire(VirtualRig(0.5 * np.eye(32), (4, 8), bits=12), geometry="aligned", strategy="pixel", store=path)
     assert Calibration.of(path).sharpness is None
 
-    class Earlier(BlockStore):
-        @property
-        def extras(self) -> Any:
-            return [name for name in super().extras if not name.endswith("doubtful")]
-
+    extras = [name for name in BlockStore.open(path).extras if not name.endswith("doubtful")]
+    monkeypatch.setattr(BlockStore, "extras", property(lambda store: extras))
     with pytest.raises(FileError, match="earlier ltcl"):
-        Calibration.of(Earlier.open(path))
+        Calibration.of(path)

@@ -28,35 +28,22 @@ def test_merged_radiance_is_unbiased_and_its_variance_true(curve, levels):
     shots = [camera.shoot(light, t, random) for t in SECONDS]
     merged = merge(shots, SECONDS, camera.response, camera.noise)
     assert merged.valid.mean() > 0.999
-    off = np.where(merged.valid, merged.value - light, 0.0)
-    bias = off.mean(axis=1) / off.std(axis=1)
-    assert np.abs(bias).max() < 0.05
-    z = off / np.sqrt(merged.variance)
+    error = np.where(merged.valid, merged.value - light, 0.0)
+    assert np.abs(error.mean(axis=1) / error.std(axis=1)).max() < 0.05
+    z = error / np.sqrt(merged.variance)
     assert z.std(axis=1) == pytest.approx(np.ones(STEPS), abs=0.05)
 
 
-def test_it_is_as_good_as_the_noise_allows():
-    """Variance against the bound of Cramer and Rao, where the exposures that may count are clear."""
-    camera, light = Camera("linear", 4096), np.full((200, 200), 0.2)
-    merged = merge([camera.shoot(light, t, random) for t in SECONDS], SECONDS, camera.response, camera.noise)
-    t = np.array(SECONDS)
-    best = 1.0 / np.sum(t**2 / camera.noise.variance(0.2 * t))
-    assert np.var(merged.value) == pytest.approx(best, rel=0.05)
-
-
-def test_without_light_radiance_scatters_about_zero():
-    camera = Camera("linear", 4096, black=0.02)
-    merged = merge(
-        [camera.shoot(np.zeros((300, 300)), t, random) for t in SECONDS],
-        SECONDS,
-        camera.response,
-        camera.noise,
-    )
+@pytest.mark.parametrize("light", [0.0, 0.2])
+def test_it_is_as_good_as_the_noise_allows(light):
+    """The bound of Cramer and Rao where all exposures are clear; without light radiance scatters about 0."""
+    camera, t = Camera("linear", 4096, black=0.02), np.array(SECONDS)
+    shots = [camera.shoot(np.full((200, 200), light), seconds, random) for seconds in SECONDS]
+    merged = merge(shots, SECONDS, camera.response, camera.noise)
+    bound = 1.0 / np.sum(t**2 / camera.noise.variance(light * t))
     assert merged.valid.all()
-    assert (merged.value < 0).mean() == pytest.approx(0.5, abs=0.02)
-    z = merged.value / np.sqrt(merged.variance)
-    assert abs(z.mean()) < 4 / 300
-    assert z.std() == pytest.approx(1.0, abs=0.03)  # a variance is that of light, never of less than none
+    assert abs(merged.value.mean() - light) < 4 * np.sqrt(bound) / 200
+    assert [np.var(merged.value), merged.variance.mean()] == pytest.approx([bound, bound], rel=0.05)
 
 
 def test_pixels_without_a_valid_exposure_are_masked():
@@ -71,45 +58,22 @@ def test_pixels_without_a_valid_exposure_are_masked():
     assert merged.value[0, 2] == pytest.approx(100 / 255, rel=1e-2)
 
 
-def test_saturated_photographs_have_no_weight():
-    light = np.array([[3.0, 0.3]])
-    shots = [np.minimum(light * t, 1.0) for t in (0.1, 1.0, 10.0)]
-    merged = merge(shots, [0.1, 1.0, 10.0])
-    np.testing.assert_allclose(merged.value, light, rtol=1e-6)
-
-
-def test_one_photograph_is_enough():
-    shot = np.array([[0.2, 0.5], [0.7, 1.0]])
-    merged = merge([shot], [0.5])
-    np.testing.assert_allclose(merged.value[merged.valid], [0.4, 1.0, 1.4], rtol=1e-6)
-    variance = NoiseModel().variance(np.array([0.2, 0.5, 0.7])) / 0.25
-    np.testing.assert_allclose(merged.variance[merged.valid], variance, rtol=1e-3)
-    assert merged.valid.tolist() == [[True, True], [True, False]]
-
-
-def test_repeated_photographs_average():
-    shots = [np.full((2, 2), 0.3), np.full((2, 2), 0.5), np.full((2, 2), 0.4)]
-    merged = merge(shots, [1.0, 1.0, 1.0])
-    np.testing.assert_allclose(merged.value, 0.4, rtol=1e-6)
-    np.testing.assert_allclose(merged.variance, NoiseModel().variance(0.4) / 3, rtol=1e-3)
-
-
-@pytest.mark.parametrize("black", [0.1, [0.1, 0.1, 0.1]])
-def test_black_is_subtracted_and_nothing_is_clipped(black):
-    shots = [0.1 + t * np.linspace(-0.05, 0.2, 105).reshape(5, 7, 3) for t in (1.0, 2.0)]
-    merged = merge(shots, [1.0, 2.0], black=black)
-    np.testing.assert_allclose(merged.value, shots[0] - 0.1, atol=1e-6)
+@pytest.mark.parametrize("shots", [[0.4], [0.3, 0.5, 0.4]])
+def test_the_mean_of_repeated_photographs_and_its_variance(shots):
+    """Tabulated weights are good to a thousandth."""
+    merged = merge([np.array([[shot, 1.0]]) for shot in shots], [0.5] * len(shots))
+    np.testing.assert_allclose(merged.value, [[0.8, 0.0]], rtol=1e-6)
+    np.testing.assert_allclose(merged.variance[0, 0], NoiseModel().variance(0.4) * 4 / len(shots), rtol=1e-3)
+    assert merged.valid.tolist() == [[True, False]]
 
 
 def test_each_channel_has_its_own_response():
     cameras = [Camera(curve, 65536, electrons=1e9, read=0.0) for curve in ("srgb", "gamma2.2", "film")]
     response = Response(np.concatenate([camera.response.values for camera in cameras]))
-    light = corner(32)
-    shots = [np.stack([camera.shoot(light, t, random) for camera in cameras], axis=-1) for t in (0.5, 1.0)]
+    shots = [np.stack([camera.shoot(corner(32), t, random) for camera in cameras], axis=-1) for t in (0.5, 1)]
     merged = merge(shots, [0.5, 1.0], response, NoiseModel(1e9, 1e-5))
-    np.testing.assert_allclose(
-        merged.value[merged.valid], np.stack([light] * 3, axis=-1)[merged.valid], rtol=4e-3
-    )
+    ratio = merged.value / corner(32)[..., None]
+    np.testing.assert_allclose(ratio[merged.valid], 1.0, rtol=4e-3)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 1, 3), (53, 7), (170, 211, 3)])
@@ -120,15 +84,6 @@ def test_any_size(shape):
     assert merged.value.shape == merged.variance.shape == merged.valid.shape == shape
     assert (merged.value.dtype, merged.variance.dtype, merged.valid.dtype) == (np.float32, np.float32, bool)
     np.testing.assert_allclose(merged.value, light, rtol=1e-4)
-
-
-def test_the_difference_of_two_pictures_adds_variances():
-    one, two = merge([np.full((1, 2), 0.5)], [1.0]), merge([np.array([[0.2, 1.0]])], [1.0])
-    left = one - two
-    np.testing.assert_allclose(left.value, [[0.3, 0.0]], rtol=1e-6)
-    np.testing.assert_allclose(left.variance[0, 0], one.variance[0, 0] + two.variance[0, 0])
-    assert left.valid.tolist() == [[True, False]]
-    assert np.isinf(left.variance[0, 1])
 
 
 @pytest.mark.parametrize(
@@ -145,67 +100,41 @@ def test_bad_input_is_refused(options, part):
         merge([np.full((4, 4), 0.1), np.full((4, 4), 0.2)], [1.0, 2.0], **options)
 
 
-def eight_bits(*shots: np.ndarray) -> list[np.ndarray]:
-    return [np.rint(np.clip(shot, 0, 1) * 255).astype(np.uint8) for shot in shots]
+def few(light: float, noise: float, ratio: float, pixels: int = 6) -> tuple[list[np.ndarray], list[float]]:
+    """Some pixels in eight bits, of `ratio` the light in the second photograph; others are saturated."""
+    shots = np.ones((2, 200))
+    shots[:, :pixels] = light * np.array([[1.0], [ratio]]) + random.normal(0, noise, (2, pixels))
+    return list(np.rint(np.clip(shots, 0, 1) * 255).astype(np.uint8).reshape(2, 10, 20)), [1.0, 2.0]
 
 
-@pytest.mark.parametrize("clear", [1, 2, 3, 8, 64])
-@pytest.mark.parametrize(
-    ("light", "noise", "ratio"), [(0.15, 0.05, 1.1), (0.002, 0.01, 2.0), (0.12, 0.1, 1.5)]
-)
-def test_a_few_noisy_pixels_among_saturated_ones_are_in_order(clear, light, noise, ratio):
+@pytest.mark.parametrize("pixels", [1, 3, 64])
+@pytest.mark.parametrize(("light", "noise", "ratio"), [(0.15, 0.05, 1.2), (0.002, 0.01, 2.0)])
+def test_a_few_noisy_pixels_among_saturated_ones_are_in_order(pixels, light, noise, ratio):
     """Three in 100000 are refused by chance."""
-    refused = 0
-    for _ in range(300):
-        shots = np.ones((2, 200))
-        shots[:, :clear] = light * np.array([[1.0], [ratio]]) + random.normal(0, noise, (2, clear))
-        try:
-            merge(eight_bits(*shots.reshape(2, 10, 20)), [1.0, ratio])
-        except InputError:
-            refused += 1
-    assert refused <= 1
+    for _ in range(200):
+        shots, _ = few(light, noise, ratio, pixels)
+        assert merge(shots, [1.0, ratio]).value.shape == (10, 20)
 
 
 @pytest.mark.parametrize("bits", [8, 14])
-@pytest.mark.parametrize("black", [0.004, 0.0625, 0.16])
-@pytest.mark.parametrize("gamma", [1.0, 2.2])
-@pytest.mark.parametrize("lit", [0.0, 0.01, 0.1, 0.3])
-def test_a_dark_picture_is_as_dark_at_any_exposure(bits, black, gamma, lit):
-    """Black cloth around a few pixels that are lit, or around none, for a camera of any offset."""
-    light = np.zeros((40, 60))
+@pytest.mark.parametrize("black", [0.004, 0.16])
+@pytest.mark.parametrize(("lit", "hot"), [(0.0, 0.0), (0.01, 0.0), (0.3, 0.0), (0.0, 0.01)])
+def test_a_dark_picture_is_as_dark_at_any_exposure(bits, black, lit, hot):
+    """Black cloth around some pixels that are lit, around hot ones, which never change, or around none."""
+    light, stuck = np.zeros((40, 60)), random.random((40, 60)) < hot
     light.flat[: int(lit * light.size)] = 0.03 * random.random(int(lit * light.size))
-    for ratio in (1.5, 4.0, 60.0):
+    for ratio in (1.5, 60.0):
         shots = []
         for t in (1.0, ratio):
             value = random.poisson(light * t * 1e4) / 1e4 + random.normal(0, 5e-4, light.shape)
-            codes = black + (1 - black) * np.clip(value, 0, 1) ** (1 / gamma)
-            shots.append(np.rint((2**bits - 1) * codes).astype(np.uint16))
+            codes = black + (1 - black) * np.clip(value, 0, 1) ** (1 / 2.2)
+            shots.append(np.rint((2**bits - 1) * np.where(stuck, 0.7, codes)).astype(np.uint16))
         assert merge(shots, [1.0, ratio], levels=2**bits).valid.any()
 
 
-def test_hot_pixels_do_not_decide_the_order():
-    shots = [np.full((20, 20), 2, np.uint8) for _ in range(2)]
-    for shot in shots:
-        shot.flat[:4] = 128
-    value = merge(shots, [1.0, 4.0]).value[1:]
-    assert np.all((value >= 0.5 / 255) & (value <= 2 / 255))  # as after 4 s, and as after 1 s
-
-
-def exchanged() -> tuple[list[np.ndarray], list[float]]:
+def bracket(order: list[int]) -> tuple[list[np.ndarray], list[float]]:
     shots = [Camera().shoot(corner(), t, random) for t in SECONDS]
-    return [*shots[:2], shots[3], shots[2], *shots[4:]], SECONDS
-
-
-def repeated() -> tuple[list[np.ndarray], list[float]]:
-    shots = [Camera().shoot(corner(), t, random) for t in SECONDS]
-    return [*shots[:3], shots[2], *shots[4:]], SECONDS
-
-
-def few(second: float, noise: float = 0.005) -> tuple[list[np.ndarray], list[float]]:
-    """Six pixels that are not saturated."""
-    shots = np.ones((2, 200))
-    shots[:, :6] = np.array([[0.4], [second]]) + random.normal(0, noise, (2, 6))
-    return eight_bits(*shots.reshape(2, 10, 20)), [1.0, 2.0]
+    return [shots[k] for k in order], SECONDS
 
 
 def constant(black: float) -> tuple[list[np.ndarray], list[float]]:
@@ -216,18 +145,17 @@ def constant(black: float) -> tuple[list[np.ndarray], list[float]]:
 
 
 @pytest.mark.parametrize(
-    ("case", "numbers"),
+    ("case", "later", "earlier"),
     [
-        (exchanged, (3, 2)),
-        (repeated, (3, 2)),
-        (lambda: few(0.2), (1, 0)),
-        (lambda: few(0.4), (1, 0)),
-        (lambda: constant(0.0), (1, 0)),
-        (lambda: constant(0.13), (1, 0)),
-        (lambda: ([np.full((4, 4), 0.2), np.full((4, 4), 0.1)], [1.0, 2.0]), (1, 0)),
+        (lambda: bracket([0, 1, 3, 2, 4, 5]), 3, 2),
+        (lambda: bracket([0, 1, 2, 2, 4, 5]), 3, 2),
+        (lambda: bracket([0, 2, 3, 4, 5, 1]), 5, 4),
+        (lambda: few(0.4, 0.005, 0.5), 1, 0),
+        (lambda: few(0.4, 0.005, 1.0), 1, 0),
+        (lambda: constant(0.0), 1, 0),
+        (lambda: constant(0.13), 1, 0),
     ],
 )
-def test_photographs_in_the_wrong_order_are_named(case, numbers):
-    later, earlier = numbers
-    with pytest.raises(InputError, match=rf"images\[{later}\] has .* s .* images\[{earlier}\]"):
+def test_photographs_in_the_wrong_order_are_named(case, later, earlier):
+    with pytest.raises(InputError, match=rf"images\[{later}\] .* images\[{earlier}\]"):
         merge(*case())

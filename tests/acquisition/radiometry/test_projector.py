@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
+"""Curves and colours of projectors against those that made the pictures."""
+
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ltcl.acquisition.radiometry import ProjectorResponse, Radiance, projector
-from ltcl.errors import InputError, InputTypeError
+from ltcl.acquisition.radiometry import ProjectorResponse, Radiance, mixing, projector_response
+from ltcl.errors import InputError
 from tests.acquisition.radiometry.cameras import CURVES, corner
 
 CODES = np.linspace(0, 1, 33)
@@ -20,31 +24,25 @@ def ramp(decode, sigma: float, scale: float = 1.0) -> list[Radiance]:
     return [Radiance(part + random.normal(0, sigma, ones.shape), sigma**2 * ones, ones > 0) for part in clean]
 
 
-@pytest.mark.parametrize("curve", CURVES)
-def test_the_projectors_curve_is_estimated(curve):
-    decode = CURVES[curve][1]
-    response = projector.measure(CODES, ramp(decode, 0.005))
-    codes = np.linspace(0, 1, 500)
-    np.testing.assert_allclose(response.linear(codes), decode(codes), atol=2e-3)
-    np.testing.assert_allclose(response.linear(response.codes(codes)), codes, atol=1e-5)
+@pytest.mark.parametrize("curves", [["linear"], ["gamma2.2"], ["srgb", "linear", "film"]])
+def test_the_projectors_curve_is_estimated_of_each_channel(curves):
+    decodes, codes = [CURVES[curve][1] for curve in curves], np.linspace(0, 1, 500)
+    response = projector_response(CODES, [ramp(decode, 0.005) for decode in decodes])
+    light, same = (
+        np.stack([decode(codes) for decode in ds], axis=-1) for ds in (decodes, [np.array] * len(curves))
+    )
+    np.testing.assert_allclose(response.linear(same), light, atol=2e-3)
+    np.testing.assert_allclose(response.linear(response.codes(same)), same, atol=1e-5)
     assert isinstance(response, ProjectorResponse)
 
 
 def test_noise_in_black_and_white_is_no_bias():
     """Noise as large as the light itself: the product of two noisy pictures would be far off."""
     at = np.array([0.25, 0.5, 0.75])
-    light = [projector.measure(CODES, ramp(lambda c: c, 0.1, 0.3)).linear(at) for _ in range(12)]
+    light = [projector_response(CODES, [ramp(lambda c: c, 0.1, 0.3)]).linear(at) for _ in range(12)]
     error = np.std(light, axis=0) / np.sqrt(len(light))
     assert np.all(np.abs(np.mean(light, axis=0) - at) < 4 * error)
     assert error.max() < 0.03
-
-
-def test_each_channel_has_a_curve():
-    names = ("srgb", "linear", "film")
-    response = projector.measure(CODES, [ramp(CURVES[name][1], 0.002) for name in names])
-    codes = np.linspace(0, 1, 50)
-    exact = np.stack([CURVES[name][1](codes) for name in names], axis=-1)
-    np.testing.assert_allclose(response.linear(np.stack([codes] * 3, axis=-1)), exact, atol=2e-3)
 
 
 def test_a_colour_that_the_channel_does_not_light_does_not_decide():
@@ -52,14 +50,14 @@ def test_a_colour_that_the_channel_does_not_light_does_not_decide():
     valid = np.full((4, 4, 3), True)
     light, variance, _ = np.broadcast_arrays([-2e-4, 0.3, 0.6], [1e-12, 3e-5, 6e-5], valid)
     pictures = [Radiance(c * light, variance, valid) for c in CODES]
-    np.testing.assert_allclose(projector.measure(CODES, pictures).linear(CODES), CODES, atol=0.01)
+    np.testing.assert_allclose(projector_response(CODES, [pictures]).linear(CODES), CODES, atol=0.01)
 
 
 def test_invalid_pixels_do_not_count():
     pictures = ramp(lambda c: c**2, 1e-4)
     pictures[5].valid[:8] = False
     pictures[5].value[:8] = 0.0
-    np.testing.assert_allclose(projector.measure(CODES, pictures).linear(CODES), CODES**2, atol=1e-3)
+    np.testing.assert_allclose(projector_response(CODES, [pictures]).linear(CODES), CODES**2, atol=1e-3)
 
 
 FLAT = Radiance(np.full((2, 2), 0.1), np.full((2, 2), 1e-6), np.full((2, 2), True))
@@ -67,15 +65,63 @@ DARK = Radiance(np.zeros((2, 2)), np.full((2, 2), np.inf), np.full((2, 2), False
 
 
 @pytest.mark.parametrize(
-    ("codes", "pictures", "error", "part"),
+    ("codes", "pictures", "part"),
     [
-        ([0.0, 0.5], [FLAT, FLAT], InputError, "codes is"),
-        ([0.0, 1.0], [FLAT], InputError, "pictures holds 1 .* 2"),
-        ([0.0, 1.0], [FLAT, FLAT.value], InputTypeError, r"pictures\[1\] is a ndarray"),
-        ([0.0, 1.0], [FLAT, FLAT], InputError, "pictures are no brighter"),
-        ([0.0, 1.0], [FLAT, DARK], InputError, "pictures have no pixel"),
+        ([0.0, 0.5], [FLAT, FLAT], "codes is"),
+        ([0.0, 1.0], [FLAT], r"channels\[0\] holds 1 .* 2"),
+        ([0.0, 1.0], [FLAT, FLAT], r"channels\[0\] are no brighter"),
+        ([0.0, 1.0], [FLAT, DARK], r"channels\[0\] have no pixel"),
     ],
 )
-def test_pictures_without_a_response_are_refused(codes, pictures, error, part):
-    with pytest.raises(error, match=part):
-        projector.measure(codes, pictures)
+def test_pictures_without_a_response_are_refused(codes, pictures, part):
+    with pytest.raises(InputError, match=part):
+        projector_response(codes, [pictures])
+
+
+M = np.array([[1.0, 0.3, 0.02], [0.1, 1.0, 0.2], [0.01, 0.15, 1.0]])
+WALL = np.stack([corner(64), 0.5 * corner(64)[::-1], 0.8 * corner(64).T], axis=-1)  # T in each channel
+BLACK = Radiance(np.zeros(WALL.shape), np.zeros(WALL.shape), np.full(WALL.shape, True))
+
+
+def lit(sigma: float, M: np.ndarray = M, ambient: float = 0.0) -> list[Radiance]:
+    clean = [ambient + WALL * M[:, d] for d in range(3)]
+    variance, valid = np.full(WALL.shape, sigma**2), np.full(WALL.shape, True)
+    return [Radiance(c + random.normal(0, sigma, c.shape), variance, valid) for c in clean]
+
+
+def test_the_mixing_of_a_set_up_is_estimated_without_bias_less_black():
+    black = replace(BLACK, value=BLACK.value + 0.3)
+    estimates = [mixing(lit(0.2, ambient=0.3), black) for _ in range(16)]
+    error = np.std(estimates, axis=0) / 4
+    bias = np.abs(np.mean(estimates, axis=0) - M)
+    assert np.all(bias[error > 0] < 4 * error[error > 0])
+    assert error.max() < 0.015
+    np.testing.assert_array_equal(np.diagonal(estimates[0]), 1.0)
+
+
+@pytest.mark.parametrize(("condition", "refused"), [(0.9e6, False), (1.1e6, True)])
+def test_mixings_are_refused_from_a_condition_number_of_a_million(condition, refused):
+    """[[1, 1 - d], [1 - d, 1]] has the condition number (2 - d) / d."""
+    d = 2.0 / (condition + 1.0)
+    nearly = np.array([[1.0, 1.0 - d, 0.0], [1.0 - d, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert np.linalg.cond(nearly) == pytest.approx(condition, rel=1e-6)
+    pictures = lit(0.0, nearly)
+    if refused:
+        with pytest.raises(InputError, match=r"condition number 1\.1e\+06"):
+            mixing(pictures, BLACK)
+    else:
+        np.testing.assert_allclose(mixing(pictures, BLACK), nearly, atol=1e-12)
+
+
+def test_pictures_without_a_mixing_are_refused():
+    good = lit(1e-3)
+    dark, unknown = replace(good[0], value=0 * WALL), replace(good[0], valid=np.zeros(WALL.shape, bool))
+    grey = replace(good[0], value=WALL[..., 0])
+    for pictures, part in (
+        (good[:2], "lit holds 2"),
+        ([dark, dark, dark], r"lit\[0\]"),
+        ([good[0], grey, good[2]], r"lit\[1\] has shape \(64, 64\)"),
+        ([unknown, *good[1:]], "lit have no pixel"),
+    ):
+        with pytest.raises(InputError, match=part):
+            mixing(pictures, BLACK)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ltcl.acquisition import Setup, VirtualRig, acquire
-from ltcl.acquisition.setup import has_calibration
+from ltcl.acquisition.calibration import has_calibration
 from ltcl.errors import FileError, InputError
 from ltcl.store import BlockStore
 
@@ -19,34 +19,33 @@ from .scanning.helpers import CLEAN, corner, rig
 random = np.random.default_rng(0)
 GRID = (4, 8)
 MIXING = np.array([[0.9, 0.15, 0.0], [0.05, 0.8, 0.1], [0.0, 0.2, 0.9]])
+CURVES = ["srgb", "gamma2.2", "linear"]
+UNEVEN = np.tile(np.linspace(0.05, 0.15, 8), 4)
 
 
-def scanned(made: VirtualRig, store: Path, strategy: str = "pixel", **options: Any) -> tuple[Any, Setup]:
-    return acquire(made, geometry="aligned", strategy=strategy, store=store, **options), Setup.of(store)
+def scanned(scene: VirtualRig, store: Path, strategy: str = "pixel", **options: Any) -> tuple[Any, Setup]:
+    return acquire(scene, geometry="aligned", strategy=strategy, store=store, **options), Setup.of(store)
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_picture_is_transport_of_light_and_ambient(tmp_path: Path, channels: int) -> None:
     """In the units of T: a is what the projector's black and the lamps of the room leave."""
-    uneven = np.tile(np.linspace(0.05, 0.15, 8), 4)
-    colours: list[Any] = []
-    room: dict[str, Any] = {"ambient": uneven, "projector_black": 0.03, "response": "film"}
-    if channels == 3:
-        curves, colours = ["srgb", "gamma2.2", "linear"], [corner(4, albedo) for albedo in (0.7, 0.5, 0.3)]
-        room = {"ambient": [0.02, 0.01, 0.03], "mixing": MIXING, "projector_response": curves, "bits": 12}
-    made = rig(4, **room) if channels == 1 else VirtualRig(colours, GRID, **room)
-    T, setup = scanned(made, tmp_path / "T.zarr")
+    if channels == 1:
+        scene = rig(4, ambient=UNEVEN, projector_black=0.03, response="film")
+    else:
+        colours = [corner(4, albedo) for albedo in (0.7, 0.5, 0.3)]
+        room: dict[str, Any] = {"ambient": [0.02, 0.01, 0.03], "mixing": MIXING, "bits": 12}
+        scene = VirtualRig(colours, GRID, projector_response=CURVES, **room)
+    T, setup = scanned(scene, tmp_path / "T.zarr")
     shape = GRID if channels == 1 else (*GRID, 3)
     assert (setup.channels, setup.ambient.shape) == (channels, shape)
-    for p in (random.random(shape).astype(np.float32), np.zeros(shape, np.float32)):
-        for given, expected in (
-            (np.asarray(T @ p) + setup.ambient, made.radiance(setup.codes(p))),
-            (setup.white + setup.ambient, made.radiance(np.ones(shape))),
-        ):
-            for ours, theirs in zip(given.reshape(32, -1).T, expected.reshape(32, -1).T, strict=True):
-                scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
-                assert np.linalg.norm(scale * ours - theirs) < 0.02 * np.linalg.norm(theirs)
-    assert max(setup.relative_error(made, T)) < 0.02
+    p, black = random.random(shape).astype(np.float32), np.zeros(shape, np.float32)
+    for light in (p, black, np.ones(shape)):
+        picture, expected = np.asarray(T @ light) + setup.ambient, scene.radiance(setup.codes(light))
+        for ours, theirs in zip(picture.reshape(32, -1).T, expected.reshape(32, -1).T, strict=True):
+            scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
+            assert np.linalg.norm(scale * ours - theirs) < 0.02 * np.linalg.norm(theirs)
+    assert max(setup.relative_error(scene, T)) < 0.02
 
 
 def test_codes_give_the_light_that_is_asked_for(tmp_path: Path) -> None:
@@ -61,13 +60,12 @@ def test_codes_give_the_light_that_is_asked_for(tmp_path: Path) -> None:
 
 
 def test_blocks_are_fed_to_the_pixels_of_the_projector(tmp_path: Path) -> None:
-    made = rig(4, **CLEAN)
-    T, setup = scanned(made, tmp_path / "T.zarr", "block", block=2, sigmas=0.0)
+    T, setup = scanned(rig(4, **CLEAN), tmp_path / "T.zarr", "block", block=2, sigmas=0.0)
     assert T.grid == setup.grid == setup.ambient.shape == (2, 4)
     codes = setup.codes(np.arange(8).reshape(2, 4) / 7)
     assert codes.shape == GRID
     np.testing.assert_array_equal(codes[:2, 2:4], codes[0, 2])
-    assert setup.relative_error(made, T)[0] < 0.01
+    assert setup.relative_error(rig(4, **CLEAN), T)[0] < 0.01
     mirrored = VirtualRig(corner(4)[:, ::-1].copy(), GRID, bits=12)
     assert setup.relative_error(mirrored, T)[0] > 0.2
 

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Columns of T: decoded with the least variance, without mere noise, in rows that add up to white."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from ltcl.acquisition.scanning import Hadamard, Pixels, columns
+from ltcl.acquisition.scanning.columns import balance, significant
+from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture
+from ltcl.errors import InputError
+
+random = np.random.default_rng(0)
+GRID = (24, 20)
+M = 480
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 3, 5, 16, 63])
+@pytest.mark.parametrize("code", [Pixels(), Hadamard()], ids=["pixel", "hadamard"])
+def test_columns_come_back_without_noise(code: columns.Code, pixels: int) -> None:
+    T, P = random.random((pixels, 4)), code.patterns(pixels)
+    assert len(P) == columns.patterns(code, pixels)
+    assert P.any(axis=1).all()  # no pattern is black
+    x, variance = code.decode(P @ T, np.full((len(P), 4), 1e-4), np.zeros(4))
+    np.testing.assert_allclose(x[:pixels], T, atol=1e-12)
+    assert variance[:pixels].shape == T.shape
+
+
+@pytest.mark.parametrize("code", [Pixels(6), Hadamard(7), Hadamard(31)])
+def test_it_is_generalised_least_squares(code: columns.Code) -> None:
+    """Of all linear estimates with y = A x + n - e 1, cov n = diag(v), var e = a: (A' K A)^-1 A' K y."""
+    A, a = code.patterns(code.size).astype(float), 0.3
+    v, y = random.random(len(A)) + 0.1, random.random(len(A))
+    K = np.linalg.inv(np.diag(v) + a)
+    C = np.linalg.inv(A.T @ K @ A)
+    x, variance = code.decode(y[:, None], v[:, None], np.array([a]))
+    np.testing.assert_allclose(x[:, 0], C @ A.T @ K @ y, rtol=1e-9)
+    np.testing.assert_allclose(variance[:, 0], np.diag(C), rtol=1e-9)
+
+
+def test_a_column_that_no_photograph_shows_comes_from_the_sum() -> None:
+    x, v = np.array([0.3, 0.0, 0.1]), np.array([1e-6, UNKNOWN, 1e-6, 4e-6])
+    decoded, variance = Pixels(3).decode(np.append(x, 0.9)[:, None], v[:, None], np.zeros(1))
+    assert decoded[1, 0] == pytest.approx(0.9 - 0.3 - 0.1, rel=1e-6)
+    assert variance[1, 0] == pytest.approx(6e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [0, 2, 64, 1.5])
+def test_other_sizes_are_refused(size: float) -> None:
+    with pytest.raises(InputError, match=f"size is {size}"):
+        Hadamard(size)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_weak_block_is_significant_though_no_entry_stands_out() -> None:
+    value, block = 0.3 * random.standard_normal((200, M)), np.zeros(GRID, bool)
+    block[4:12, 8:16] = True
+    value[:, block.ravel()] += 1.0
+    value = np.clip(value, -2.9, 2.9)  # below three standard deviations, all of them
+    keep = significant(value, np.ones_like(value), GRID)
+    assert keep[:, block.ravel()].mean() > 0.999
+    assert np.sum(value[keep]) == pytest.approx(np.sum(value), rel=0.05)
+
+
+def test_noise_is_dropped_without_a_bias() -> None:
+    value = random.standard_normal((400, M))
+    keep = np.concatenate([significant(x, np.ones_like(x), GRID) for x in np.split(value, 40)])
+    assert keep.mean() < 0.05
+    assert abs(np.sum(value[keep])) < 4 * np.sqrt(np.sum(value[keep] ** 2))
+
+
+def test_sums_show_weak_light() -> None:
+    """0.4 standard deviations in all of a column; 0.1 in all columns, of which one is too little."""
+    value = random.standard_normal((50, M)) + 0.4
+    assert significant(value, np.ones_like(value), GRID).mean() > 0.99
+    weak = np.full((64, M), 0.1)
+    assert not significant(weak[:1], np.ones((1, M)), GRID).any()
+    assert significant(weak, np.ones((64, M)), GRID).all()
+
+
+def test_strong_and_unknown_entries_stand_alone() -> None:
+    value, variance = np.zeros((1, M)), np.ones((1, M))
+    value[0, 7], variance[0, 9] = 8.0, UNKNOWN
+    np.testing.assert_array_equal(np.flatnonzero(significant(value, variance, GRID)), [7, 9])
+    assert significant(value, variance, GRID, 0.0).all()
+    with pytest.raises(InputError, match="sigmas is -1"):
+        significant(value, variance, GRID, -1)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 7), (5, 1)])
+def test_rows_add_up_by_least_squares(shape: tuple[int, int]) -> None:
+    """Of x_j of variance v_j and their sum w of variance u: as weighted normal equations have it."""
+    x, v = random.random(shape) + 0.1, random.random(shape) + 0.1
+    w, u = x.sum(axis=1) + random.normal(size=shape[0]), random.random(shape[0]) + 0.1
+    rows, variance = balance(scipy.sparse.csr_array(x), v.ravel(), Picture(w, u))
+    for i, row in enumerate(rows.toarray()):
+        C = np.linalg.inv(np.diag(1 / v[i]) + 1 / u[i])
+        np.testing.assert_allclose(row, C @ (x[i] / v[i] + w[i] / u[i]), rtol=1e-10)
+        np.testing.assert_allclose(variance.reshape(shape)[i], np.diag(C), rtol=1e-10)
+
+
+def test_rows_of_which_something_is_not_known_stay() -> None:
+    x, v = np.full((3, 2), 0.5), np.array([0.1, np.nan, 0.1, 0.1, 0.1, 0.1])
+    white = Picture(np.full(3, 2.0), np.array([0.1, UNKNOWN, 0.1]))
+    rows, variance = balance(scipy.sparse.csr_array(x), v, white)
+    np.testing.assert_array_equal(rows.data[:4], 0.5)
+    np.testing.assert_array_equal(variance[:4], v[:4])
+    assert (rows.data[4:] > 0.5).all()
+    empty, _ = balance(scipy.sparse.csr_array((2, 3)), np.zeros(0), Picture(np.ones(2), np.zeros(2)))
+    assert empty.nnz == 0
+
+
+def test_the_part_of_dropped_entries_goes_to_the_others() -> None:
+    """As in rows with entries of the median variance there, whose part of the rest is then moved."""
+    x, v = np.array([[1.0, 0.2, 0.0, 0.0]]), np.array([0.3, 0.1])
+    w, u = np.array([1.5]), np.array([0.05])
+    rows, variance = balance(scipy.sparse.csr_array(x), v, Picture(w, u))
+    whole = x + 0.3 * np.array([[0.3, 0.1, 0.2, 0.2]]) / 0.85
+    np.testing.assert_allclose(rows.data, whole[0, :2] + whole[0, 2:].sum() * v / v.sum(), rtol=1e-12)
+    np.testing.assert_allclose(variance, v - v**2 / 0.85, rtol=1e-12)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A calibration that ended early goes on with its photographs, if the rig is the same."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ltcl.acquisition import FolderRig, Shots, acquire
+from ltcl.acquisition.session import calibration_folder, calibration_photographs, check_same_rig
+from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing
+from ltcl.files import locked
+from tests.store.stores import contents
+
+from .stopping import LINE, Unplugged, scene
+
+GRID = (8, 8)
+
+
+def unplugged(left: int = 1 << 30, **options: Any) -> Unplugged:
+    """A rig that fails after so many photographs."""
+    return Unplugged(scene(GRID), GRID, left=left, **options)
+
+
+def run(rig: Any, store: Path, **settings: Any) -> None:
+    acquire(rig, geometry="aligned", strategy="pixel", store=store, **settings)
+
+
+def test_a_camera_that_is_unplugged_again_and_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Nothing is photographed twice, but for one photograph that was damaged."""
+    whole, store, rig = unplugged(), tmp_path / "T.zarr", unplugged()
+    run(whole, tmp_path / "whole.zarr")
+    for left, count in ((1, 1), (20, 21), (30, 51)):
+        with pytest.raises(AcquisitionError, match=f"photograph {count + 1}: the rig failed with OSErr"):
+            run(unplugged(left), store)
+        assert calibration_photographs(store) == count
+        assert not store.exists()
+    file = next(calibration_folder(store).glob("shot_*.npz"))
+    file.write_bytes(file.read_bytes()[:-1] + b"\xff")
+    with caplog.at_level(logging.INFO, "ltcl.acquisition"):
+        run(rig, store)
+    assert "51 photographs" in caplog.text
+    assert 51 + rig.count == whole.count + 1
+    assert contents(store) == contents(tmp_path / "whole.zarr")
+    assert {path.name for path in tmp_path.iterdir()} == {"whole.zarr", "T.zarr"}
+
+
+def test_another_rig_and_a_second_process_are_refused(tmp_path: Path) -> None:
+    store = tmp_path / "T.zarr"
+    with pytest.raises(AcquisitionError):
+        run(unplugged(20), store)
+    with pytest.raises(InputError, match=r"rig.bits is 8, but .*T.zarr.calibration was begun with 12"):
+        run(unplugged(bits=8), store)
+    with pytest.raises(InputError, match=r"resume is False, but .*calibration exists"):
+        run(unplugged(), store, resume=False)
+    with locked(calibration_folder(store)), pytest.raises(FileError, match=r"calibration: another run"):
+        run(unplugged(), store)
+    assert calibration_photographs(store) == 20
+
+
+def test_a_rig_that_keeps_its_photographs_needs_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(PhotographMissing):
+        run(FolderRig(tmp_path / "rig", GRID), tmp_path / "T.zarr")
+    assert not calibration_folder(tmp_path / "T.zarr").exists()
+
+
+LIVE: dict[str, Any] = {
+    "kind": "live",
+    "camera": {"kind": "opencv", "source": 0, "locked": {"exposure": True}},
+    "display": {"index": 1, "driver": "x11", "block": [2, 2]},
+    "period": 1 / 60,
+    "exposures": [1 / 60, 1 / 30],
+    "survey": {"latency": 0.05},
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        ({}, None),
+        ({"survey": {"latency": 0.08}, "seed": 3, "mitsuba": "3.9"}, None),
+        ({"camera": LIVE["camera"] | {"source": 2}, "display": {"index": 0, "block": [2, 2]}}, None),
+        ({"period": 1 / 60 + 1e-9, "exposures": [1 / 60 + 1e-9, 1 / 30]}, None),
+        ({"kind": "virtual"}, r"rig\.kind is 'virtual'"),
+        ({"camera": {"kind": "opencv", "locked": {}}}, r"rig\.camera\.locked\.exposure is"),
+        ({"exposures": [1 / 60]}, r"rig\.exposures is \[0\.016"),
+        ({"period": None}, r"rig\.period is None"),
+        ({"iso": "200"}, r"rig\.iso is '200'"),
+    ],
+)
+def test_a_rig_is_the_same_but_for_volatile_keys(change: dict[str, Any], part: str | None) -> None:
+    rig: Any = unplugged()
+    rig.describe = lambda: {**LIVE, **change}
+    with pytest.raises(InputError, match=part) if part else contextlib.nullcontext():
+        check_same_rig(LIVE, Shots(rig), Path("T.zarr"))
+
+
+class Plain:
+    """A rig of somebody's own, without `describe()`."""
+
+    projector_grid, channels = GRID, 1
+
+    def __init__(self, T: np.ndarray, bits: int = 12, left: int = 1 << 30) -> None:
+        self.bits = bits
+        self.photograph = Unplugged(T, GRID, left=left, bits=bits, response="linear").photograph
+
+
+def test_a_rig_without_a_description_is_known_by_what_it_shows(tmp_path: Path) -> None:
+    """Class, bits, and black and white, which are photographed again."""
+    settings: dict[str, Any] = {"frames": 2, "response": LINE, "exposures": [0.5]}
+    settings |= {"store": tmp_path / "T.zarr"}
+    with pytest.raises(AcquisitionError, match="unplugged"):
+        run(Plain(scene(GRID), left=60), **settings)
+    dim = scene(GRID) * np.linspace(0.5, 1.0, 64)[:, None]
+    for other, part in (
+        (type("Another", (Plain,), {})(scene(GRID)), "rig.kind is 'Another'"),
+        (Plain(scene(GRID), bits=10), "levels"),
+        (Plain(dim), "white"),
+    ):
+        with pytest.raises(InputError, match=part):
+            run(other, **settings)
+    run(Plain(scene(GRID)), **settings)
