@@ -100,6 +100,7 @@ class Shots(Closing):
         self.count = 0
         self.camera_grid: tuple[int, int] | None = None
         self.levels: int | None = None
+        self.expected: tuple[Any, Any] | None = None  # these two, of the scan that is resumed
         self.digest: dict[str, dict[str, Any]] = {}
         self.image = np.zeros((0, 0))
         self._first: _Kind | None = None
@@ -142,6 +143,11 @@ class Shots(Closing):
         scaled = to_unit(name, image, self.rig, self._first)
         self._first = image.shape, image.dtype
         self.camera_grid, self.levels = (image.shape[0], image.shape[1]), _levels(image.dtype, self.rig)
+        if self.expected not in (None, (self.camera_grid, self.levels)):
+            raise InputError(
+                f"{name} has {self.camera_grid} pixels and {self.levels} levels; the scan was begun with "
+                f"{self.expected[0]} and {self.expected[1]}: it must be that camera, or another store"
+            )
         self.count += 1
         for view, code in (("black", 0.0), ("white", 1.0)):
             if view not in self.digest and np.all(codes == code):

@@ -125,3 +125,17 @@ def test_a_rig_without_a_description_is_known_by_what_it_shows(tmp_path: Path) -
         with pytest.raises(InputError, match=part):
             run(other, **settings)
     run(Plain(scene(GRID)), **settings)
+
+
+def test_a_description_without_the_camera_hides_no_other_camera(tmp_path: Path) -> None:
+    class Terse(Plain):
+        def describe(self) -> dict[str, Any]:
+            return {"kind": "terse"}
+
+    settings: dict[str, Any] = {"frames": 2, "response": LINE, "exposures": [0.5]}
+    settings |= {"store": tmp_path / "T.zarr"}
+    with pytest.raises(AcquisitionError, match="unplugged"):
+        run(Terse(scene(GRID), left=60), **settings)
+    with pytest.raises(InputError, match=r"1024 levels.*4096"):
+        run(Terse(scene(GRID), bits=10), **settings)
+    run(Terse(scene(GRID)), **settings)

@@ -172,7 +172,8 @@ class FolderRig:
         numbers = self.missing()
         paths = sorted(map(as_path, files), key=lambda p: re.sub("[0-9]+", lambda n: n[0].zfill(20), p.name))
         if len(paths) != len(numbers):
-            raise InputError(f"files holds {len(paths)} names; {len(numbers)} photographs are missing")
+            which = f": {numbers[0]} to {numbers[-1]}" if numbers else ""
+            raise InputError(f"files holds {len(paths)} photographs; {len(numbers)} are missing{which}")
         for path in map(input_file, paths):
             if path.suffix.lower() not in _SUFFIXES:
                 raise FileError(f"{path}: is no photograph; it must be {_KINDS}")
