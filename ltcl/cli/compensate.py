@@ -212,7 +212,7 @@ def _row(file: Path, facts: dict[str, Any], pattern: str) -> tuple:
     solves = facts["channels"] + [each for each in facts["limited"] if each not in facts["channels"]]
     methods = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
     products = sum(solve["products"] for solve in solves)
-    reasons = {"dark": "; a lower --gain helps where the pattern is at 1"}
+    reasons = {"dark": "; where the pattern is at 1 a lower --gain helps, or --gain auto"}
     reasons["bright"] = ", by bounces or the background; brighten its dark parts"
     for name, reason in reasons.items():
         if (share := facts[f"too_{name}"]) > _MANY:
@@ -242,7 +242,7 @@ def _compensate_frames(
         count = sum(record.clipped > _MANY for record in records)
         frame = f"frame {most.number} ({most.name}) most"
         advice = "a lower --gain helps where patterns are at 1"
-        note(f"{count} frame(s) ask for light beyond the projector's range, {frame}; {advice}")
+        note(f"{count} frame(s) ask for light beyond the projector's, {frame}; {advice}")
     pace = f"{result.frames_per_second:.1f}" if result.solved else None
     columns = ("frames", "of this run", "a second", "gain", "worst error", "most clipped")
     error, clipped = percent(worst.error), percent(most.clipped)

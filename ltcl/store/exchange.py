@@ -120,8 +120,6 @@ def read_mat(path: Path, variable: str | None = None) -> Record:
     if head.startswith(b"MATLAB 5.0 MAT-file") and head[126:128] in (b"IM", b"MI"):
         variables = _variables(path, "<" if head[126:128] == b"IM" else ">")
         return _assemble(variables, lambda name: variables[name], variable)
-    if not head.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF")):
-        raise FileError("is of none of MATLAB's versions 5 and 7.3; save it with -v7 or -v7.3")
     with _members(path) as named:
         return _assemble(named, lambda name: _matrix(named, name), variable)
 

@@ -16,7 +16,7 @@ separate f from f times a wobble of that period in log f; ratios of 2, 3, 2, 3 a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ _ROUNDS = 8  # of reweighting (5: 0.09 %, 8 to 20: 0.08 %)
 _SMOOTH = 300.0  # weight of a relative change of slope by 1, in units of noise (30: 0.11 %, 1000: 0.07 %)
 _MARGIN = 2.5  # standard deviations that a prediction keeps from the ends (1: 0.08 %, 4: 0.09 %)
 _TUKEY = 5.0  # standard deviations at which a residual counts no more (3: 0.17 %, 8: 0.07 %)
+_READ, _QUIET = 0.001, 0.1  # noise whose size is scaled to the residuals, by at least a tenth
 _DEGREE, _INTERVALS = 3, 24  # of the spline: it fits the curves of sRGB and of film to 4e-5
 _RISE, _RIDGE = 1e-7, 1e-12  # least step between coefficients, of a strictly monotone curve; rounding errors
 
@@ -161,7 +162,7 @@ def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
             f"images have {seen} sampled pixel(s) that are neither black nor saturated at two exposures; "
             f"there must be {_LEAST}: take exposures closer to each other, or a scene with more between"
         )
-    noise = NoiseModel(levels=bracket.levels)
+    noise = NoiseModel(read=_READ, levels=bracket.levels)
     # Weights of a first round: errors of 5 % of the code, and of a thousandth of full scale.
     theta, weight = _PLACES, usable / (0.05 * (0.02 + codes)) ** 2
     near, offset = codes, np.zeros_like(codes)  # codes c' to linearise about; f'(c') (c - c')
@@ -178,9 +179,10 @@ def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
         near = np.interp(x, table, grid)
         slope = np.interp(near, grid, np.gradient(table, grid))
         residual = np.interp(codes, grid, table) - x
-        inside = usable & (near < saturation)
-        noise = _noise_of(residual[inside], x[inside], slope[inside], noise)
         sigma = np.sqrt(noise.variance(x, slope))
+        inside = usable & (near < saturation)
+        if inside.any():  # the median of |normal values| is 0.6745 standard deviations, 1 / 1.4826
+            sigma *= max(1.4826 * float(np.median(np.abs(residual / sigma)[inside])), _QUIET)
         low, high = np.interp([0.0, saturation], grid, table)
         clear = usable & (x + _MARGIN * sigma < high) & (x - _MARGIN * sigma > low)
         weight = clear * np.clip(1.0 - (residual / (_TUKEY * sigma)) ** 2, 0.0, 1.0) ** 2 / sigma**2
@@ -227,19 +229,3 @@ def _design(codes: np.ndarray) -> np.ndarray:
 
 def _tabulate(theta: np.ndarray, count: int) -> np.ndarray:
     return _design(np.linspace(0.0, 1.0, count)) @ theta
-
-
-def _noise_of(residual: np.ndarray, x: np.ndarray, slope: np.ndarray, noise: NoiseModel) -> NoiseModel:
-    """Electrons and read noise that explain the residuals, by their median size in 16 bins of light."""
-    bins = [places for places in np.array_split(np.argsort(x), 16) if len(places) > 10]
-    if len(bins) < 2:
-        return noise
-    # The median of |normal values| is 0.6745 standard deviations, 1 / 1.4826.
-    spread = np.array([(1.4826 * np.median(np.abs(residual[places]))) ** 2 for places in bins])
-    light = np.array([max(x[places].mean(), 0.0) for places in bins])
-    code = 1.0 / (noise.levels - 1) if noise.levels > 1 else 0.0
-    rounding = np.array([np.mean(slope[places] ** 2) for places in bins]) * code**2 / 12.0
-    spread = np.maximum(spread, rounding + 1e-12)
-    columns = np.stack([light, np.ones_like(light)], axis=1) / spread[:, None]
-    (gain, floor), _ = scipy.optimize.nnls(columns, (spread - rounding) / spread)
-    return replace(noise, electrons=1.0 / max(gain, 1e-9), read=float(np.sqrt(floor)))
