@@ -6,11 +6,12 @@ compared with the radiance L of the others, at pixels where neither is saturated
 
     z_k = (x_k - t_k L) / sqrt(v_k + t_k^2 v_L),    L = sum_j x_j t_j / v_j / sum_j t_j^2 / v_j
 
-v is noise, (2 % of x)^2 for inexact exposures and response curves, and (0.1 % of full scale)^2 for the level
-of black. A photograph deviates where the mean of min(z^2, 100) is above 2.5, two pixels left out that may be
-defects; of fewer than 8 pixels, where it is above 27.5. Or where the sum of t_k L (x_k - t_k L) over pixels
-exceeds 5 of its standard deviations: an exposure is wrong, and each pixel alone is dim. In the same way a
-photograph is compared with an earlier one (`known`), and sums of patterns and their inverses with each other.
+v is noise, (2 % of x)^2 for inexact exposures and response curves, and for the level of black (0.1 % of full
+scale)^2 and (3 electrons)^2: cameras without an offset clip the noise there, which bends their curves. A
+photograph deviates where the mean of min(z^2, 100) is above 2.5, two pixels left out that may be defects; of
+fewer than 8 pixels, where it is above 27.5. Or where the sum of t_k L (x_k - t_k L) over pixels exceeds 5 of
+its standard deviations: an exposure is wrong, and each pixel alone is dim. In the same way a photograph is
+compared with an earlier one (`known`), and sums of patterns and their inverses with each other.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.errors import AcquisitionError
 
 _SCALE, _FLOOR = 0.02, 0.001  # systematic errors: of light, of full scale
+_ELECTRONS = 3.0  # of light: error of the level of black
 _BIAS = 0.2  # of the noise without light: common error of all pixels there
 _CLIP, _DEFECTS, _MEAN = 100.0, 2, 2.5
 _SINGLE = 25.0  # z^2 of each of a few pixels, which a single one has by noise once in a million
@@ -169,8 +171,9 @@ class _Light(NamedTuple):
             usable = x < limit
             L = np.sum(x * usable, axis=0) / np.maximum(np.sum(t * usable, axis=0), 1e-30)
         variance = noise.variance(t * L, response.derivative(curve).reshape(codes.shape))
-        variance = variance + (_SCALE * t * L) ** 2 + _FLOOR**2
-        bias = np.full(limit.shape, _BIAS * np.sqrt(noise.variance(0.0)))
+        few = _ELECTRONS / noise.electrons
+        variance = variance + (_SCALE * t * L) ** 2 + _FLOOR**2 + few**2
+        bias = np.full(limit.shape, np.hypot(_BIAS * np.sqrt(noise.variance(0.0)), few))
         return cls(t, np.where(x < limit, x, np.inf), variance, limit, bias)
 
     def with_known(self, value: np.ndarray, variance: np.ndarray) -> _Light:

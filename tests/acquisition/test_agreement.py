@@ -10,9 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ltcl
 from ltcl.acquisition.agreement import ROUGH, Record, Sensor
+from ltcl.acquisition.calibrate import measure
 from ltcl.acquisition.radiometry import NoiseModel, Response
+from ltcl.acquisition.rig import Shots
 from ltcl.errors import AcquisitionError
+
+from .stopping import Unplugged
 
 random = np.random.default_rng(0)
 WHITE = np.ones((2, 2), np.float32)
@@ -60,6 +65,18 @@ def test_few_photons_deviate_from_nothing() -> None:
     for light in 0.2 * random.random((20, 32, 32)) ** 3:
         images = [np.minimum(random.poisson(100.0 * light * t) / 100.0, 1.0) for t in times]
         assert not deviating(images, times, sensor=sensor)
+
+
+@pytest.mark.parametrize("by_hand", [False, True])
+@pytest.mark.parametrize("albedo", [0.6, (0.8, 0.6, 0.4)])
+@pytest.mark.parametrize("gain", [500.0, 1000.0, 3000.0])
+def test_a_clean_calibration_of_a_noisy_camera_agrees(gain: float, albedo: Any, by_hand: bool) -> None:
+    """Its response has to be measured in that noise, which the camera clips at black."""
+    T = ltcl.scenes.dihedral(8, albedo=albedo).transport()
+    rig = Unplugged(T, T.grid, bits=12, gain=gain, response="srgb", ambient=0.01)
+    rig.keeps_photographs = by_hand
+    measured = measure(Shots(rig), geometry="aligned").noise.electrons
+    assert measured == pytest.approx(gain, rel=0.1)
 
 
 def test_defects_and_a_moth_deviate_from_nothing() -> None:

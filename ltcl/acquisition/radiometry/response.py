@@ -36,7 +36,7 @@ _ROUNDS = 8  # of reweighting (5: 0.09 %, 8 to 20: 0.08 %)
 _SMOOTH = 300.0  # weight of a relative change of slope by 1, in units of noise (30: 0.11 %, 1000: 0.07 %)
 _MARGIN = 2.5  # standard deviations that a prediction keeps from the ends (1: 0.08 %, 4: 0.09 %)
 _TUKEY = 5.0  # standard deviations at which a residual counts no more (3: 0.17 %, 8: 0.07 %)
-_READ, _QUIET = 0.001, 0.1  # noise whose size is scaled to the residuals, by at least a tenth
+_NOISE_BINS = 16  # of light, in which the size of residuals gives the noise
 _DEGREE, _INTERVALS = 3, 24  # of the spline: it fits the curves of sRGB and of film to 4e-5
 _RISE, _RIDGE = 1e-7, 1e-12  # least step between coefficients, of a strictly monotone curve; rounding errors
 
@@ -162,7 +162,6 @@ def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
             f"images have {seen} sampled pixel(s) that are neither black nor saturated at two exposures; "
             f"there must be {_LEAST}: take exposures closer to each other, or a scene with more between"
         )
-    noise = NoiseModel(read=_READ, levels=bracket.levels)
     # Weights of a first round: errors of 5 % of the code, and of a thousandth of full scale.
     theta, weight = _PLACES, usable / (0.05 * (0.02 + codes)) ** 2
     near, offset = codes, np.zeros_like(codes)  # codes c' to linearise about; f'(c') (c - c')
@@ -179,15 +178,29 @@ def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
         near = np.interp(x, table, grid)
         slope = np.interp(near, grid, np.gradient(table, grid))
         residual = np.interp(codes, grid, table) - x
-        sigma = np.sqrt(noise.variance(x, slope))
         inside = usable & (near < saturation)
-        if inside.any():  # the median of |normal values| is 0.6745 standard deviations, 1 / 1.4826
-            sigma *= max(1.4826 * float(np.median(np.abs(residual / sigma)[inside])), _QUIET)
+        noise = _noise(residual[inside], x[inside], slope[inside], bracket.levels)
+        sigma = np.sqrt(noise.variance(x, slope))
         low, high = np.interp([0.0, saturation], grid, table)
         clear = usable & (x + _MARGIN * sigma < high) & (x - _MARGIN * sigma > low)
         weight = clear * np.clip(1.0 - (residual / (_TUKEY * sigma)) ** 2, 0.0, 1.0) ** 2 / sigma**2
         offset = slope * (codes - near)
     return theta
+
+
+def _noise(residual: np.ndarray, x: np.ndarray, slope: np.ndarray, levels: int) -> NoiseModel:
+    """Electrons and read noise that explain the median size of residuals in bins of light x."""
+    bins = [members for members in np.array_split(np.argsort(x), _NOISE_BINS) if len(members)]
+    if len(bins) < 2:
+        return NoiseModel(levels=levels)
+    # The median of |normal values| is 0.6745 standard deviations, 1 / 1.4826.
+    variance = np.array([(1.4826 * np.median(np.abs(residual[members]))) ** 2 for members in bins])
+    light = np.array([max(x[members].mean(), 0.0) for members in bins])
+    rounding = [NoiseModel(read=0.0, levels=levels).variance(0.0, slope[members]).mean() for members in bins]
+    variance = np.maximum(variance, np.array(rounding) + 1e-12)
+    columns = np.stack([light, np.ones_like(light)], axis=1) / variance[:, None]
+    (gain, floor), _ = scipy.optimize.nnls(columns, 1.0 - rounding / variance)
+    return NoiseModel(1.0 / max(gain, 1e-9), float(np.sqrt(floor)), levels=levels)
 
 
 def _solve(
