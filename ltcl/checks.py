@@ -126,7 +126,7 @@ def flag(name: str, value: Any) -> bool:
 def one_of(name: str, value: Any, allowed: Iterable[Any]) -> Any:
     """Return `value` if it is one of `allowed`."""
     choices = list(allowed)
-    if value not in choices:
+    if getattr(value, "ndim", 0) or value not in choices:
         raise InputError(f"{name} is {value!r}; it must be one of {', '.join(map(str, choices))}")
     return value
 

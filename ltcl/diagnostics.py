@@ -39,6 +39,7 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
+from ltcl import checks
 from ltcl.errors import ConvergenceError, InputError
 from ltcl.operators import IdentityPlus
 from ltcl.solvers import solve
@@ -62,11 +63,9 @@ def reciprocity_defect(T: Any, F: np.ndarray, *, entries: int = ALL, seed: int =
     T : array, csr_array, Operator, or LinearOperator
     F : (N,)
         First bounce; pixels where it is 0 are left out.
-    entries : int
-        Of a T with more, the pixels of a random sample that has about so many: any part of a reciprocal T
-        is reciprocal.
-    seed : int
-        Of the sample.
+    entries, seed : int
+        Of a T with more `entries`, the pixels of a random sample that has about so many, from this `seed`:
+        any part of a reciprocal T is reciprocal.
 
     Examples
     --------
@@ -98,7 +97,8 @@ def _sample(pixels: np.ndarray, count: int, n: int, entries: int, seed: int) -> 
     if count <= entries:
         return pixels
     some = min(len(pixels), int(n * (entries / count) ** 0.5))
-    return np.sort(np.random.default_rng(seed).choice(pixels, some, replace=False))
+    random = np.random.default_rng(checks.count("seed", seed, least=0))
+    return np.sort(random.choice(pixels, some, replace=False))
 
 
 def _indirect(T: Any, F: np.ndarray) -> Any:

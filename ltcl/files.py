@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ltcl import checks
 from ltcl.errors import FileError, InputTypeError, LtclError
 
 fcntl: Any = None if os.name == "nt" else importlib.import_module("fcntl")  # Windows: nothing is locked
@@ -46,12 +47,12 @@ def input_file(path: Any) -> Path:
 
 def as_path(path: Any, name: str = "path") -> Path:
     """Return `path` (str or os.PathLike) as a Path; refuse everything else, an empty text, and NUL."""
-    if path == "" or "\0" in str(path):
+    if not str(path) or "\0" in str(path):
         raise FileError(f"{path or name} is {str(path)!r}; it must name a file or a folder")
     try:
         return Path(path)
     except TypeError:
-        raise InputTypeError(f"{name} is {path!r}; it must be a str or a path") from None
+        raise InputTypeError(f"{name} is {checks.shown(path)}; it must be a str or a path") from None
 
 
 def unknown_extension(path: Path) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 from ltcl import checks, layout
 from ltcl.errors import InputTypeError
 from ltcl.solvers import Inverse, Solution, monte_carlo, solve_each
-from ltcl.solvers.solve import SAMPLED
+from ltcl.solvers.solve import METHODS, SAMPLED
 from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
 
 logger = logging.getLogger(__name__)
@@ -184,7 +184,7 @@ def _warning(defect: float, negative: float, error: float) -> str:
 
 def _with_seed(method: str, options: dict[str, Any], k: int) -> dict[str, Any]:
     """The options of bounce k: random numbers of its own, or its noise would go with that of others."""
-    if method not in SAMPLED:
+    if checks.one_of("method", method, METHODS) not in SAMPLED:
         return options
     seed = options.get("seed", 0)
     checks.count("seed", seed, least=0, most=(1 << 64) - 1)

@@ -69,8 +69,8 @@ def test_no_pyplot_and_no_matplotlib_before_the_first_plot() -> None:
 
 
 def test_an_analysis_shows_every_channel_and_method(device) -> None:
-    one = ltcl.analyze(ltcl.scenes.box(3, albedo=0.8).transport(device=device))
-    left, right = plots.analysis({"a": one, "b": one}).axes
+    analysis = ltcl.analyze(ltcl.scenes.box(3, albedo=0.8).transport(device=device))
+    left, right = plots.analysis({"a": analysis, "b": analysis}).axes
     assert [label.get_text() for label in left.get_yticklabels()] == ["a", "b"]
-    assert [label.get_text() for label in right.get_yticklabels()] == list(one.channels[0].products)
+    assert [label.get_text() for label in right.get_yticklabels()] == list(analysis.channels[0].products)
     assert [text.get_text().strip() for text in right.texts].count("diverges") == 4  # jacobi, neumann; twice

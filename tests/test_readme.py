@@ -56,6 +56,6 @@ def test_the_rigs_of_the_readme_are_ones(tmp_path):
     for text in re.findall(r"```toml\n(.*?)```", README, re.DOTALL):
         (tmp_path / "acquisition.toml").write_text(text)
         project = Project.open(tmp_path)
-        assert project.outlook().grid == (48, 64)
+        assert project.outlook()[1]["grid"] == (48, 64)
         kinds.append(project.kind)
     assert kinds == ["folder", "live"]

@@ -91,6 +91,7 @@ def test_nothing_of_the_picture_is_lost(device, matrix_and_F, shape, bounces, rt
         ({"bounces": True}, InputError, "bounces is True"),
         ({"bounces": 10**12}, MemoryLimitError, "1000000000000 bounces"),
         ({"method": "magic"}, InputError, "method is 'magic'"),
+        ({"method": []}, InputError, r"method is \[\]"),
         ({"omega": 1}, InputTypeError, "option 'omega'"),
         ({"method": "jacobi", "samples": 3}, InputTypeError, "samples.*'jacobi'"),
         ({"method": "monte_carlo", "pixels": [1, 2]}, InputTypeError, "pixels"),

@@ -2,12 +2,12 @@
 """A pattern of blocks that is photographed in the calibration, and again after each batch of a scan.
 
 Where it does not show the same light as before (`agreement`), something moved during the batch, or the light
-changed. From which pattern on, the pictures of the batch show at the edges of their patterns. With y a
-picture, w white, both less ambient light, and p the pattern on the camera's pixels, by least squares
+changed. From which pattern on, the batch shows at the edges of its patterns: with a picture y and white w,
+both less ambient light, and the pattern p on the camera's pixels, least squares give the movement d of
 
     p y / w = p s (p + d . grad p)
 
-d being how far things moved. The factor p leaves out pixels with nothing but indirect light.
+where the factor p leaves out pixels with nothing but indirect light.
 """
 
 from __future__ import annotations
@@ -33,10 +33,7 @@ def pattern(grid: tuple[int, int]) -> np.ndarray:
 
 
 def marked(batch: Sequence[np.ndarray]) -> np.ndarray:
-    """The pattern for a batch of codes, changed by 1 / 255 of the first of them.
-
-    So it has another entry for each batch in a list of photographs, also after a scan was interrupted.
-    """
+    """The pattern, changed by 1 / 255 of the first codes of a batch: so each has its own entry in a list."""
     return np.abs(pattern(batch[0].shape[:2]) - batch[0] / np.float32(255.0))
 
 
@@ -44,7 +41,7 @@ def marked(batch: Sequence[np.ndarray]) -> np.ndarray:
 class Anchor:
     """What a calibration saw of the pattern: radiance (n, c), ambient light included, and its variance.
 
-    `pixels` (n,) of the photograph, row by row, are those that see the projector, or some of them.
+    `pixels` (n,) of the photograph, row by row, are some of those that see the projector.
     """
 
     pixels: np.ndarray
@@ -54,11 +51,9 @@ class Anchor:
     @classmethod
     def of(cls, shown: Radiance, R: Resampling) -> Self:
         """From a picture (H, W[, c]) of the pattern."""
-        size = shown.value.shape[0] * shown.value.shape[1]
-        value, variance, valid = (x.reshape(size, -1) for x in (shown.value, shown.variance, shown.valid))
         seen = np.unique(R.weights.indices)
-        pixels = spread(seen[valid[seen].all(axis=1)])
-        return cls(pixels, value[pixels], variance[pixels])
+        pixels = spread(seen[sample(shown.valid, seen).all(axis=1)])
+        return cls(pixels, sample(shown.value, pixels), sample(shown.variance, pixels))
 
     def deviation(self, image: np.ndarray, seconds: float, sensor: Sensor) -> Deviation | None:
         """Whether a photograph (H, W[, c]) of the pattern deviates from that of the calibration."""

@@ -11,9 +11,7 @@ T is for light relative to white less black: a includes what a black projector s
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections import defaultdict
 from dataclasses import astuple, dataclass
 from typing import Any
 
@@ -25,8 +23,8 @@ from ltcl.acquisition.anchor import Anchor
 from ltcl.acquisition.geometry import Resampling
 from ltcl.acquisition.geometry.resample import Blocks
 from ltcl.acquisition.geometry.sharpness import Sharpness
-from ltcl.acquisition.radiometry import NoiseModel, ProjectorResponse, Radiance, Response
-from ltcl.errors import FileError, InputError
+from ltcl.acquisition.radiometry import NoiseModel, Radiance, Response
+from ltcl.errors import FileError
 from ltcl.store import BlockStore
 from ltcl.transport import Transport
 
@@ -40,8 +38,8 @@ class Calibration:
 
     `exposures` in seconds, ascending; `offset`, the camera's linear value without light; `ambient`, `white`,
     (H, W[, 3]), what a black projector shows and a white one adds; `mixing`, (3, 3), None of one channel;
-    `resampling` from the camera's pixels to the projector's. `sharpness` and `anchor` are None of an aligned
-    camera, and of older stores, whose photographs are not compared with the anchor.
+    `resampling` to the projector's pixels; `sharpness`, None of an aligned camera; `anchor`, None of older
+    stores.
     """
 
     exposures: tuple[float, ...]
@@ -50,7 +48,7 @@ class Calibration:
     offset: np.ndarray
     ambient: Radiance
     white: Radiance
-    projector: ProjectorResponse
+    projector: Response
     mixing: np.ndarray | None
     resampling: Resampling
     sharpness: Sharpness | None = None
@@ -70,13 +68,14 @@ class Calibration:
             raise FileError(f"{scan.path}: holds no calibration; ltcl.acquire writes one")
         if "resampling.doubtful" not in names:
             raise FileError(f"{scan.path}: its calibration is of an earlier ltcl; it must be acquired again")
-        arrays, groups = {name: np.array(scan.extra(PREFIX + name)) for name in names}, defaultdict(dict)
-        for name, array in arrays.items():
-            group, _, field = name.partition(".")
-            groups[group][field] = array
-        R, ambient, white, anchor = (groups[name] for name in ("resampling", "ambient", "white", "anchor"))
+        arrays = {name: np.array(scan.extra(PREFIX + name)) for name in names}
+
+        def group(prefix: str) -> dict[str, Any]:
+            return {k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)}
+
+        R, ambient, white, anchor = map(group, ("resampling.", "ambient.", "white.", "anchor."))
         anchor.pop("shift", None)  # of earlier versions
-        for light in (ambient, white):
+        for light in (ambient, white):  # of earlier versions: 0 where it is not valid
             light["variance"] = np.where(light["valid"], light["variance"], np.float32(np.inf))
         (h, w), (H, W) = R["coverage"].shape, R["camera_grid"].tolist()
         weights = scipy.sparse.csr_array((R["data"], R["indices"], R["indptr"]), shape=(h * w, H * W))
@@ -89,7 +88,7 @@ class Calibration:
             arrays["offset"],
             Radiance(**ambient),
             Radiance(**white),
-            ProjectorResponse(arrays["projector"]),
+            Response(arrays["projector"]),
             arrays.get("mixing"),
             Resampling(weights, R["coverage"], (h, w), (H, W), R["doubtful"]),
             Sharpness((y, x), width) if "sharpness" in arrays else None,
@@ -97,7 +96,7 @@ class Calibration:
         )
 
     def write(self, store: BlockStore) -> None:
-        """Commit it to a store, as extra arrays, all finite."""
+        """Commit it to a store, as extra arrays."""
         R = self.resampling
         arrays = {
             "exposures": np.array(self.exposures),
@@ -114,11 +113,9 @@ class Calibration:
             arrays["sharpness"] = np.hstack(astuple(self.sharpness))
         if self.mixing is not None:
             arrays["mixing"] = self.mixing
-        if self.anchor is not None:
-            arrays |= {f"anchor.{field}": array for field, array in vars(self.anchor).items()}
-        for name, light in {"ambient": self.ambient, "white": self.white}.items():
-            arrays |= {f"{name}.{field}": array for field, array in vars(light).items()}
-            arrays[f"{name}.variance"] = np.where(light.valid, light.variance, np.float32(0.0))
+        for group in ("ambient", "white", "anchor"):
+            if (record := getattr(self, group)) is not None:
+                arrays |= {f"{group}.{field}": array for field, array in vars(record).items()}
         for name, array in arrays.items():
             store.extra(PREFIX + name, array)
 
@@ -131,10 +128,9 @@ class Setup:
     --------
     >>> import tempfile, ltcl
     >>> from ltcl.acquisition import VirtualRig
-    >>> rig, store = VirtualRig(np.eye(64) / 2, (8, 8), bits=12, ambient=0.1), f"{tempfile.mkdtemp()}/T.zarr"
-    >>> T = ltcl.acquire(rig, geometry="aligned", strategy="pixel", store=store)
-    >>> setup = Setup.of(store)
-    >>> setup.codes(np.full(T.grid, 0.214)).mean().round(2)  # sRGB, as this rig has by default
+    >>> store = f"{tempfile.mkdtemp()}/T.zarr"
+    >>> T = ltcl.acquire(VirtualRig(np.eye(64) / 2, (8, 8), ambient=0.1), geometry="aligned", store=store)
+    >>> Setup.of(store).codes(np.full(T.grid, 0.214)).mean().round(1)  # sRGB, as this rig has by default
     np.float32(0.5)
     """
 
@@ -143,7 +139,7 @@ class Setup:
 
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Setup:
-        """That of a store made by `ltcl.acquire`; FileError where it has no calibration, or is damaged."""
+        """That of a store made by `ltcl.acquire`; FileError as of `Calibration.of`."""
         scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
         calibration, facts = Calibration.of(scan), scan.attributes
         side = facts["settings"]["block"] if facts.get("strategy") == "block" else 1
@@ -157,14 +153,13 @@ class Setup:
     @property
     def channels(self) -> int:
         """1 or 3."""
-        return 1 if self.calibration.white.value.ndim == 2 else 3
+        return len(self.calibration.offset)
 
     @property
     def ambient(self) -> np.ndarray:
         """Light under a black projector, (h, w[, 3]) in the units of T; 0 where it is unknown."""
         R, light = self.calibration.resampling, self.calibration.ambient
-        weight = R.apply(light.valid.astype(np.float32))
-        value = R.apply(np.where(light.valid, light.value, 0.0))
+        weight, value = R.apply(light.valid.astype(np.float32)), R.apply(light.value * light.valid)
         return self._mean(np.where(weight >= _VALID, value / np.maximum(weight, _VALID), 0.0))
 
     def codes(self, pattern: Any) -> np.ndarray:
@@ -201,13 +196,4 @@ class Setup:
         return values
 
     def _mean(self, picture: np.ndarray) -> np.ndarray:
-        """Means over the pixels of the transport."""
         return (self.blocks.sum(picture) / self.blocks.sum(np.ones_like(picture))).astype(np.float32)
-
-
-def has_calibration(store: str | os.PathLike[str]) -> bool:
-    """Whether there is a store that `ltcl.acquire` made; whoever loads a damaged one says what is wrong."""
-    with contextlib.suppress(InputError):
-        scan = BlockStore.open(store)
-        return any(name.startswith(PREFIX) for name in scan.extras) and "strategy" in scan.attributes
-    return False

@@ -10,7 +10,7 @@
 
 Keys of [rig] are arguments of its class, those of [acquire] of `ltcl.acquire`; "none" stands for None. A
 virtual rig has the files `transport` and `camera_map`, a live one the tables [rig.camera], of kind "opencv"
-or "gphoto2", and [rig.display]. The transport comes to transport.zarr in the folder.
+or "gphoto2", and [rig.display].
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition import exposure, rigs
+from ltcl.acquisition import rigs
+from ltcl.acquisition.calibrate import expected_exposures
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.rigs.mitsuba import SCENES
 from ltcl.acquisition.rigs.virtual import CURVES, Sensor
 from ltcl.acquisition.scanning.plan import Light
-from ltcl.acquisition.session import calibration_photographs
 from ltcl.acquisition.task import Settings, acquire
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
@@ -46,17 +46,6 @@ _RIGS: dict[str, Any] = {"virtual": rigs.VirtualRig, "mitsuba": rigs.MitsubaRig}
 _RIGS |= {"folder": rigs.FolderRig, "live": rigs.LiveRig}
 _CAMERAS = {"opencv": rigs.OpenCVCamera, "gphoto2": rigs.GPhoto2Camera}
 _OBJECTS = ("T", "folder", "rig", "store", "resume", "progress", "device")  # arguments that no file has
-
-
-@dataclass(frozen=True)
-class Outlook:
-    """What is known of a rig that was not opened; exposures, noise and light are guesses."""
-
-    grid: tuple[int, int]
-    channels: int
-    exposures: tuple[float, ...]
-    noise: NoiseModel
-    light: Light
 
 
 @dataclass(frozen=True)
@@ -123,28 +112,22 @@ class Project:
         store = BlockStore.open(self.store)
         return "final" if store.final else "begun" if "strategy" in store.attributes else "new"
 
-    @property
-    def photographs(self) -> int:
-        """Photographs that a calibration which has not ended can go on with; those of a folder rig apart."""
-        return calibration_photographs(self.store)
-
     @contextlib.contextmanager
-    def rig(self, *, closed: bool = False) -> Iterator[Any]:
-        """The rig, until the end of the block; a live one that is `closed` has its grid and channels only."""
+    def rig(self, *, closed: bool = False, aligned: bool = False) -> Iterator[Any]:
+        """The rig, until the end of the block; a live one that is `closed` has its grid and channels only.
+
+        What an `aligned` virtual rig photographs is seen on the pixels that its transport has.
+        """
+        camera = ("camera_map", "camera_grid") if aligned else ()
         with self.naming("rig"):
             try:
-                rig = _make(self.folder, dict(self.table), closed)
+                rig = _make(self.folder, {k: v for k, v in self.table.items() if k not in camera}, closed)
             except LtclError:
                 raise
             except (TypeError, ValueError) as error:  # a number where a class expects a list
                 raise InputTypeError(f"holds a value of an unusable type: {error}") from error
         with Shots(rig):
             yield rig
-
-    def aligned(self) -> Project:
-        """The same, but what a virtual rig photographs is seen on the pixels that its transport has."""
-        table = {k: v for k, v in self.table.items() if k not in ("camera_map", "camera_grid")}
-        return replace(self, table=table)
 
     @contextlib.contextmanager
     def naming(self, table: str) -> Iterator[None]:
@@ -156,47 +139,38 @@ class Project:
         except (InputError, InputTypeError) as error:
             raise type(error)(f"{self.folder / FILE}: [{table}] {error}") from None
 
-    def check(self) -> Settings:
-        """What `acquire` would refuse before the first photograph; errors as there. No camera is opened."""
-        with self.rig(closed=True) as rig:
-            return self._check(Shots(rig))
-
-    def outlook(self) -> Outlook:
-        """What a plan needs before the first photograph; exposures are chosen for a scene as `Light`."""
+    def outlook(self) -> tuple[Settings, dict[str, Any]]:
+        """Settings as `acquire` checks them, and guesses for `scanning.plan.plans`; no camera is opened."""
+        arguments = {name: p.default for name, p in inspect.signature(acquire).parameters.items()}
+        own = {name: value for name, value in arguments.items() if name not in _OBJECTS}
         with self.rig(closed=True) as rig:
             shots, light = Shots(rig), Light()
+            with self.naming("acquire"):
+                settings = Settings.of(shots, **(own | self.settings))
             noise = NoiseModel(levels=1 << rig.bits if rig.bits else 0)
             if (sensor := getattr(rig, "sensor", None)) is not None:
                 noise = replace(noise, electrons=sensor.gain or _NOISELESS, read=sensor.read)
             light = replace(light, ambient=float(np.mean(getattr(rig, "ambient", light.ambient))))
-            exposures = self._check(shots).exposures
-            if exposures is None:
-                exposures = exposure.expected(shots, light.direct + light.indirect, light.ambient)
-            return Outlook(shots.grid, shots.channels, tuple(sorted(exposures)), noise, light)
-
-    def _check(self, shots: Shots) -> Settings:
-        arguments = {name: p.default for name, p in inspect.signature(acquire).parameters.items()}
-        own = {name: value for name, value in arguments.items() if name not in _OBJECTS}
-        with self.naming("acquire"):
-            return Settings.of(shots, **(own | self.settings))
+            times = expected_exposures(shots, light.direct + light.indirect, light.ambient)
+            facts: dict[str, Any] = {"exposures": tuple(sorted(settings.exposures or times))}
+            facts |= {"grid": shots.grid, "channels": shots.channels, "noise": noise, "light": light}
+            return settings, facts
 
 
 def _check(path: Path, name: str, table: Any, make: Any) -> dict[str, Any]:
     """The arguments of `make`, or of one of several by the key "kind", in a table; None for "none"."""
     if not isinstance(table, dict):
         raise InputError(f"{path}: has no table [{name}]; it must have one")
-    kinds: dict[str, Any] = {}
+    needed: dict[str, bool] = {}
     if isinstance(make, dict):
-        kinds = make
-        if (kind := table.get("kind")) not in [*kinds]:
-            raise InputError(f"{path}: [{name}] kind is {kind!r}; it must be one of {', '.join(kinds)}")
-        make = kinds[kind]
+        if (kind := table.get("kind")) not in [*make]:
+            raise InputError(f"{path}: [{name}] kind is {kind!r}; it must be one of {', '.join(make)}")
+        make, needed = make[kind], {"kind": True}
     arguments = dict(inspect.signature(make).parameters)
     if arguments.pop("sensor", None):
         arguments |= inspect.signature(Sensor).parameters
-    needed = {key: a.default is a.empty for key, a in arguments.items() if key not in _OBJECTS}
+    needed |= {key: a.default is a.empty for key, a in arguments.items() if key not in _OBJECTS}
     needed |= {"transport": True, "grid": False} if make is rigs.VirtualRig else {}
-    needed |= {"kind": True} if kinds else {}
     for key in {**table, **needed}:
         if key not in needed:
             raise InputError(f"{path}: [{name}] has {key!r}; it may have {', '.join(needed)}")

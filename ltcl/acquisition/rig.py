@@ -3,7 +3,6 @@
 
 `Shots` checks what goes into a rig and what comes back, counts the photographs, and scales their codes:
     value = code / full scale,    full scale = 2^bits - 1 of an integer camera, 1 of a float one.
-`shot_key` and `fingerprint` recognize photographs and matrices in a later run.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib
+import json
 import math
 from collections.abc import Iterable, Iterator
 from typing import Any, Protocol
@@ -31,12 +31,12 @@ _Kind = tuple[tuple[int, ...], np.dtype]  # shape and type of a photograph
 class Rig(Protocol):
     """A projector, (h, w), and a camera that looks at what it lights; `channels` are 1 for grey, 3 for RGB.
 
-    Nothing else is needed. Used where a rig has it: `exposures`, the seconds the camera offers, ascending
-    (else any from 1e-4 to 30); `bits` in use in a uint16 image (else 16); `prepare(shots)`, called with the
-    (codes, seconds) that come next; `describe()`, a dict of plain JSON for the records, which must be equal
-    when a scan is resumed (but for what is measured anew, such as "survey"); `recall(codes, seconds, image)`,
-    called with a photograph of an earlier session in place of `photograph`; `keeps_photographs`, whether it
-    stores them itself; `number` of the last photograph and `file_name(number)`, for messages; `close()`.
+    Optional: `exposures`, the seconds that the camera offers, ascending (else any from 1e-4 to 30); `bits` in
+    use in a uint16 image (else 16); `prepare(shots)`, called with the (codes, seconds) that come next;
+    `describe()`, a dict of plain JSON, equal when a scan is resumed (but for what is measured anew, such as
+    "survey"); `recall(codes, seconds, image)`, called for a photograph of an earlier session;
+    `keeps_photographs`, whether it stores them itself; `number` of the last photograph and
+    `file_name(number)`, for messages; `close()`.
     """
 
     projector_grid: tuple[int, int]
@@ -61,20 +61,19 @@ class Closing(contextlib.AbstractContextManager):
 
     @contextlib.contextmanager
     def _closed_on_error(self) -> Iterator[None]:
-        try:
+        with contextlib.ExitStack() as opened:
+            opened.callback(self.close)
             yield
-        except BaseException:
-            self.close()
-            raise
+            opened.pop_all()
 
 
 class Shots(Closing):
     """Photographs of a rig: checked, counted, float32 in [0, 1] of full scale.
 
     InputTypeError for a rig that lacks a member, InputError where one cannot be used. `exposures` are None
-    for any from 1e-4 to 30 s; `count` is of the photographs. After the first of them there are `camera_grid`,
-    `levels` (256 of 8 bits, None of floats), and `digest`: of the first under "black" and "white" the
-    seconds, and means over 8 x 8 cells. `image` is the last as the rig gave it.
+    for any from 1e-4 to 30 s; `count` is of the photographs, `image` the last as the rig gave it. After the
+    first there are `camera_grid`, `levels` (256 of 8 bits, None of floats), and `digest`: of the first under
+    "black" and "white" the seconds, and means over 8 x 8 cells.
 
     Examples
     --------
@@ -89,21 +88,19 @@ class Shots(Closing):
     def __init__(self, rig: Rig) -> None:
         require_members("rig", rig, "projector_grid", "channels", "photograph")
         self.rig = rig
-        self.grid = checks.grid("rig.projector_grid", rig.projector_grid)
+        self.grid = self.projector_grid = checks.grid("rig.projector_grid", rig.projector_grid)
         self.channels = checks.one_of("rig.channels", rig.channels, (1, 3))
-        self.exposures: tuple[float, ...] | None = None
-        if (offered := getattr(rig, "exposures", None)) is not None:
-            seconds = checks.finite("rig.exposures", checks.real("rig.exposures", offered))
-            if seconds.ndim != 1 or seconds.size == 0 or seconds[0] <= 0 or np.any(np.diff(seconds) <= 0):
-                raise InputError(f"rig.exposures is {offered!r}; it must be positive seconds, ascending")
-            self.exposures = tuple(map(float, seconds))
-        self.count = 0
+        self.exposures = as_exposures("rig.exposures", getattr(rig, "exposures", None))
+        self.count, self.image = 0, np.zeros((0, 0))
         self.camera_grid: tuple[int, int] | None = None
         self.levels: int | None = None
         self.expected: tuple[Any, Any] | None = None  # these two, of the scan that is resumed
         self.digest: dict[str, dict[str, Any]] = {}
-        self.image = np.zeros((0, 0))
         self._first: _Kind | None = None
+        try:
+            json.dumps(self.describe(), allow_nan=False)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InputTypeError(f"rig.describe() returns what is no plain JSON: {error}") from None
 
     @property
     def number(self) -> int:
@@ -117,19 +114,15 @@ class Shots(Closing):
 
     def prepare(self, shots: Iterable[tuple[Any, float]]) -> None:
         """Announce the (codes, seconds) that come next, in order, to a rig that writes lists for a person."""
-        announce = getattr(self.rig, "prepare", None)
-        if announce is not None:
-            announce(self._request(*shot) for shot in shots)
+        getattr(self.rig, "prepare", list)(as_shot(self, *shot) for shot in shots)
 
     def photograph(self, codes: Any, seconds: float, stored: Any = None) -> np.ndarray:
-        """One photograph, codes over full scale: float32, (H, W) or (H, W, 3).
+        """One photograph of codes (h, w[, 3]) in [0, 1] over full scale: float32, (H, W) or (H, W, 3).
 
-        `codes` are (h, w), for all channels of the projector alike, or (h, w, 3), in [0, 1]; `stored` is the
-        image of an earlier run, in place of a new one. InputError for others, or seconds that the camera does
-        not have; AcquisitionError, with the number, where the rig fails, or returns an unusable image or one
-        unlike the first.
+        `stored` is the image of an earlier run, in place of a new one. InputError for other codes, or seconds
+        that the camera does not have; AcquisitionError where the rig fails, or the image cannot be used.
         """
-        codes, seconds = self._request(codes, seconds)
+        codes, seconds = as_shot(self, codes, seconds)
         if stored is not None:
             getattr(self.rig, "recall", lambda *_: None)(codes, seconds, stored)
         try:
@@ -143,11 +136,11 @@ class Shots(Closing):
         scaled = to_unit(name, image, self.rig, self._first)
         self._first = image.shape, image.dtype
         self.camera_grid, self.levels = (image.shape[0], image.shape[1]), _levels(image.dtype, self.rig)
-        if self.expected not in (None, (self.camera_grid, self.levels)):
-            raise InputError(
-                f"{name} has {self.camera_grid} pixels and {self.levels} levels; the scan was begun with "
-                f"{self.expected[0]} and {self.expected[1]}: it must be that camera, or another store"
-            )
+        sizes = self.camera_grid, self.levels
+        if self.expected is not None and self.expected != sizes:
+            text = "{} pixels and {} levels"
+            expected = f"{text.format(*self.expected)}, as the scan was begun with, or another store"
+            raise InputError(f"{name} has {text.format(*sizes)}; it must have {expected}")
         self.count += 1
         for view, code in (("black", 0.0), ("white", 1.0)):
             if view not in self.digest and np.all(codes == code):
@@ -158,33 +151,31 @@ class Shots(Closing):
 
     def describe(self) -> dict[str, Any]:
         """Plain JSON for the records: what the rig says of itself, the grids, and the photographs so far."""
-        return {
-            "rig": getattr(self.rig, "describe", lambda: {"kind": type(self.rig).__name__})(),
-            "projector_grid": list(self.grid),
-            "camera_grid": None if self.camera_grid is None else list(self.camera_grid),
-            "channels": self.channels,
-            "levels": self.levels,
-            "digest": self.digest,
-            "photographs": self.count,
-        }
+        rig = getattr(self.rig, "describe", lambda: {"kind": type(self.rig).__name__})()
+        facts = {"rig": rig, "projector_grid": self.grid, "channels": self.channels}
+        facts |= {"camera_grid": self.camera_grid, "levels": self.levels}
+        return facts | {"digest": self.digest, "photographs": self.count}
 
     def close(self) -> None:
         """Close the rig, where it can be closed."""
         getattr(self.rig, "close", lambda: None)()
 
-    def _request(self, codes: Any, seconds: float) -> tuple[np.ndarray, float]:
-        return as_codes(codes, self.grid, self.channels), exact("seconds", seconds, self.exposures)
-
 
 def nearest(exposures: Iterable[float] | None, seconds: float) -> float:
-    """The exposure of a camera whose ratio to `seconds` is nearest to 1; None: it has any from 1e-4 to 30.
-
-    >>> nearest((0.1, 1.0), 0.3), nearest((0.1, 1.0), 0.4), nearest(None, 50.0)
-    (0.1, 1.0, 30.0)
-    """
+    """The exposure whose ratio to `seconds` is nearest to 1; of None, any from 1e-4 to 30."""
     if exposures is None:
         return float(min(max(seconds, SHORTEST), LONGEST))
     return min(exposures, key=lambda offered: abs(math.log(offered / seconds)))
+
+
+def as_exposures(name: str, offered: Any) -> tuple[float, ...] | None:
+    """The seconds that a camera offers as floats, or None for any; InputError unless they ascend from 0."""
+    if offered is None:
+        return None
+    seconds = checks.finite(name, checks.real(name, offered))
+    if seconds.ndim != 1 or seconds.size == 0 or seconds[0] <= 0 or np.any(np.diff(seconds) <= 0):
+        raise InputError(f"{name} is {offered!r}; it must be positive seconds, ascending")
+    return tuple(map(float, seconds))
 
 
 def exact(name: str, seconds: Any, exposures: Iterable[float] | None) -> float:
@@ -207,25 +198,20 @@ def as_codes(codes: Any, grid: tuple[int, int], channels: int) -> np.ndarray:
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
-def as_seconds(seconds: Any) -> float:
-    """`seconds` as a positive float."""
-    return checks.number("seconds", seconds, above=0.0)
+def as_shot(rig: Any, codes: Any, seconds: Any) -> tuple[np.ndarray, float]:
+    """Codes by `as_codes` and seconds by `exact`, for a rig whose members are checked."""
+    return as_codes(codes, rig.projector_grid, rig.channels), exact("seconds", seconds, rig.exposures)
 
 
 def to_unit(name: str, image: np.ndarray, camera: Any, first: _Kind | None = None) -> np.ndarray:
-    """A photograph over full scale, float32; `camera` is a rig or a camera, with `channels` and maybe `bits`.
-
-    AcquisitionError, which begins with `name`, for what is no photograph of so many channels, exceeds `bits`,
-    is not finite, or has another shape and type than the `first`.
-    """
+    """A photograph of a rig or camera over full scale, float32; AcquisitionError begins with `name`."""
     if image.dtype not in (np.uint8, np.uint16) and image.dtype.kind != "f":
         raise AcquisitionError(f"{name} holds {image.dtype}; it must hold uint8, uint16 or float")
     if image.ndim < 2 or image.shape[2:] != (() if camera.channels == 1 else (3,)) or image.size == 0:
         expected = "(H, W)" if camera.channels == 1 else "(H, W, 3)"
         raise AcquisitionError(f"{name} has shape {image.shape}; it must be {expected}, not empty")
     if first is not None and first != (image.shape, image.dtype):
-        expected = f"{first[1]} {first[0]}, as the first was"
-        raise AcquisitionError(f"{name} is {image.dtype} {image.shape}; it must be {expected}")
+        raise AcquisitionError(f"{name} is {image.dtype} {image.shape}; it must be {first[1]} {first[0]}")
     levels = _levels(image.dtype, camera)
     if levels is None:
         with np.errstate(over="ignore"):
@@ -242,10 +228,8 @@ def _levels(dtype: np.dtype, camera: Any) -> int | None:
     """How many codes photographs of `dtype` have; None of floats."""
     if dtype.kind == "f":
         return None
-    bits = getattr(camera, "bits", None)
-    if dtype == np.uint8 or bits is None:
-        return 1 << 8 * dtype.itemsize
-    return 1 << checks.count("rig.bits", bits, least=9, most=16)
+    bits = 8 if dtype == np.uint8 else getattr(camera, "bits", None) or 16
+    return 1 << checks.count("rig.bits", bits, least=8, most=16)
 
 
 def require_members(name: str, value: Any, *members: str) -> None:
@@ -264,25 +248,13 @@ def load_extra(module: str, extra: str, what: str) -> Any:
 
 
 def shot_key(codes: np.ndarray, *seconds: float) -> str:
-    """128 bits of a photograph's codes and exposure, or of codes alone.
-
-    >>> a, b = np.zeros((1, 2), np.float32), np.zeros((2, 1), np.float32)
-    >>> shot_key(a, 1.0) == shot_key(a.copy(), 1.0), shot_key(a, 1.0) == shot_key(b, 1.0)
-    (True, False)
-    """
+    """128 bits of a photograph's codes and exposure, or of codes alone."""
     content = repr(codes.shape).encode() + codes.tobytes() + np.array(seconds, np.float64).tobytes()
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
 def fingerprint(*matrices: Any) -> str:
-    """SHA-256 of all entries of arrays and sparse matrices, and of four sums u . (T v) of operators.
-
-    4096 x 4096 entries in float32 take 0.1 s. Sums keep four digits, more than products in float32 vary.
-
-    >>> T = np.eye(3)
-    >>> fingerprint(T) == fingerprint(np.ones(9)), fingerprint(T) == fingerprint(T.copy())
-    (False, True)
-    """
+    """SHA-256 of all entries of arrays and sparse matrices; of operators, of four sums u . (T v)."""
     digest = hashlib.sha256()
     for matrix in matrices:
         if scipy.sparse.issparse(matrix):
@@ -295,7 +267,7 @@ def fingerprint(*matrices: Any) -> str:
             random = np.random.default_rng(0)
             v = random.random(matrix.shape[1]).astype(matrix.dtype)
             sums = random.random((4, matrix.shape[0])) @ (matrix @ v)
-            arrays = [np.array([f"{number:.4g}" for number in sums], "S16")]
+            arrays = [np.array([f"{number:.4g}" for number in sums], "S16")]  # products in float32 vary
         for array in arrays:
             digest.update(f"{array.dtype.str} {array.shape};".encode())
             digest.update(np.ascontiguousarray(array).data)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`CaptureSession`: the photographs of a calibration; and the folder that holds them until it has ended.
 
-A calibration is committed as a whole, and what decides its next photograph are those before. So one that was
-stopped is run again from its start, with the photographs in the folder STORE.calibration, until it asks for a
-new one. A photograph is known by codes, seconds, and how often a list of requests had the same before.
+The photographs of a calibration decide on the next one. So one that was stopped is run again from its start,
+with the photographs in STORE.calibration, until it asks for a new one: known by codes, seconds, and how often
+a list of requests had the same before.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ VOLATILE_KEYS = frozenset({"survey", "seed", "mitsuba", "source", "backend", "in
 """Keys of `describe()`, on any level, that may differ when a scan is resumed."""
 _RIG, _SHOT = "rig", "shot_"  # names in the log: what the rig said of itself, photographs
 
-Request = tuple[np.ndarray, float]
-"""Codes (h, w[, 3]) and seconds."""
+Request = tuple[np.ndarray, float]  # codes (h, w[, 3]) and seconds
 
 
 class Photograph(NamedTuple):
@@ -47,20 +46,19 @@ class Photograph(NamedTuple):
 class CaptureSession:
     """A rig for a calibration, and what is known of its camera so far.
 
-    `sensor` is its response, noise and offset, `hot` (H, W) its defective pixels, once they are measured;
-    `record` has all photographs, to be compared when the noise is known; `count` is their number.
+    `sensor` is its response, noise and offset, `hot` (H, W) its defective pixels; `record` has all
+    photographs, to be compared when the noise is known.
     """
 
     def __init__(self, shots: Shots, log: ArrayLog | None, progress: Callable[[int], None]) -> None:
         self.sensor, self.hot = Sensor(Response.identity()), np.zeros((1, 1), bool)
-        self.shots, self.record, self.count = shots, agreement.Record(), 0
+        self.shots, self.record = shots, agreement.Record()
         self._log, self._progress = log, progress
         self._uniform: dict[str, Photograph] = {}
 
     def prepare(self, requests: Iterable[Request]) -> None:
         """Announce photographs to the rig, so that a person can take all of them in one go."""
-        named = _named(requests)
-        self.shots.prepare([request for name, request in named if name not in self._uniform])
+        self.shots.prepare([r for name, r in _named(requests) if name not in self._uniform])
 
     def take(self, groups: Sequence[Sequence[Request]]) -> list[list[Photograph]]:
         """Photographs of requests, in order; those of uniform patterns are used again."""
@@ -82,7 +80,7 @@ class CaptureSession:
 
     @contextlib.contextmanager
     def naming_photographs(self) -> Iterator[None]:
-        """Name photographs that deviate, where what comes of them in the block cannot be used."""
+        """Name photographs that deviate, where the block cannot use them."""
         try:
             yield
         except AcquisitionError as error:
@@ -101,8 +99,7 @@ class CaptureSession:
         self.record.add(*request, image, photograph.number)
         if request[0].min() == request[0].max():
             self._uniform[name] = photograph
-        self.count += 1
-        self._progress(self.count)
+        self._progress(self.shots.count)
         return photograph
 
 
@@ -124,12 +121,12 @@ def acquisition_error(subject: str) -> Iterator[None]:
 
 
 def calibration_folder(store: Path) -> Path:
-    """Where the photographs of a calibration for `store` are: T.zarr.calibration for T.zarr."""
+    """T.zarr.calibration for T.zarr."""
     return store.with_name(f"{store.name}.calibration")
 
 
 def calibration_photographs(store: Path) -> int:
-    """How many there are."""
+    """How many photographs there are."""
     return sum(name.startswith(_SHOT) for name in ArrayLog(calibration_folder(store)).names)
 
 
@@ -144,8 +141,8 @@ def remove_photographs(store: Path) -> None:
 def photograph_log(store: Path, shots: Shots) -> Iterator[ArrayLog | None]:
     """The folder for a session, which is removed where the block ends well.
 
-    None where the rig stores its photographs itself (`keeps_photographs`). InputError where those in it are
-    of another rig; FileError where it cannot be written, or another process is at work there.
+    None where the rig stores its photographs itself. InputError where those in it are of another rig;
+    FileError where it cannot be written, or another process is at work there.
     """
     if getattr(shots.rig, "keeps_photographs", False):
         yield None
@@ -153,9 +150,9 @@ def photograph_log(store: Path, shots: Shots) -> Iterator[ArrayLog | None]:
     log = ArrayLog(calibration_folder(store))
     if log.path.is_dir():
         sweep(log.path)
+    if not log.names and log.path.exists() and any(log.path.iterdir()):
+        raise FileError(f"{log.path}: was not made by ltcl; it will not be replaced")
     if not log.names:
-        if log.path.exists() and any(log.path.iterdir()):
-            raise FileError(f"{log.path}: was not made by ltcl; it will not be replaced")
         log.put(_RIG, json=np.array(json.dumps(shots.describe()["rig"], default=str)))
     with locked(log.path, wait=False):
         check_same_rig(json.loads(str(log.get(_RIG)["json"])), shots, log.path)

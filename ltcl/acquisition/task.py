@@ -2,18 +2,20 @@
 """`acquire`: from a rig to a transport, by photographs alone; it can be stopped at any time, and goes on.
 
 First the set-up is measured (`calibrate`) and committed as a whole; then T is scanned (`scanning`), batch by
-batch, each committed before the next is taken. Columns go into the store as they are decoded; of an adaptive
-scan the store is a log of pictures, which the transport replaces in the end.
+batch: columns of T, or pictures of an adaptive scan, which the transport replaces in the end.
 """
 
 from __future__ import annotations
 
+import json
 import logging
+import math
 import os
 import tempfile
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +41,7 @@ _SAME_VIEW = 0.03  # of full scale, mean over the cells of a digest: lamps and e
 
 @dataclass(frozen=True)
 class Settings:
-    """The arguments of `acquire` that decide which photographs are taken, and what is made of them."""
+    """The arguments of `acquire` that decide on photographs and T."""
 
     geometry: Any
     strategy: str
@@ -53,12 +55,12 @@ class Settings:
 
     @classmethod
     def of(cls, shots: Shots, *values: Any, **named: Any) -> Settings:
-        """Checked for the rig of `shots`; InputError, InputTypeError where one is unusable."""
+        """Checked for the rig of `shots`; errors as of `acquire`."""
         settings = cls(*values, **named)
         geometry, response, times = settings.geometry, settings.response, settings.exposures
         if not isinstance(geometry, Correspondence) and str(geometry) not in ("graycode", "aligned"):
-            name = repr(geometry) if isinstance(geometry, str) else f"a {type(geometry).__name__}"
-            raise InputError(f"geometry is {name}; it must be 'graycode', 'aligned' or a Correspondence")
+            text = "it must be 'graycode', 'aligned' or a Correspondence"
+            raise InputError(f"geometry is {checks.shown(geometry)}; {text}")
         if not isinstance(response, Response | None):
             raise InputTypeError(f"response is a {type(response).__name__}; it must be a Response, or None")
         if response is None and shots.exposures is not None and len(shots.exposures) == 1:
@@ -81,7 +83,7 @@ class Settings:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """As plain JSON; of a geometry or a response that is measured, nothing but that."""
+        """Plain JSON without the response; of a Correspondence nothing but that there was one."""
         named = {name: value for name, value in vars(self).items() if name != "response"}
         named["geometry"] = self.geometry if isinstance(self.geometry, str) else "given"
         return named | {"exposures": self.exposures and list(self.exposures)}
@@ -116,9 +118,8 @@ def acquire(
         Cells that are divided where needed; one pixel at a time; blocks of pixels, which makes a coarser
         transport; many pixels at once. "auto" decides by the noise of the camera (`scanning.plan`).
     store : path, optional
-        Folder of the transport on disk, which keeps what was photographed; without one nothing can be
-        resumed. Until the set-up is measured its photographs are in the folder STORE.calibration, whatever
-        ends it; to begin anew, remove both.
+        Folder of the transport, which keeps what was photographed, to be resumed. Until the set-up is
+        measured its photographs are in the folder STORE.calibration; to begin anew, remove both.
     resume : bool
         Go on with what is in the store; else the store must not exist.
     progress : function of (str, int, int), optional
@@ -137,7 +138,7 @@ def acquire(
         Part of what a camera pixel sees under white, above which a cell is divided by "adaptive"; standard
         deviations above which an entry or a sum of entries is light and not noise, 0 keeps all.
     device : Device or str, optional
-        As in `Transport`.
+        As in `Transport`; opened before the first photograph.
 
     Returns
     -------
@@ -148,8 +149,8 @@ def acquire(
 
     Raises
     ------
-    InputError, InputTypeError
-        Bad arguments; a store that was made with others, or with another rig.
+    InputError, InputTypeError, DeviceError
+        Bad arguments; a store that was made with others, or with another rig; no such device.
     AcquisitionError
         The rig fails, or photographs contradict each other; `PhotographMissing`: call again with it.
     FileError
@@ -173,6 +174,8 @@ def acquire(
     settings = Settings.of(
         shots, geometry, strategy, exposures, response, frames, block, order, threshold, sigmas
     )
+    if device is not None:
+        device = Transport(np.eye(1), (1, 1), device=device).device
     if store is None:
         with tempfile.TemporaryDirectory(prefix="ltcl-") as folder:
             path = Path(folder) / "T.zarr"
@@ -180,8 +183,7 @@ def acquire(
             T = load(path, on_dark="mask", device=device)
             if not isinstance(T.matrices[0], StoredRows):
                 return T
-            matrices: Any = [rows.tocsr() for rows in T.matrices]
-            matrices = matrices if len(matrices) == 3 else matrices[0]
+            matrices = [rows.tocsr() for rows in T.matrices]
             return Transport(matrices, T.grid, T.first_bounce, device=device, on_dark="mask", mixing=T.mixing)
     path = as_path(store, "store")
     existing = _open(path, resume)
@@ -192,9 +194,7 @@ def acquire(
     else:
         _check_begun(existing, shots, settings)
         session.remove_photographs(path)
-    if existing.final:
-        existing.finalize()  # removes what a process that was killed at the very end has left
-    else:
+    if not existing.final:
         scan(existing, shots, settings, progress)
     return load(path, on_dark="mask", device=device)
 
@@ -205,64 +205,46 @@ def finalize(store: str | os.PathLike[str], progress: Progress | None = None) ->
     `progress` is that of `ltcl.acquire`. FileError for a store that is missing, damaged or not made by
     `ltcl.acquire`; AcquisitionError where photographs are missing.
 
-    Examples
-    --------
-    >>> import tempfile, ltcl
-    >>> from ltcl.acquisition import VirtualRig
-    >>> rig, store = VirtualRig(np.eye(64) / 2, (8, 8), bits=12), f"{tempfile.mkdtemp()}/T.zarr"
-    >>> T = ltcl.acquire(rig, geometry="aligned", strategy="pixel", store=store)
-    >>> finalize(store)
+    >>> finalize("nowhere.zarr")
+    Traceback (most recent call last):
+    ltcl.errors.FileError: nowhere.zarr: no such folder
     """
-    opened = BlockStore.open(store, "a")
+    opened = BlockStore.open(store)
     if "strategy" not in opened.attributes:
         raise FileError(f"{opened.path}: holds no whole calibration of ltcl.acquire, so no transport either")
     if opened.final:
-        return
-    rig: Any = _NoRig(opened.path, Calibration.of(opened).resampling.grid, opened.layout.channels)
+        return opened.finalize()  # removes what a process that was killed at the very end has left
+
+    def photograph(codes: np.ndarray, seconds: float) -> np.ndarray:
+        raise AcquisitionError(f"{opened.path}: the next batch of patterns is not photographed")
+
+    grid, channels = Calibration.of(opened).resampling.grid, opened.layout.channels
+    rig: Any = SimpleNamespace(projector_grid=grid, channels=channels, photograph=photograph)
     settings = Settings(**opened.attributes["settings"], response=None)
     scan(opened, Shots(rig), settings, progress or (lambda step, done, total: None))
 
 
-class _NoRig(NamedTuple):
-    """In place of the rig that took the photographs: a scan may ask for more of them."""
-
-    path: Path
-    projector_grid: tuple[int, int]
-    channels: int
-
-    def photograph(self, codes: np.ndarray, seconds: float) -> np.ndarray:
-        raise AcquisitionError(f"{self.path}: the next batch of patterns is not photographed")
-
-
-def _is_empty(path: Path) -> bool:
-    return not os.path.exists(path) or (path.is_dir() and not any(path.iterdir()))
-
-
 def _open(path: Path, resume: bool) -> BlockStore | None:
     """The store of an earlier run whose calibration was committed."""
-    for place in (session.calibration_folder(path), path):
-        if not resume and not _is_empty(place):
-            raise InputError(f"resume is False, but {place} exists; remove it, or give another store")
-    if _is_empty(path):
+    places = [p for p in (session.calibration_folder(path), path) if os.path.exists(p)]
+    places = [p for p in places if not p.is_dir() or any(p.iterdir())]
+    if places and not resume:
+        raise InputError(f"resume is False, but {places[0]} exists; remove it, or give another store")
+    if path not in places:
         return None
-    store = BlockStore.open(path, "a")
+    store = BlockStore.open(path)
     if "acquisition" not in store.provenance:
         raise InputError(f"store is {path}, which ltcl.acquire did not make; give another one")
     return store if "strategy" in store.attributes else None
 
 
 def _check_begun(store: BlockStore, shots: Shots, settings: Settings) -> None:
-    """Refuse to go on with a store that was begun with another rig or with other settings.
-
-    The same rig has the same pixels and describes itself as before; without `describe()` it must show black
-    and white as before.
-    """
+    """Refuse to go on with another rig or other settings; without `describe()` black and white are shown."""
     facts, path, described = store.attributes, store.path, store.provenance["acquisition"]
     before = facts.get("settings")
     if facts["strategy"] not in plan.STRATEGIES or not isinstance(before, dict):
-        raise FileError(
-            f"{path}: its scan is {facts['strategy']!r:.40} of {before!r:.40}; ltcl makes none such"
-        )
+        scan = f"{facts['strategy']!r:.40} of {before!r:.40}"
+        raise FileError(f"{path}: its scan is {scan}; ltcl makes none such")
     for name, value in settings.to_json().items():
         check_same(name, value, before.get(name), path)
     check_same("rig.projector_grid", shots.grid, Calibration.of(store).resampling.grid, path)
@@ -276,41 +258,35 @@ def _check_begun(store: BlockStore, shots: Shots, settings: Settings) -> None:
         shots.photograph(np.full(shots.grid, float(name == "white")), digest["seconds"])
         difference = np.mean(np.abs(np.subtract(shots.digest[name]["cells"], digest["cells"])))
         if difference > _SAME_VIEW:
-            raise InputError(
-                f"{name} differs by {difference:.1%} of full scale from that of {path}; rig "
-                "and scene must be the same"
-            )
+            text = f"{name} differs by {difference:.1%} of full scale from that of {path}"
+            raise InputError(f"{text}; rig and scene must be the same")
 
 
 def _calibrate(path: Path, shots: Shots, settings: Settings, log: Any, progress: Progress) -> BlockStore:
     """Measure the set-up, choose a strategy, and make the store."""
     side = settings.block if settings.strategy == "block" else 1
-    asked = {name: getattr(settings, name) for name in ("geometry", "response", "exposures", "frames")}
-    calibration = calibrate.measure(shots, **asked, side=side, progress=progress, log=log)
-    asked = {name: getattr(settings, name) for name in ("block", "order", "threshold")}
-    asked |= {"channels": shots.channels, "calibration": shots.count}
+    options = {name: getattr(settings, name) for name in ("geometry", "response", "exposures", "frames")}
+    calibration = calibrate.measure(shots, **options, side=side, progress=progress, log=log)
+    options = {name: getattr(settings, name) for name in ("block", "order", "threshold")}
+    options |= {"channels": shots.channels, "calibration": shots.count}
     light = plan.measured(calibration)
-    plans = plan.plans(shots.grid, calibration.exposures, calibration.noise, light, **asked)
+    plans = plan.plans(shots.grid, calibration.exposures, calibration.noise, light, **options)
     strategy, why = settings.strategy, "as asked for"
     if strategy == "auto":
         strategy, why = plan.choose(plans)
     logger.info("%s (%s)", plans[strategy], why)
     pictures = Pictures(shots, calibration, side)
-    h, w = pictures.grid
-    rows, sizes = adaptive.AT_ONCE, {"shape": (h * w, h * w), "grid": (h, w)}
+    grid, pixels = pictures.grid, math.prod(pictures.grid)
+    sizes: dict[str, Any] = {"channels": pictures.channels, "shape": (pixels, pixels), "grid": grid}
     if strategy == "adaptive":
-        most = adaptive.most_patterns(adaptive.Cells((h, w)))
-        sizes = {"shape": (h * w, most), "grid": (1, most), "camera_grid": (h, w)}
+        most = adaptive.most_patterns(adaptive.Cells(grid))
+        sizes |= {"shape": (pixels, most), "grid": (1, most), "camera_grid": grid}
+        sizes["block_rows"] = adaptive.AT_ONCE
     else:
-        rows = columns.code_of(strategy, (h, w), settings.order).size
-    store = BlockStore.create(
-        path,
-        **sizes,
-        block_rows=rows,
-        channels=pictures.channels,
-        provenance={"acquisition": {**shots.describe(), **settings.to_json()}},
-        overwrite=True,  # what a run left that ended before its calibration was committed
-    )
+        sizes["block_rows"] = columns.code_of(strategy, grid, settings.order).size
+    facts = json.loads(json.dumps(shots.describe(), default=str))
+    # Overwrites what a run left that ended before its calibration was committed.
+    store = BlockStore.create(path, **sizes, provenance={"acquisition": facts}, overwrite=True)
     calibration.write(store)
     if calibration.mixing is not None:
         store.extra("mixing", calibration.mixing)
@@ -328,14 +304,13 @@ def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress
         log = Log(store, pictures, lambda done: progress("scan", done, max(done, most)))
         core = adaptive.scan(pictures, log, settings.threshold, settings.sigmas)
         store.update(patterns=log.done)
-        for name, variance in adaptive.variances(core).items():
-            store.extra(name, variance)
+        for c, V in enumerate(core.matrices("variance")):
+            store.extra(f"core_variance_{c}", V.data)
         store.finalize(compressed=Parts(adaptive.arrays(core, calibration.mixing, settings.sigmas)))
         progress("scan", log.done, log.done)
         return
-    h, w = pictures.grid
-    code, done = columns.code_of(strategy, (h, w), settings.order), 0
-    total = columns.patterns(code, h * w)
+    code, done = columns.code_of(strategy, pictures.grid, settings.order), 0
+    total = columns.patterns(code, math.prod(pictures.grid))
 
     def count(patterns: int) -> None:
         nonlocal done
@@ -343,11 +318,9 @@ def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress
         progress("scan", done, total)
 
     columns.scan(pictures, code, store, settings.sigmas, count)
-    white = pictures.white
-    if columns.SUMS not in store.extras:  # of a run that was killed after it
-        sums = np.stack([columns.sums(store, c) for c in range(pictures.channels)])
-        columns.check_row_sums(str(store.path), sums, white)
-        store.extra(columns.SUMS, sums)
+    white, sums = pictures.white, np.stack([columns.sums(store, c) for c in range(pictures.channels)])
+    columns.check_row_sums(str(store.path), sums, white)
+    store.extra(columns.SUMS, sums)
     store.update(patterns=total)
 
     def add_up(c: int, first: int, matrix: Any, variance: Any) -> tuple[Any, Any]:

@@ -3,7 +3,8 @@
 
 Every frame gets the same gain: one that followed the frames would make the scene flicker. Batches begin at
 the same frames in every run and share nothing but T: a resumed run gives what an uninterrupted one does, to
-the last bit with a named method; "auto" may know more of S the second time.
+the last bit with a named method; "auto" may know more of S the second time. What is missing from a batch is
+solved alone, to the same tolerance: the rest after `frames=`, or a pattern that was removed.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ def compensate_frames(
     checks.one_of("format", format, ("png", "exr"))
     fps = None if fps is None else checks.number("fps", fps, above=0.0)
     limit = None if frames is None else checks.count("frames", frames)
-    bounds = _validate(T, gain, loss, codes, options)
+    bounds = _validate(T, gain, loss, {"codes": codes, "progress": progress}, options)
     if video is not None:
         check_video(video, T.grid)
     opened, folder = open_frames(source, encoding=encoding), as_path(out)
@@ -177,13 +178,16 @@ def compensate_frames(
     return CompensatedFrames(folder, film, manifest.gain or 0.0, records, run.solved, seconds, error)
 
 
-def _validate(T: Transport, gain: Any, loss: Any, codes: Any, options: dict[str, Any]) -> tuple[float, float]:
+def _validate(
+    T: Transport, gain: Any, loss: Any, functions: dict[str, Any], options: dict[str, Any]
+) -> tuple[float, float]:
     """The bounds; refuses what `compensate` would, and pictures that are not for all frames."""
     require(T, square=False)
     resolve_reference(T, options.get("exact"))
     problem.gain(gain, loss)
-    if codes is not None and not callable(codes):
-        raise InputTypeError(f"codes is {checks.shown(codes)}; it must be a function of a pattern")
+    for name, value in functions.items():
+        if value is not None and not callable(value):
+            raise InputTypeError(f"{name} is {checks.shown(value)}; it must be a function, or None")
     for name in ("background", "weights"):
         value = options.get(name)
         if value is None or checks.real(name, value).ndim == 0:
@@ -231,11 +235,11 @@ class _Run:
             coming = reader.submit(next, batches, None)
             while (batch := coming.result()) is not None:
                 coming = reader.submit(next, batches, None)
-                frames, digests, pictures = batch
+                numbers, missing, digests, pictures = batch
                 if pictures:
                     yield len(self.done)
-                    self._solve(frames, digests, _stack(pictures), self._gain(gain, loss))
-                self.done += [frame.number for frame in frames]
+                    self._solve(missing, digests, _stack(pictures), self._gain(gain, loss))
+                self.done += numbers
         yield len(self.done)
 
     def patterns(self) -> Iterator[np.ndarray]:
@@ -252,19 +256,20 @@ class _Run:
         names = ["pattern_{:06}.{}", "appearance/appearance_{:06}.{}"][: 1 + self.appearance]
         return [self.manifest.path.parent / name.format(number, self.format) for name in names]
 
-    def _batches(self) -> Iterator[tuple[list[Frame], list[str], list[np.ndarray]]]:
-        """Frames, digests, and pictures: none where an earlier run has done all of them."""
+    def _batches(self) -> Iterator[tuple[list[int], list[Frame], list[str], list[np.ndarray]]]:
+        """Numbers of the frames; and those that no earlier run has done, with digests and pictures."""
         frames, folder = islice(self.source, self.limit), self.manifest.path.parent
         while batch := list(islice(frames, self.size)):
-            digests = [frame.digest() for frame in batch]
-            records = [self.manifest.records.get(frame.number) for frame in batch]
-            for frame, digest, record in zip(batch, digests, records, strict=True):
+            missing: dict[Frame, str] = {}
+            for frame in batch:
+                digest, record = frame.digest(), self.manifest.records.get(frame.number)
                 if record is not None and record.digest != digest:
                     advice = f"give the same frames to go on, or another folder than {folder}"
                     raise OtherRun(f"{self._place(frame)} has changed since its pattern was made; {advice}")
-            files = [file for frame in batch for file in self._files(frame.number)]
-            is_done = None not in records and all(file.is_file() for file in files)
-            yield batch, digests, [] if is_done else [self._picture(frame) for frame in batch]
+                if record is None or not all(file.is_file() for file in self._files(frame.number)):
+                    missing[frame] = digest
+            numbers = [frame.number for frame in batch]
+            yield numbers, [*missing], [*missing.values()], [self._picture(frame) for frame in missing]
 
     def _place(self, frame: Frame) -> str:
         return f"{self.source.path}: frame {frame.number} ({frame.name})"

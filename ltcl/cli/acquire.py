@@ -51,7 +51,8 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     from ltcl.acquisition.scanning.plan import choose, plans
 
     project = Project.open(folder)
-    settings, facts = project.check(), _outlook(project)
+    settings, facts = project.outlook()
+    facts = facts if project.state == "new" else _measured(project)
     kind: dict[str, Any] = {"aligned": settings.geometry == "aligned", "by_hand": project.kind == "folder"}
     count = photographs(facts["grid"], channels=facts["channels"], frames=settings.frames, **kind)
     asked: dict[str, Any] = {name: getattr(settings, name) for name in ("block", "order", "threshold")}
@@ -81,11 +82,8 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     return Answer(data, lines)
 
 
-def _outlook(project: Project) -> dict[str, Any]:
-    """What decides on the plans: guessed before the calibration, then measured."""
-    if project.state == "new":
-        outlook = project.outlook()
-        return {field.name: getattr(outlook, field.name) for field in dataclasses.fields(outlook)}
+def _measured(project: Project) -> dict[str, Any]:
+    """What decides on the plans, by the calibration."""
     from ltcl.acquisition import Calibration
     from ltcl.acquisition.scanning.plan import measured
 
@@ -157,6 +155,8 @@ def _is_complete(project: Project) -> bool:
 @contextmanager
 def _advising(project: Project) -> Iterator[None]:
     """Add to what ends an acquisition early what is kept, and how it goes on."""
+    from ltcl.acquisition.session import calibration_photographs
+
     try:
         yield
     except (AcquisitionError, KeyboardInterrupt) as error:
@@ -165,10 +165,13 @@ def _advising(project: Project) -> Iterator[None]:
             advice = f"remove {project.store} to begin again"
         elif project.state == "begun":
             advice = f"what was photographed before is kept in {project.store}; {again}"
+        elif project.kind == "folder" and isinstance(error, KeyboardInterrupt):
+            advice = again
         elif project.kind == "folder":
             advice = f"take wrong photographs in {project.folder}/photographs again; then {again}"
         else:
-            advice = f"{project.photographs} photographs of the calibration are kept; {again}"
+            count = calibration_photographs(project.store)
+            advice = f"{count} photographs of the calibration are kept; {again}"
         error.args = (f"{str(error) or 'interrupted'}; {advice}",)
         raise
 
@@ -196,7 +199,7 @@ def _report(context: Context, project: Project, device: Any) -> Answer:
     if project.kind == "virtual":
         context.progress("relative error of T p")
         T = store.load(project.store, on_dark="mask", device=device)
-        with project.aligned().rig() as rig:
+        with project.rig(aligned=True) as rig:
             data["error"] = errors = Setup.of(project.store).relative_error(rig, T)
         each = ", ".join(f"{error:.2%}" for error in errors)
         lines.append(f"relative error of T p, for patterns p that were not scanned: {each}")

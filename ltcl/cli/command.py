@@ -109,6 +109,14 @@ def command(*groups: Callable[..., None]) -> Callable[[Callable[..., Answer]], C
 
 def fail(error: BaseException, json: bool, verbose: bool = False) -> int:
     """Print an error as one line, and as JSON; returns the exit code."""
+    document = print_error(error, verbose)
+    if json:
+        typer.echo(report.dumps(document))
+    return document["exit_code"]
+
+
+def print_error(error: BaseException, verbose: bool = False) -> dict[str, Any]:
+    """One line on stderr; returns message, type and exit code, for --json."""
     code, kind, message = FAILED, type(error).__name__, " ".join(str(error).split())
     if isinstance(error, KeyboardInterrupt):
         code, message = INTERRUPTED, message or "interrupted"
@@ -120,15 +128,8 @@ def fail(error: BaseException, json: bool, verbose: bool = False) -> int:
         code, message = INTERNAL, f"internal error: {kind}: {message}; --verbose prints where it occurred"
         if verbose:
             typer.echo("".join(traceback.format_exception(error)), err=True)
-    if json:
-        typer.echo(report.dumps({"error": message, "type": kind, "exit_code": code}))
-    print_error(message)
-    return code
-
-
-def print_error(message: str) -> None:
-    """One line on stderr."""
     typer.echo(f"ltcl: error: {message}", err=True)
+    return {"error": message, "type": kind, "exit_code": code}
 
 
 def note(text: str) -> None:

@@ -29,16 +29,25 @@ def _bytes(text: str) -> int:
 
 
 _BUDGET = "Bytes that the numbers of R may take, such as 50MB."
+_BASIS = "pixels or a wavelet (haar, db2, ...; compress: 'db2 rows', too); more than once: the best of them."
 
 
-@command(options.file_options, options.transport_options)
+def _accuracy_options(
+    rtol: Annotated[float, options.option("Relative error that a solution may have.")] = 1e-2,
+    basis: Annotated[list[str] | None, options.option(_BASIS)] = None,
+) -> None:
+    """How accurate the solutions are, and in which basis R is written."""
+
+
+_GROUPS = (options.file_options, options.transport_options, _accuracy_options)
+
+
+@command(*_GROUPS)
 def compress(
     context: Context,
     file: options.Matrix,
     out: Annotated[Path, options.out("The compressed transport: .npz or .zarr.")],
-    rtol: options.SolutionRtol = 1e-2,
     budget: Annotated[int | None, options.option(_BUDGET, parser=_bytes, metavar="SIZE")] = None,
-    basis: options.Basis = None,
 ) -> Answer:
     """Write R in a basis where it is sparse; basis, threshold and precision are chosen by measurement."""
     from ltcl import store
@@ -52,7 +61,8 @@ def compress(
     if T.is_compressed and T.error:
         error = f"with an error of {T.error:.2g}"
         raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
-    C = compress(T, rtol, budget, basis=basis or None, progress=partial(context.progress, total=1.0))
+    rtol, basis = context.options["rtol"], context.options["basis"] or None
+    C = compress(T, rtol, budget, basis=basis, progress=partial(context.progress, total=1.0))
     store.save(out, C)
     transports.note_lost(file, out)
     facts: Any = C.compression
@@ -71,13 +81,9 @@ def compress(
     )
 
 
-@command(options.file_options, options.transport_options)
+@command(*_GROUPS)
 def invert(
-    context: Context,
-    file: options.Matrix,
-    out: Annotated[Path, options.out("The inverse: .npz.")],
-    rtol: options.SolutionRtol = 1e-2,
-    basis: options.Basis = None,
+    context: Context, file: options.Matrix, out: Annotated[Path, options.out("The inverse: .npz.")]
 ) -> Answer:
     """Find A = I - S^-1, one physical bounce, so that each further picture costs one product."""
     from ltcl.compression import INVERSE_NAMES, invert
@@ -85,8 +91,8 @@ def invert(
     formats.find(out, inverse=True)  # refused before a long computation
     transports.refuse_same(out, file)
     T = transports.load(context, file)
-    progress = partial(context.progress, total=1.0)
-    inverse = invert(T, rtol, basis=basis or INVERSE_NAMES, progress=progress)
+    rtol, basis = context.options["rtol"], context.options["basis"] or INVERSE_NAMES
+    inverse = invert(T, rtol, basis=basis, progress=partial(context.progress, total=1.0))
     save_inverse(out, inverse)
     data = transports.heading(context, file, T)
     data |= {"out": out, "bytes": inverse.nbytes, "bytes_on_disk": out.stat().st_size}

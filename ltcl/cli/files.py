@@ -28,16 +28,15 @@ def info(context: Context, files: options.Matrices, variable: options.Variable =
     for file in context.progress.each(files):
         context.progress("reading")
         try:
-            record = formats.read(file, variable=variable, inverse=None)
+            record = formats.read(file, variable=variable)
             with about(file):
                 if file.is_dir():
                     BlockStore.open(file).verify()
                 facts = _describe(file, record)
             entries.append(facts)
             rows.append(_row(facts))
-        except (LtclError, MemoryError) as error:
-            entries.append({"file": str(file), "error": str(error) or f"{file}: the host has no memory left"})
-            print_error(entries[-1]["error"])
+        except LtclError as error:
+            entries.append({"file": str(file), **print_error(error)})
     columns = ("file", "shape", "channels", "grid", "camera grid", "stored", "entries", "memory")
     lines = [table((*columns, "first bounce", "dark pixels"), rows)] if rows else []
     return Answer(entries, lines, FAILED if len(rows) < len(files) else 0)

@@ -88,7 +88,6 @@ _ENCODING = "Of pictures; auto: integers sRGB, floats linear."
 _RTOL = "Relative residual that ends a solve. Default: 0.01 (separate: 0.001), or the error of T where more."
 _EXACT = "What TRANSPORT was compressed from: corrects solves to any RTOL; errors are those with it."
 _SAMPLES = "Random walks from each pixel (monte_carlo, 256), or columns of a row (hybrid, 32)."
-_BASIS = "pixels or a wavelet (haar, db2, ...; compress: 'db2 rows', too); more than once: the best of them."
 _FIRST = "Direct light: the diagonal of T, or 1 / diag(T^-1), dense or estimated. Default: as in the file."
 _DARK = "Projector pixels without direct light: refuse or leave unlit; auto: unlit if 'ltcl acquire' made T."
 Matrix = Annotated[Path, argument("TRANSPORT", FORMATS)]
@@ -97,8 +96,6 @@ Pictures = Annotated[list[Path], argument("PICTURE...", "Pictures: .png, .jpg, .
 Out = Annotated[Path, out("Folder for the results; filled only on success.", writable_folder, "DIR")]
 Acquisition = Annotated[Path, argument("DIR", "Folder with an acquisition.toml; 'ltcl simulate' makes one.")]
 Device = Annotated[str | None, option(_DEVICE)]
-SolutionRtol = Annotated[float, option("Relative error that a solution may have.")]
-Basis = Annotated[list[str] | None, option(_BASIS)]
 OnDark = Annotated[Literal["auto", "raise", "mask"], option(_DARK)]
 Variable = Annotated[str | None, option("Name of the matrix in a .mat, .h5 or .npz file.", metavar="NAME")]
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +35,10 @@ def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
 
 
 def is_measured(path: Path) -> bool:
-    """Whether `ltcl.acquire` made this store."""
-    if not path.is_dir():
-        return False
-    from ltcl.acquisition.calibration import has_calibration
-
-    return has_calibration(path)
+    """Whether `ltcl.acquire` made this store; whoever loads a damaged one says what is wrong."""
+    with suppress(InputError):
+        return path.is_dir() and "strategy" in store.BlockStore.open(path).attributes
+    return False
 
 
 def note_lost(source: Path, target: Path) -> None:

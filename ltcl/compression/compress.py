@@ -26,7 +26,7 @@ from ltcl.compression.coefficients import Coefficients
 from ltcl.compression.norms import MISS, Starts, fresh_starts, inverse_norm
 from ltcl.compression.sources import Inputs, Problem, memory_errors, validate_inputs, window_of
 from ltcl.device import Device
-from ltcl.errors import ConvergenceError, InputError, ToleranceError
+from ltcl.errors import ConvergenceError, InputError, InputTypeError, ToleranceError
 from ltcl.operators import IdentityPlus, ScaledColumns
 from ltcl.operators.tiles import Packed
 from ltcl.theory import TwoNorm, two_norm
@@ -173,9 +173,10 @@ def compress(
     budget = None if budget is None else checks.count("budget", budget)
     memory = None if memory is None else checks.count("memory", memory)
     names = validate_names(INVERSE_NAMES if basis is None else basis)
+    note = validate_progress(progress)
     with memory_errors("compress", T):
         inputs = validate_inputs(T, grid, first_bounce, device, memory)
-        C, channels = compress_inputs(inputs, names, rtol, fresh_starts("compress"), progress)
+        C, channels = compress_inputs(inputs, names, rtol, fresh_starts("compress"), note)
     needed = sum(channel.nbytes for channel in channels)
     if budget is not None and needed > budget:
         raise InputError(
@@ -197,8 +198,15 @@ def validate_rtol(rtol: float, least: float) -> float:
     return rtol
 
 
+def validate_progress(progress: Note | None) -> Note:
+    """`progress`, or in its place a function that does nothing."""
+    if progress is not None and not callable(progress):
+        raise InputTypeError(f"progress is {progress!r}; it must be callable(text, share), or None")
+    return progress or (lambda text, share: None)
+
+
 def compress_inputs(
-    inputs: Inputs, names: Sequence[str], rtol: float, starts: Starts, progress: Note | None = None
+    inputs: Inputs, names: Sequence[str], rtol: float, starts: Starts, progress: Note
 ) -> tuple[Transport, tuple[ChannelCompression, ...]]:
     """R of every channel in the best of the bases `names`, and what is reported of each."""
     colours = ("red: ", "green: ", "blue: ") if len(inputs.problems) == 3 else ("",)
@@ -206,8 +214,7 @@ def compress_inputs(
     for number, (problem, F) in enumerate(zip(inputs.problems, inputs.F, strict=True)):
 
         def note(text: str, share: float, number: int = number) -> None:
-            if progress is not None:
-                progress(colours[number] + text, (number + share) / len(colours))
+            progress(colours[number] + text, (number + share) / len(colours))
 
         best, trials = _compare(problem, names, rtol, note)
         fit = _whole(problem, best, rtol, starts, note)

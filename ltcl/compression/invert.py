@@ -21,7 +21,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.compression.bases import INVERSE_NAMES, PIXELS, quantize, validate_names
-from ltcl.compression.compress import compress_inputs, validate_rtol
+from ltcl.compression.compress import compress_inputs, validate_progress, validate_rtol
 from ltcl.compression.norms import MISS, Starts, fresh_starts
 from ltcl.compression.sources import memory_errors, of_transport
 from ltcl.compression.sparse_inverse import invert_coefficients, residual_norm
@@ -92,7 +92,7 @@ def invert(
             f"{checks.upwards(T.error)}; ask for more than that, or invert what T was compressed from"
         )
     names = validate_names(basis, for_inverse=True)
-    note, starts = progress or (lambda text, share: None), fresh_starts("invert")
+    note, starts = validate_progress(progress), fresh_starts("invert")
     bounces, errors = [], []
     try:
         with memory_errors("invert", T):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ltcl import checks, report
+from ltcl import checks, errors, report
 from ltcl.demo import experiment, output
 from ltcl.files import fill_folder
 
@@ -46,10 +46,8 @@ def run(
         Folder; files of an earlier run are replaced only when everything has succeeded.
     size : int
         Patches along a wall, at least 4: the projector has 3 * size^2 pixels.
-    device : Device or str, optional
-        As `open_device` takes it.
-    progress : callable, optional
-        Called with each of `STEPS` as it begins.
+    device, progress : optional
+        As `open_device` takes it; a function, called with each of `STEPS` as it begins.
 
     Examples
     --------
@@ -59,6 +57,8 @@ def run(
     True
     """
     checks.count("size", size, least=4)
+    if progress is not None and not callable(progress):
+        raise errors.InputTypeError(f"progress is {progress!r}; it must be callable(step), or None")
     starts: dict[str, float] = {}
 
     def begin(step: str) -> None:

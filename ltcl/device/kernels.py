@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ltcl.device.device import Device
 
 # Exact float32: no fast-math (it deletes NaN tests), contraction of a * b + c is left to the driver.
-_OPTIONS = ["-cl-std=CL1.2", "-cl-kernel-arg-info"]
+_OPTIONS = ["-cl-std=CL1.2", "-cl-kernel-arg-info", "-w"]
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _PRIVATE = 0x119E  # CL_KERNEL_ARG_ADDRESS_PRIVATE: numbers
 _PACKERS: dict[str, Any] = {  # a Python number as bytes; reals beyond float32 are infinite, as in a kernel

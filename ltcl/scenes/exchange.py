@@ -105,21 +105,22 @@ def of_walls(first: Wall, second: Wall, n: int) -> np.ndarray:
     It depends on the offset of the patches alone, so each offset is computed once: about 2 n^3 for walls that
     share an edge, 4 n^2 for walls that face each other.
     """
-    one, other = (np.stack([wall.down, wall.right]).astype(np.float64) / n for wall in (first, second))
+    edges, others = (np.stack([wall.down, wall.right]).astype(np.float64) / n for wall in (first, second))
     index = np.ogrid[:n, :n, :n, :n]
     steps, counts, free = [], [], {0, 1, 2, 3}
     for i, j, sign in itertools.product((0, 1), (2, 3), (1, -1)):
-        alike = np.allclose(one[i], sign * other[j - 2], rtol=0, atol=_FLAT * np.linalg.norm(one[i]))
+        tolerance = _FLAT * np.linalg.norm(edges[i])
+        alike = np.allclose(edges[i], sign * others[j - 2], rtol=0, atol=tolerance)
         if alike and {i, j} <= free:  # only the difference of the counts along a shared edge matters
             free -= {i, j}
-            steps.append(other[j - 2])
+            steps.append(others[j - 2])
             counts.append(index[j] - sign * index[i])
-    steps += [other[k - 2] if k > 1 else -one[k] for k in sorted(free)]
+    steps += [others[k - 2] if k > 1 else -edges[k] for k in sorted(free)]
     counts += [index[k] for k in sorted(free)]
     ranges = np.meshgrid(*(np.arange(count.min(), count.max() + 1) for count in counts), indexing="ij")
-    start = np.subtract(second.corner, first.corner) + (other.sum(axis=0) - one.sum(axis=0)) / 2
+    start = np.subtract(second.corner, first.corner) + (others.sum(axis=0) - edges.sum(axis=0)) / 2
     offsets = start + np.stack(ranges, axis=-1) @ np.array(steps)
-    table = exchange(one, other, offsets.reshape(-1, 3)).reshape(offsets.shape[:-1])
+    table = exchange(edges, others, offsets.reshape(-1, 3)).reshape(offsets.shape[:-1])
     return table[tuple(count - count.min() for count in counts)]
 
 
@@ -147,8 +148,8 @@ def exchange(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.nd
     result = np.empty(len(offset))
     for start in range(0, len(offset), _SLAB):
         slab = slice(start, start + _SLAB)
-        one, other = (edges if edges.ndim == 2 else edges[slab] for edges in (first, second))
-        result[slab] = _slab(one, other, offset[slab])
+        pair = [edges if edges.ndim == 2 else edges[slab] for edges in (first, second)]
+        result[slab] = _slab(pair[0], pair[1], offset[slab])
     return result
 
 
@@ -177,11 +178,11 @@ def _slab(first: np.ndarray, second: np.ndarray, offset: np.ndarray) -> np.ndarr
         some = np.flatnonzero(left & ((distance < _TIERS[-1][0]) == near) & (whole != clipped))
         if len(some):
             scale = unit[some, None, None, None]
-            one = _outline(first[some], np.zeros((1, 3))) / scale
-            other = _outline(second[some], offset[some]) / scale
+            outline = _outline(first[some], np.zeros((1, 3))) / scale
+            opposite = _outline(second[some], offset[some]) / scale
             if clipped:
-                one, other = _clip(one, under[some]), _clip(other, over[some])
-            result[some] = _stokes(one, other, _TOUCHING if near else _APART) * unit[some] ** 2
+                outline, opposite = _clip(outline, under[some]), _clip(opposite, over[some])
+            result[some] = _stokes(outline, opposite, _TOUCHING if near else _APART) * unit[some] ** 2
     return result
 
 

@@ -189,8 +189,8 @@ def _hit(homography: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
 def _overlap(first: np.ndarray, second: np.ndarray) -> bool:
     """Whether two walls overlap in the image by more than a rounding error."""
     corners = np.array([(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 1)], dtype=np.float64)
-    one, other = (np.pad(_apply(homography, corners), ((0, 0), (0, 1))) for homography in (first, second))
-    return overlap(one, other, touch=1e-9)
+    outlines = (np.pad(_apply(homography, corners), ((0, 0), (0, 1))) for homography in (first, second))
+    return overlap(*outlines, touch=1e-9)
 
 
 def _read_wall(

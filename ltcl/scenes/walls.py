@@ -211,13 +211,13 @@ def refuse_crossing(walls: Sequence[Wall]) -> None:
 
 
 def overlap(first: np.ndarray, second: np.ndarray, touch: float) -> bool:
-    """Whether convex outlines (4, 3) in one plane overlap: no line along an edge of one parts them."""
+    """Whether convex outlines (4, 3) in one plane overlap: no line along an edge separates them."""
     normal = _normal(first)
     for corners in (first, second):
         for edge in np.roll(corners, -1, axis=0) - corners:
             across = np.cross(normal, edge) / np.linalg.norm(edge)
-            one, other = first @ across, second @ across
-            if min(one.max(), other.max()) - max(one.min(), other.min()) <= touch:
+            a, b = first @ across, second @ across
+            if min(a.max(), b.max()) - max(a.min(), b.min()) <= touch:
                 return False
     return True
 

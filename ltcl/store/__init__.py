@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Transports on disk: load one from, and save one to, .npz, .npy, .mtx, .h5, .mat and .zarr.
 
-Everything that a file declares is checked before memory is taken for it; pickles are never loaded. A .zarr
-folder is a `BlockStore`: a scan grows in it batch by batch, and a finished T is read block by block.
+Everything that a file declares is checked before memory is taken for it; pickles are never loaded.
 
-formats         load, save, read and write by extension; npz (.npy), exchange (.mtx, .h5, .mat)
+formats         load, save, read and write by extension; exchange (.mtx, .h5, .mat)
 record          what is in files, and the checks of what they declare
-block_store     `BlockStore`: a log of batches, finalized as zarr (`zarr_arrays`)
+block_store     .zarr: in a `BlockStore` a scan grows by batches; a finished T is read block by block
 """
 
 from ltcl.store.block_store import ArrayLog, BlockStore

@@ -1,49 +1,34 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Transport files by extension: transports (`load`, `save`), and what files hold (`read`, `write`)."""
+"""Transport files by extension: transports (`load`, `save`), and what files hold (`read`, `write`).
+
+An .npz holds SciPy's `save_npz` layouts; or named arrays, `T` (M, N) or (3, M, N) or the only matrix; or, by
+its `format`, a compressed transport, an inverse, or three sparse channels ("ltcl-rgb-csr-1": `shape`,
+`indptr_0`, `indices_0`, `data_0` to `data_2`); and perhaps `EXTRAS`. Not compressed, as light hardly shrinks.
+"""
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.errors import FileError, InputTypeError
+from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.solvers import Inverse
-from ltcl.store import block_store, exchange, npz
-from ltcl.store.record import Matrix, Parts, Record, about, floats
+from ltcl.store import block_store, exchange, record
+from ltcl.store.record import CSR, Matrix, Parts, Record, about
 from ltcl.transport import Transport, from_arrays, to_arrays
 
-logger = logging.getLogger(__name__)
-
-
-class Format(NamedTuple):
-    """How files of a format are read and written, and what they keep."""
-
-    read: Callable[..., Any]
-    write: Callable[[Path, Any], None]
-    variables: bool = True  # whether arrays have names
-    first_bounce: bool = True
-    compressed: bool = False
-
-
-_ZARR = Format(block_store.read, block_store.write, variables=False, compressed=True)
-_HDF5 = Format(exchange.read_hdf5, exchange.write_hdf5)
-FORMATS: dict[str, Format] = {
-    ".npz": Format(npz.read, npz.write, compressed=True),
-    ".npy": Format(npz.read_npy, npz.write_npy, variables=False, first_bounce=False),
-    ".mtx": Format(exchange.read_mtx, exchange.write_mtx, variables=False, first_bounce=False),
-    ".h5": _HDF5,
-    ".hdf5": _HDF5,
-    ".mat": Format(exchange.read_mat, exchange.write_mat),
-    ".zarr": _ZARR,
-}
+COMPRESSED, INVERSE, RGB = "ltcl-compressed-1", "ltcl-inverse-1", "ltcl-rgb-csr-1"
+_INDICES = ("indices", "indptr", "row", "col", "coords", "offsets")
 
 
 def load(
@@ -71,45 +56,34 @@ def load(
     first_bounce, on_dark, device
         As in `Transport`; a first bounce of None takes the file's, or else "diagonal".
 
-    Returns
-    -------
-    Transport
-        Values of up to 16 bits and float32 are float32, all others float64; a compressed one has the same
-        bits as it was saved. HDF5, .mtx and .mat keep no checksums: a flipped bit may be another number.
-
-    Raises
-    ------
-    FileError
-        The file is missing, damaged, of an unknown format, without a grid, or holds no valid transport.
-    MemoryLimitError
-        It does not fit the memory of the host or of the device.
+    Values of up to 16 bits and float32 become float32, all others float64; compressed ones keep their bits.
+    HDF5, .mtx and .mat keep no checksums: a flipped bit may be another number. FileError for a file that is
+    missing, damaged, without a grid or no transport; MemoryLimitError where host or device have no room.
 
     Examples
     --------
-    >>> import tempfile, pathlib, numpy as np
+    >>> import ltcl, tempfile, pathlib, numpy as np
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "T.npy"
     >>> np.save(path, np.eye(6, dtype=np.float32))
-    >>> load(path, grid=(2, 3)).shape
+    >>> ltcl.load(path, grid=(2, 3)).shape
     (6, 6)
     """
-    path = as_path(path)
-    record = read(path, variable=variable)
+    content = read(path, variable=variable)
     with about(path):
-        if isinstance(record, Parts):
-            own: dict[str, Any] = {"grid": grid or camera_grid, "first_bounce": first_bounce}
-            return from_arrays(record.arrays, **own, on_dark=on_dark, device=device)
-        M, N = record.shape
-        grid = checks.grid("grid", grid or record.grid or _unknown("grid", N, "projector"), N)
-        camera_grid = camera_grid or record.camera_grid
+        if isinstance(content, Parts):
+            if content.format == INVERSE:
+                raise FileError("is an inverse, for ltcl.load_inverse; it must be a transport")
+            options: dict[str, Any] = {"grid": grid or camera_grid, "first_bounce": first_bounce}
+            return from_arrays(content.arrays, **options, on_dark=on_dark, device=device)
+        M, N = content.shape
+        grid = checks.grid("grid", grid or content.grid or _unknown("grid", N, "projector"), N)
+        camera_grid = camera_grid or content.camera_grid
         if camera_grid is not None or M != N:
             camera_grid = checks.grid("camera_grid", camera_grid or _unknown("camera_grid", M, "camera"), M)
-        if first_bounce is None:
-            # On another camera grid there is no S, and the file's first bounce means nothing.
-            stored = record.first_bounce if camera_grid in (None, grid) else None
-            first_bounce = "diagonal" if stored is None else stored
-        matrices = record.matrices if len(record.matrices) == 3 else record.matrices[0]
-        own = {"on_dark": on_dark, "mixing": record.mixing}
-        return Transport(matrices, grid, first_bounce, camera_grid, device, **own)
+        if first_bounce is None and camera_grid in (None, grid):  # on another grid there is no S
+            first_bounce = content.first_bounce
+        T, F = content.matrices, "diagonal" if first_bounce is None else first_bounce
+        return Transport(T, grid, F, camera_grid, device, on_dark=on_dark, mixing=content.mixing)
 
 
 def _unknown(name: str, pixels: int, whose: str) -> tuple[int, int]:
@@ -125,38 +99,31 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     4 GiB a variable) all else; .npy (dense only) the matrix; .mtx (one channel) matrix and grids. Pixels
     dropped by ``on_dark="mask"`` are saved with a first bounce of 0; loading needs the same again.
 
-    FileError for an unknown extension, a format that cannot hold this transport, or a file that cannot be
+    FileError where the extension is unknown, the format cannot hold this transport, or the file cannot be
     written; InputTypeError for 3 x 3 blocks, or operators that are no compressed S F.
 
     Examples
     --------
-    >>> import tempfile, pathlib, numpy as np
+    >>> import ltcl, tempfile, pathlib, numpy as np
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "T.npz"
-    >>> save(path, Transport(np.eye(6), grid=(2, 3)))
-    >>> load(path).grid
+    >>> ltcl.save(path, ltcl.Transport(np.eye(6), grid=(2, 3)))
+    >>> ltcl.load(path).grid
     (2, 3)
     """
     if not isinstance(T, Transport):
-        also = "; ltcl.save_inverse saves it" if isinstance(T, Inverse) else ""
-        raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport{also}")
+        raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport (or use save_inverse)")
     if T.blocks is not None:
         raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
-    if not any(isinstance(matrix, Matrix) for matrix in T.matrices):
+    if not any(isinstance(M, Matrix) for M in T.matrices):
         write(path, Parts(to_arrays(T)))
         return
-    matrices = []
-    for M in T.matrices:
-        if isinstance(M, scipy.sparse.csr_array):
-            M = scipy.sparse.csr_array((floats("T", M.data), M.indices, M.indptr), shape=M.shape)
-        matrices.append(floats("T", M) if isinstance(M, np.ndarray) else M)
+    matrices = [record.floats("T", M) if isinstance(M, np.ndarray) else M for M in T.matrices]
     F = T.first_bounce if T.is_square else None
     write(path, Record(tuple(matrices), T.grid, T.camera_grid, F, T.mixing))
 
 
 def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
-    """Save what `ltcl.invert` made as .npz; an earlier file at `path` is replaced whole or not at all.
-
-    FileError for another extension, or where the file cannot be written.
+    """Save what `ltcl.invert` made as .npz, whole or not at all; FileError where that is not possible.
 
     Examples
     --------
@@ -169,68 +136,144 @@ def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:
     """
     if not isinstance(inverse, Inverse):
         raise InputTypeError(f"inverse is a {type(inverse).__name__}; it must be what ltcl.invert(T) gives")
-    write(path, Parts(inverse.to_arrays(), npz.INVERSE))
+    write(path, Parts(inverse.to_arrays(), INVERSE))
 
 
 def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse:
-    """Load an inverse of `save_inverse` onto a device (as `open_device` takes it), with the same bits.
-
-    FileError and MemoryLimitError as of `load`, and where the file holds something else.
-    """
-    content: Any = read(path, inverse=True)
+    """Load an inverse of `save_inverse` onto a device (see `open_device`); errors are those of `load`."""
+    content: Any = read(path)
     with about(path):
+        if getattr(content, "format", None) != INVERSE:
+            raise FileError("is no inverse, as ltcl.save_inverse writes it")
         return Inverse.from_arrays(content.arrays, device)
 
 
-def read(
-    path: str | os.PathLike[str], *, variable: str | None = None, inverse: bool | None = False
-) -> Record | Parts:
-    """A `Record`, or `Parts` of a compressed transport, or of an `inverse`; with None of either.
-
-    Needs no device; errors and `variable` are those of `load`.
-    """
+def read(path: str | os.PathLike[str], *, variable: str | None = None) -> Record | Parts:
+    """A `Record`, or `Parts` of a compressed transport or of an inverse; errors are those of `load`."""
     path = as_path(path)
-    kind = find(path, inverse=inverse or False)
-    if variable is not None and not kind.variables:
+    suffix = find(path)
+    if variable is not None and suffix in (".npy", ".mtx", ".zarr"):
         raise FileError(f"{path}: variable is {variable!r}, but the matrix of this format has no name")
-    if kind is not _ZARR:
+    if suffix != ".zarr":
         input_file(path)
     with about(path, reading=True):
-        content = kind.read(path) if variable is None else kind.read(path, variable)
-        is_inverse = isinstance(content, Parts) and content.format == npz.INVERSE
-        if inverse not in (None, is_inverse):
-            actual = "an inverse, for ltcl.load_inverse; it must be a transport"
-            raise FileError(f"is {actual}" if is_inverse else "is no inverse, as ltcl.save_inverse writes it")
-        return content
+        return FORMATS[suffix][0](path, *([] if variable is None else [variable]))
 
 
 def write(path: str | os.PathLike[str], content: Record | Parts) -> None:
     """Write a transport file whole or not at all; errors are those of `save`."""
     path = as_path(path)
-    kind = find(path, inverse=isinstance(content, Parts) and content.format == npz.INVERSE)
+    suffix = find(path, inverse=isinstance(content, Parts) and content.format == INVERSE)
     lost = f"{path}: {path.suffix} does not keep"
     if isinstance(content, Parts):
-        if not kind.compressed:
+        if suffix not in (".npz", ".zarr"):
             raise FileError(f"{lost} compressed transports; .npz and .zarr do")
-    elif not kind.first_bounce:
+    elif suffix in (".npy", ".mtx"):
         if content.mixing is not None:
             raise FileError(f"{lost} how the projector's colours mix; .npz does")
         F, diagonals = content.first_bounce, [T.diagonal() for T in content.matrices]
         if F is not None and not np.allclose(F, diagonals, rtol=1e-6, atol=0):
-            logger.warning("%s the first bounce; .npz does", lost)
+            logging.getLogger(__name__).warning("%s the first bounce; .npz does", lost)
     with about(path):
-        if kind is _ZARR:
-            kind.write(path, content)
-            return
-        with replace_file(path) as temporary:
-            kind.write(temporary, content.in_memory() if isinstance(content, Record) else content)
+        if suffix == ".zarr":
+            block_store.write(path, content)
+        else:
+            with replace_file(path) as temporary:
+                FORMATS[suffix][1](temporary, content.in_memory() if isinstance(content, Record) else content)
 
 
-def find(path: Path, *, inverse: bool = False) -> Format:
-    """The format that the extension of `path` names; a folder may be a store by any other."""
+def find(path: Path, *, inverse: bool = False) -> str:
+    """The extension by which the format of `path` is known; a folder may be a store by any other."""
     suffix = path.suffix.lower()
     if inverse and suffix != ".npz":
         raise FileError(f"{path}: the extension is {path.suffix!r}; inverses are .npz")
     if suffix not in FORMATS and not path.is_dir():
         raise FileError(f"{path}: {unknown_extension(path)}; transports are {', '.join(FORMATS)}")
-    return FORMATS.get(suffix, _ZARR)
+    return suffix if suffix in FORMATS else ".zarr"
+
+
+def _read_npz(path: Path, variable: str | None = None) -> Record | Parts:
+    headers = _headers(path)
+    with np.load(path, allow_pickle=False) as archive:
+
+        def load(name: str) -> np.ndarray:
+            array = archive[name]
+            if array.dtype.kind in "SU" and array.size == 1:
+                return array.astype(str).reshape(())
+            return np.asarray(checks.real(f"array {name!r}", array), array.dtype.newbyteorder("="))
+
+        layout = str(load("format")) if "format" in headers else None
+        if layout in (COMPRESSED, INVERSE):
+            return Parts({name: load(name) for name in headers if name != "format"}, layout)
+        shapes = {name: shape for name, (shape, dtype) in headers.items() if dtype.kind in "fiubc"}
+        matrices: dict[str, Any] = {}
+        if layout and variable is None:
+            if "shape" not in headers:
+                raise FileError(f"array 'format' is {layout!r:.60}, which is unknown")
+            M, N = checks.grid("array 'shape'", load("shape").tolist())
+            for name, (_, dtype) in headers.items():
+                if name.startswith(_INDICES) and dtype.kind not in "iu":  # SciPy would truncate them
+                    raise FileError(f"array {name!r} holds {dtype}; it must hold integers")
+            entries = path.stat().st_size // 8  # about, and enough to bound the rows
+            if layout != RGB:
+                matrices["T"] = record.sparse(lambda: scipy.sparse.load_npz(path), (M, N), entries)
+            for k, channel in enumerate(record.CHANNELS if layout == RGB else ()):
+                arrays = tuple(load(f"{name}_{k}") for name in CSR)
+                make = functools.partial(scipy.sparse.csr_array, arrays, shape=(M, N))
+                matrices[channel] = record.sparse(make, (M, N), entries)
+        shapes |= dict.fromkeys(matrices, (1, 1))
+        return record.assemble(shapes, lambda n: matrices[n] if n in matrices else load(n), variable)
+
+
+def _headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    """Shape and type of each array by name, after they were compared with the sizes that are stored."""
+    headers, size = {}, path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            name, most = info.filename.removesuffix(".npy"), record.EXPANSION * min(info.compress_size, size)
+            with archive.open(info) as stream:
+                version = "1_0" if np.lib.format.read_magic(stream) == (1, 0) else "2_0"
+                shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version}")(stream)
+                rest = info.file_size - stream.tell()
+            record.declared(f"array {name!r}", dtype, shape, min(rest, most), rest)
+            headers[name] = (shape, dtype)
+    return headers
+
+
+def _write_npz(path: Path, content: Record | Parts) -> None:
+    arrays: dict[str, Any]
+    if isinstance(content, Parts):
+        arrays = {"format": content.format, **content.arrays}
+    elif content.dense:
+        arrays = content.arrays()
+    else:  # one matrix as SciPy writes it: bytes, and a flag for csr_array
+        ends = [""] if len(content.matrices) == 1 else ["_0", "_1", "_2"]
+        header = {"format": RGB if ends[1:] else np.array(b"csr"), "_is_array": True, "shape": content.shape}
+        csr = zip(ends, content.matrices, strict=True)
+        arrays = content.arrays() | header | {n + end: getattr(T, n) for end, T in csr for n in CSR}
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def _read_npy(path: Path) -> Record:
+    mapped = np.lib.format.open_memmap(path, "r")  # reads the header and allocates nothing
+    checks.fits_host("the array", 2 * mapped.nbytes)
+    return record.assemble({"T": mapped.shape}, lambda _: np.array(mapped))
+
+
+def _write_npy(path: Path, content: Record) -> None:
+    if not content.dense:
+        raise InputError("T is sparse, and .npy holds dense arrays only; save it as .npz")
+    with path.open("wb") as file:
+        np.save(file, content.arrays()["T"], allow_pickle=False)
+
+
+FORMATS: dict[str, tuple[Callable[..., Any], Callable[[Path, Any], None]]] = {
+    ".npz": (_read_npz, _write_npz),
+    ".npy": (_read_npy, _write_npy),
+    ".mtx": (exchange.read_mtx, exchange.write_mtx),
+    ".h5": (exchange.read_hdf5, exchange.write_hdf5),
+    ".hdf5": (exchange.read_hdf5, exchange.write_hdf5),
+    ".mat": (exchange.read_mat, exchange.write_mat),
+    ".zarr": (block_store.read, block_store.write),
+}

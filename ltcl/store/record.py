@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Transports as files hold them, and the checks of what a file declares before memory is taken for it.
 
-`Record` has matrices, in memory or on the disk (`StoredRows`); `Parts` arrays of a compressed transport or an
-inverse. SciPy, NumPy, h5py and zarr allocate what a header asks for, and raise nearly everything where bytes
-are damaged: so their callers call `declared` first, inside of `about`.
+SciPy, NumPy, h5py and zarr allocate what a header asks for, and raise nearly everything where bytes are
+damaged: so their callers call `declared` first, inside of `about`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,21 +24,12 @@ from ltcl.errors import FileError, InputError, InputTypeError, LtclError, Memory
 EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
 CSR = ("data", "indices", "indptr")
 CHANNELS = ("T_0", "T_1", "T_2")
-EXPANSION = 1032
-"""What deflate can reach, the only compression that is read."""
-_FREE_ROWS = 1 << 24  # 128 MiB of pointers; a matrix of more rows must have entries to show for them
-_ROWS_PER_ENTRY = 64
+EXPANSION = 1032  # what deflate can reach, the only compression that is read
 
 
 @contextlib.contextmanager
 def about(path: Any, *, reading: bool = False) -> Iterator[None]:
-    """Put the name of `path` in front of each refusal in the block; in `reading`, any exception is one.
-
-    >>> with about("T.npz"):
-    ...     raise InputError("is empty")
-    Traceback (most recent call last):
-    ltcl.errors.FileError: T.npz: is empty
-    """
+    """Put the name of `path` in front of each refusal in the block; in `reading`, any exception is one."""
     try:
         yield
     except (InputError, InputTypeError) as error:
@@ -72,10 +63,9 @@ def floats(what: str, array: np.ndarray) -> np.ndarray:
 
 def sparse(make: Callable[[], Any], shape: Sequence[int], entries: int) -> scipy.sparse.csr_array:
     """A matrix of SciPy in any layout as checked rows of floats, made after its sizes are checked."""
-    most = _FREE_ROWS + _ROWS_PER_ENTRY * entries  # as the conversion allocates all rows
+    most = (1 << 24) + 64 * entries  # 128 MiB of pointers; more rows must have entries to show for them
     if min(shape) < 1 or max(shape) > most:
-        sizes = f"{tuple(shape)} with {entries} entries"
-        raise FileError(f"the matrix is declared as {sizes}; rows and columns must be 1..{most}")
+        raise FileError(f"the matrix is declared as {tuple(shape)}, {entries} entries; it must be 1..{most}")
     matrix = make()
     if matrix.format == "bsr":
         matrix.check_format(full_check=True)  # the others are checked in `checks.csr`, or when they are made
@@ -84,40 +74,33 @@ def sparse(make: Callable[[], Any], shape: Sequence[int], entries: int) -> scipy
 
 
 class StoredRows(scipy.sparse.linalg.LinearOperator):
-    """T (M, N) of channel `channel` of a final `BlockStore`, read block by block; all are checked once, here.
+    """T (M, N) of a channel of a final `BlockStore`, read block by block; all are checked once, here.
 
-    On a device it becomes compressed sparse rows, a block at a time; everything else may use it as a SciPy
-    `LinearOperator`. `nbytes` are those of the blocks on the disk.
+    On a device it becomes compressed sparse rows, a block at a time. `nbytes` are those on the disk.
     """
 
-    dtype: np.dtype
-    shape: tuple[int, int]
-
     def __init__(self, store: Any, channel: int) -> None:
-        super().__init__(np.dtype(store.layout.dtype), store.layout.shape)
-        self.store, self.channel = store, channel
-        self._latest: tuple[int, Any] = (-1, None)
+        self._layout = sizes = store.layout
+        super().__init__(np.dtype(sizes.dtype), sizes.shape)
+        self._read = functools.lru_cache(1)(lambda block: store.block(channel, block).matrix)
         self.nnz = sum(block.nnz for _, block in self.row_blocks())
-        self.nbytes = (4 + self.dtype.itemsize) * self.nnz + 8 * (self.shape[0] + store.layout.blocks())
+        self.nbytes = (4 + np.dtype(sizes.dtype).itemsize) * self.nnz + 8 * (self.shape[0] + sizes.blocks())
 
     def row_blocks(self) -> Iterator[tuple[int, scipy.sparse.csr_array]]:
-        """Each block with its first row; gone from memory when the next one comes."""
-        for block in range(self.store.layout.blocks()):
-            yield self.store.layout.span(block)[0], self._read(block)
+        """Each block with its first row."""
+        for block in range(self._layout.blocks()):
+            yield self._layout.span(block)[0], self._read(block)
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1, (stop - start, N)."""
-        size = self.store.layout.block_rows
+        size = self._layout.block_rows
         blocks = range(start // size, -(-stop // size))
         slices = (self._read(k)[max(start - k * size, 0) : stop - k * size].toarray() for k in blocks)
         return np.concatenate(list(slices))
 
     def between(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """The entries where ascending `rows` meet `columns`, (len(rows), len(columns)) float64."""
-        limits = ((rows, *self.store.layout.span(k)) for k in range(self.store.layout.blocks()))
-        inside = (rows[(rows >= first) & (rows < stop)] - first for rows, first, stop in limits)
-        blocks = (B[of][:, columns].toarray() for of, (_, B) in zip(inside, self.row_blocks(), strict=True))
-        return np.concatenate(list(blocks)).astype(np.float64)
+        return np.concatenate([self.rows(i, i + 1)[:, columns] for i in rows.tolist()]).astype(np.float64)
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal."""
@@ -129,21 +112,12 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
         checks.fits_host(f"T of {self.nnz} entries", 2 * self.nbytes)
         return scipy.sparse.csr_array(scipy.sparse.vstack([block for _, block in self.row_blocks()], "csr"))
 
-    def _read(self, block: int) -> Any:
-        if self._latest[0] != block:  # neighbouring rows are asked for a few at a time
-            self._latest = (-1, None)
-            self._latest = (block, self.store.block(self.channel, block).matrix)
-        return self._latest[1]
-
     def _matmat(self, X: Any) -> np.ndarray:
         return np.concatenate([block @ X for _, block in self.row_blocks()])
 
     def _rmatmat(self, X: Any) -> np.ndarray:
         blocks = (block.T @ X[first : first + len(block.indptr) - 1] for first, block in self.row_blocks())
         return sum(blocks, np.zeros((self.shape[1], X.shape[1])))
-
-    def _rmatvec(self, x: Any) -> np.ndarray:
-        return self._rmatmat(x.reshape(-1, 1))
 
 
 Matrix = np.ndarray | scipy.sparse.csr_array | StoredRows
@@ -153,17 +127,11 @@ Matrix = np.ndarray | scipy.sparse.csr_array | StoredRows
 class Record:
     """Contents of a transport file, `picture = T @ pattern`; InputError where they do not fit each other.
 
-    `matrices` are one, or three for red, green and blue, each (M, N), real: M camera pixels, N projector
-    pixels, both row-major; all dense, all `csr_array` or all `StoredRows`. Perhaps `grid` and `camera_grid`
-    (h, w) of projector and camera, `first_bounce` (N,) or (3, N), and `mixing` (3, 3) of colours.
-
-    Examples
-    --------
-    >>> Record((np.eye(6),), grid=(2, 3)).shape
-    (6, 6)
+    `matrices` are one, or three of colours, of M camera and N projector pixels: arrays, `csr_array` or
+    `StoredRows`; `grid` and `camera_grid` are (h, w), `first_bounce` (N,) or (3, N), `mixing` (3, 3).
     """
 
-    matrices: tuple[Matrix, ...]
+    matrices: tuple[Any, ...]
     grid: tuple[int, int] | None = None
     camera_grid: tuple[int, int] | None = None
     first_bounce: np.ndarray | None = None
@@ -172,7 +140,7 @@ class Record:
     def __post_init__(self) -> None:
         types, shapes = {type(T) for T in self.matrices}, {tuple(T.shape or ()) for T in self.matrices}
         if len(self.matrices) not in (1, 3) or len(types) > 1 or not isinstance(self.matrices[0], Matrix):
-            names = ", ".join(type(T).__name__ for T in self.matrices)
+            names = [type(T).__name__ for T in self.matrices]
             raise InputTypeError(f"matrices are {names}; they must be one or three arrays or csr_array")
         if len(shapes) > 1 or any(len(shape) != 2 or 0 in shape for shape in shapes):
             raise InputError(f"matrices have the shapes {sorted(shapes)}; they must be one (M, N), not empty")
@@ -181,63 +149,42 @@ class Record:
         if self.mixing is not None:
             layout.mixing(self.mixing, len(self.matrices), None)
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(M, N): camera pixels, projector pixels."""
-        shape: Any = self.matrices[0].shape
-        return shape
-
-    @property
-    def dense(self) -> bool:
-        """Whether the matrices are plain arrays."""
-        return isinstance(self.matrices[0], np.ndarray)
-
-    @property
-    def stored(self) -> bool:
-        """Whether the matrices are in a store, and not in memory."""
-        return isinstance(self.matrices[0], StoredRows)
+    shape = property(lambda self: self.matrices[0].shape, doc="(M, N): camera pixels, projector pixels.")
+    dense = property(lambda self: isinstance(self.matrices[0], np.ndarray), doc="Whether they are arrays.")
+    stored = property(lambda self: isinstance(self.matrices[0], StoredRows), doc="Whether in a store.")
 
     def in_memory(self) -> Record:
         """The same, of a store's blocks all loaded."""
-        T: Any = self.matrices
-        return replace(self, matrices=tuple(channel.tocsr() for channel in T)) if self.stored else self
+        return replace(self, matrices=tuple(T.tocsr() for T in self.matrices)) if self.stored else self
 
     def arrays(self) -> dict[str, Any]:
         """Named arrays: `EXTRAS`, and T (M, N) or (3, M, N) where that is dense."""
-        T: Any = self.matrices
+        T = self.matrices
         values = {"T": (T[0] if len(T) == 1 else np.stack(T)) if self.dense else None}
         values |= {name: getattr(self, name) for name in EXTRAS}
         return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 
 def assemble(
-    shapes: Mapping[str, tuple[int, ...]],
-    load: Callable[[str], Any],
-    variable: str | None = None,
-    name: str = "T",
-    channels: Sequence[str] = CHANNELS,
-    reverse: bool = False,
+    shapes: Any, load: Any, variable: str | None = None, name="T", channels=CHANNELS, reverse=False
 ) -> Record:
-    """A record of what a file holds by name: T is `variable`, else `name`, `channels`, or the only matrix.
-
-    `reverse`: the axes of `shapes` are in the reverse order of those that the user knows.
-    """
+    """A record of what a file holds by name: T is `variable`, else `name`, `channels`, or the only matrix."""
+    if variable not in (None, *shapes):
+        raise FileError(f"variable {variable!r} is missing; it holds {', '.join(shapes) or 'none':.200}")
     others = {other: shape for other, shape in shapes.items() if other not in EXTRAS}
     names: Sequence[str] = [variable or name]
     if variable is None and name not in shapes:
         names = [other for other, shape in others.items() if _is_matrix(shape)]
         names = channels if set(channels) <= set(shapes) else names
         if len(names) != 1 and names is not channels:
-            sizes = {other: shape[::-1] if reverse else shape for other, shape in others.items()}
-            content = ", ".join(f"{other!r} {size}" for other, size in sizes.items()) or "no numbers"
+            step = -1 if reverse else 1  # axes as the user knows them
+            content = ", ".join(f"{n!r} {shape[::step]}" for n, shape in others.items()) or "no numbers"
             text = f"it must hold {name} of (M, N) or of three channels, or one matrix by another name"
             raise FileError(f"holds {content:.300}; {text}; variable= names one of several")
     matrices = [load(name) for name in names]
-    extras: dict[str, Any] = {name: load(name) for name in EXTRAS if name in shapes}
-    for name in extras.keys() & {"first_bounce", "mixing"}:
-        extras[name] = floats(name, extras[name])
-    for name in extras.keys() & {"grid", "camera_grid"}:
-        extras[name] = checks.grid(f"array {name!r}", extras[name].ravel().tolist())
+    extras: dict[str, Any] = {n: floats(n, load(n)) for n in ("first_bounce", "mixing") if n in shapes}
+    for grid in {"grid", "camera_grid"} & set(shapes):
+        extras[grid] = checks.grid(f"array {grid!r}", load(grid).ravel().tolist())
     if isinstance(matrices[0], np.ndarray):
         if wrong := [T.shape for T in matrices if not _is_matrix(np.shape(T))]:
             raise FileError(f"T has shape {wrong[0]}; it must be (M, N) or (3, M, N), not empty")
@@ -254,8 +201,7 @@ def _is_matrix(shape: tuple[int, ...]) -> bool:
 class Parts:
     """Arrays of a compressed transport, or by its `format` of an inverse, by the names of `ltcl.transport`.
 
-    They are finite, with a grid and a first bounce that fit (else InputError); the operators are checked
-    where they are made.
+    InputError where they do not fit, or are not finite; operators are checked where they are made.
     """
 
     arrays: Mapping[str, np.ndarray]
@@ -266,8 +212,7 @@ class Parts:
         if missing := {"grid", "first_bounce", "system_0.R.kind"} - self.arrays.keys():
             raise InputError(f"a compressed transport has the array {min(missing)!r}, which is missing")
         F = self.first_bounce
-        if F.ndim != 2 or len(F) not in (1, 3):
-            raise InputError(f"first_bounce has shape {F.shape}; it must be (1, N) or (3, N)")
+        checks.shape("first_bounce", F, *((channels, *F.shape[1:2]) for channels in (1, 3)))
         checks.grid("grid", checks.shape("grid", self.arrays["grid"], (2,)).tolist(), F.shape[1])
         for name, array in self.arrays.items():
             if array.dtype.kind == "f" and not name.endswith(".solution_error"):  # infinite where unknown
@@ -302,6 +247,5 @@ class Parts:
     @property
     def kinds(self) -> tuple[str, ...]:
         """Names of the cores and bases, each once."""
-        cores = {str(array) for array in self._ending(".kind")} - {"compressed", "sum"}
-        texts = {n: str(a) for n, a in self.arrays.items() if n.startswith("basis_") and a.dtype.kind in "SU"}
-        return (*sorted(cores), *sorted(set(texts.values())))
+        names = dict.fromkeys(map(str, self._ending(".kind") + self._ending(".name")))
+        return tuple(name for name in names if name not in ("compressed", "sum"))

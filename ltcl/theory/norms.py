@@ -132,7 +132,7 @@ class _Bidiagonal:
 
     def __init__(self, A: Operator, minus: Operator | None, starts: int, seed: int) -> None:
         self.A, self.minus = A, minus
-        v = np.random.default_rng(seed).standard_normal((A.shape[1], starts))
+        v = np.random.default_rng(checks.count("seed", seed, least=0)).standard_normal((A.shape[1], starts))
         self.vs, self.us = [v / np.linalg.norm(v, axis=0)], []
         self.alphas, self.betas = np.zeros((0, starts)), np.zeros((0, starts))  # (steps, starts)
         self.products, self._size = 0, 0.0

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ltcl import checks
 from ltcl.device import Array, vectors
 from ltcl.errors import InputTypeError
 from ltcl.operators import Norms, Operator
@@ -87,7 +88,7 @@ def spectral_radius(
     """
     require_operator("R", R)
     certificate = POWER_ITERATION if norms is None or norms.lowest < 0.0 else COLLATZ_WIELANDT
-    start = np.random.default_rng(seed).uniform(0.5, 1.5, R.shape[0])
+    start = np.random.default_rng(checks.count("seed", seed, least=0)).uniform(0.5, 1.5, R.shape[0])
     v = R.device.upload(start / np.linalg.norm(start))
     w = v.like()
     growth, values, change = [], [], math.inf

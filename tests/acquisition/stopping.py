@@ -21,14 +21,12 @@ from ltcl.acquisition.radiometry import Response
 from tests.store.stores import at_line, interrupt, kill
 
 LINE = Response(np.array([[-0.004 / 0.996, 1.0]]))  # of a camera with an offset of 0.4 %
-MADE: dict[str, dict[str, Any]] = {
+SETTINGS: dict[str, dict[str, Any]] = {  # rigs and settings, by strategy
     "pixel": {"grid": (6, 8)},
     "hadamard": {"grid": (6, 6), "order": 15},
     "block": {"grid": (8, 8), "channels": 3, "block": 2},
     "adaptive": {"grid": (8, 8)},
 }
-"""Rigs and settings, by strategy."""
-ENDS = {"SIGKILL": kill, "Ctrl-C": interrupt}
 
 
 def scene(grid: tuple[int, int]) -> np.ndarray:
@@ -38,25 +36,31 @@ def scene(grid: tuple[int, int]) -> np.ndarray:
 
 
 class Unplugged(VirtualRig):
-    """Gives `left` photographs, which it counts, then fails."""
+    """Gives `left` photographs, which it counts, then fails; `fault` changes them, by their codes."""
 
     keeps_photographs = False
 
-    def __init__(self, T: Any, grid: tuple[int, int], *, left: int = 1 << 30, **options: Any) -> None:
+    def __init__(
+        self, T: Any, grid: tuple[int, int], *, left: int = 1 << 30, fault: Any = None, **options: Any
+    ) -> None:
         super().__init__(T, grid, **{"bits": 12, "ambient": 0.01, **options})
-        self.left, self.count = left, 0
+        self.left, self.counts, self.fault = left, [0], fault
+
+    @property
+    def count(self) -> int:
+        return self.counts[0]
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
-        """As of `VirtualRig`; OSError."""
         if self.count == self.left:
             raise OSError("unplugged")
-        self.count += 1
-        return super().photograph(codes, seconds)
+        self.counts[0] += 1
+        image = super().photograph(codes, seconds)
+        return self.fault(codes, image) if self.fault else image
 
 
-def made(strategy: str, left: int = 1 << 30) -> tuple[Unplugged, dict[str, Any]]:
+def set_up(strategy: str, left: int = 1 << 30) -> tuple[Unplugged, dict[str, Any]]:
     """The rig of a strategy, and the arguments of `acquire`."""
-    settings = dict(MADE[strategy])
+    settings = dict(SETTINGS[strategy])
     grid, channels = settings.pop("grid"), settings.pop("channels", 1)
     T = [scene(grid) * (1.0 - 0.2 * c) for c in range(channels)]
     rig = Unplugged(T if channels == 3 else T[0], grid, left=left, response="linear")
@@ -65,7 +69,7 @@ def made(strategy: str, left: int = 1 << 30) -> tuple[Unplugged, dict[str, Any]]
 
 
 def acquire_and_end(store: Path, strategy: str, line: int = 0, end: str = "SIGKILL") -> tuple[int, int, int]:
-    """Acquire in a process of its own, and end at a line of ltcl; its status, its lines and photographs."""
+    """Acquire in a process of its own, and end at a line of ltcl; its status, photographs and lines."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["pytest", __name__])
     counts = context.RawArray("q", 2)
@@ -78,19 +82,13 @@ def acquire_and_end(store: Path, strategy: str, line: int = 0, end: str = "SIGKI
 
 def _work(store: Path, strategy: str, line: int, end: str, counts: Any) -> None:
     os.fsync = lambda _: None  # no power is cut here
-    rig, settings = made(strategy)
-    real = rig.photograph
-
-    def photograph(codes: Any, seconds: float) -> np.ndarray:
-        counts[1] += 1
-        return real(codes, seconds)
-
-    rig.photograph = photograph
-    lines = at_line(line, ENDS[end])
+    rig, settings = set_up(strategy)
+    rig.counts = counts
+    lines = at_line(line, kill if end == "SIGKILL" else interrupt)
     try:
         ltcl.acquire(rig, store=store, **settings)
     except KeyboardInterrupt:
         sys.exit(2)
     finally:
         sys.settrace(None)
-        counts[0] = lines[0]
+        counts[1] = lines[0]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import Calibration, Report, VirtualRig, acquire, camera_map, finalize
+from ltcl.acquisition import Calibration, Report, Setup, VirtualRig, acquire, camera_map, finalize
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.store import BlockStore
 from tests.store.stores import interrupt
 
-from .scanning.helpers import corner, dense, held, off, rig, unit
+from .scanning.helpers import corner, dense, relative_error, rig, unit, unseen_patterns
 from .stopping import LINE, Unplugged
 
 GRID = (8, 16)
@@ -45,7 +45,7 @@ def camera(left: int = 1 << 30) -> Unplugged:
 def test_patterns_that_no_scan_has_seen(scanned: Any) -> None:
     """Curve of the camera, black, ambient light and noise are measured from photographs alone."""
     strategy, T, path = scanned
-    assert off(dense(T), corner(), GRID) < 0.02
+    assert relative_error(dense(T), corner(), GRID) < 0.02
     assert strategy != "adaptive" or Report.of(path).patterns < 128
 
 
@@ -63,11 +63,10 @@ def test_what_is_photographed_is_all_it_takes(
     """A run that ends between the last photograph and the transport, and one that was not stopped."""
     strategy, T, whole = scanned
     path, steps = tmp_path / "T.zarr", []
-
-    with monkeypatch.context() as patch:
-        patch.setattr(BlockStore, "finalize", lambda *_, **__: interrupt())
-        with pytest.raises(KeyboardInterrupt):
-            acquire(camera(), geometry="aligned", strategy=strategy, store=path)
+    monkeypatch.setattr(BlockStore, "finalize", lambda *_, **__: interrupt())
+    with pytest.raises(KeyboardInterrupt):
+        acquire(camera(), geometry="aligned", strategy=strategy, store=path)
+    monkeypatch.undo()
     assert not BlockStore.open(path).final
     finalize(path, lambda *step: steps.append(step))
     np.testing.assert_array_equal(dense(ltcl.load(path, on_dark="mask")), dense(T))
@@ -82,33 +81,28 @@ def test_progress(tmp_path: Path, strategy: str) -> None:
 
     Nothing is made up for photographs that are missing.
     """
-    path, steps = tmp_path / "T.zarr", []
-
-    def run(rig: Unplugged) -> None:
-        steps.clear()
-        note = lambda *step: steps.append((*step, rig.count))  # noqa: E731
-        acquire(rig, geometry="aligned", strategy=strategy, store=path, progress=note)
-
+    path, first, second = tmp_path / "T.zarr", [], []
+    settings: dict[str, Any] = {"geometry": "aligned", "strategy": strategy, "store": path}
     with pytest.raises(AcquisitionError, match="unplugged"):
-        run(camera(350))
-    done = [done for step, done, *_ in steps if step == "calibration"]
+        acquire(camera(350), **settings, progress=lambda *step: first.append(step))
+    done = [done for step, done, _ in first if step == "calibration"]
     assert done == [*range(1, done[-1] + 1), done[-1]]
-    assert all(done <= total for _, done, total, _ in steps)
+    assert all(done <= total for _, done, total in first)
     earlier = BlockStore.open(path).written
     for read, error in ((finalize, AcquisitionError), (Report.of, FileError)):
         with pytest.raises(error, match=r"T\.zarr"):
             read(path)
     assert BlockStore.open(path).written == earlier
-    run(camera())
-    done = [done for step, done, *_ in steps if step == "scan"]
+    rig = camera()
+    acquire(rig, **settings, progress=lambda *step: second.append((*step, rig.count)))
+    done = [done for _, done, _, _ in second]
     assert done == sorted(done)
-    assert steps[-1][1:3] == (BlockStore.open(path).attributes["patterns"],) * 2
-    assert (max(done for _, done, _, count in steps if count == 0) > 0) == bool(earlier)
+    assert second[-1][:3] == ("scan", *(BlockStore.open(path).attributes["patterns"],) * 2)
+    assert (max(done for _, done, _, count in second if count == 0) > 0) == bool(earlier)
 
 
 def test_other_settings_and_rigs_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "T.zarr"
-    settings: dict[str, Any] = {"geometry": "aligned", "strategy": "pixel", "store": path}
+    settings: dict[str, Any] = {"geometry": "aligned", "strategy": "pixel", "store": tmp_path / "T.zarr"}
     with pytest.raises(AcquisitionError, match="unplugged"):
         acquire(Unplugged(corner(), GRID, left=300), **settings)
     for other, change, text in (
@@ -128,25 +122,14 @@ def test_other_settings_and_rigs_are_refused(tmp_path: Path) -> None:
 
 def test_stores_of_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "T.zarr"
-    for read in (Calibration.of, Report.of, finalize):
-        with pytest.raises(FileError, match="no such folder"):
-            read(path)
     ltcl.save(path, ltcl.Transport(np.eye(128), GRID))
     with pytest.raises(InputError, match=r"ltcl\.acquire did not make"):
         acquire(rig(), geometry="aligned", store=path)
-    for read in (Calibration.of, Report.of, finalize):
+    for read in (Setup.of, Report.of, finalize):
         with pytest.raises(FileError, match=r"ltcl\.acquire"):
             read(path)
-    BlockStore.create(tmp_path / "b.zarr", shape=(4, 4), grid=(2, 2), provenance={"acquisition": {}})
-    with pytest.raises(FileError, match="holds no whole calibration"):
-        finalize(tmp_path / "b.zarr")
-
-
-def test_one_exposure_determines_no_response() -> None:
-    with pytest.raises(InputError, match=r"one exposure.*response="):
-        acquire(rig(exposures=[0.5]), geometry="aligned", strategy="pixel")
-    T = acquire(rig(exposures=[0.5], response="linear"), geometry="aligned", strategy="pixel", response=LINE)
-    assert off(dense(T), corner(), GRID) < 0.03  # with one exposure, as much noise again
+        with pytest.raises(FileError, match="no such folder"):
+            read(tmp_path / "nowhere.zarr")
 
 
 @pytest.mark.parametrize(
@@ -162,8 +145,8 @@ def test_a_camera_of_its_own_pixels(
 ) -> None:
     """Decoded by Gray code. It does not see all pixels: these are masked, and the others are right.
 
-    Bounces within 3 %; the pattern for the measured transport shows the picture under the true one to 30 dB.
-    By hand, with all defaults, it takes at most 300 photographs.
+    The pattern for the measured transport shows the picture under the true one to 30 dB. By hand, with all
+    defaults, it takes at most 300 photographs.
     """
     C, path = camera_map(askance, (27, 50), GRID), tmp_path / "T.zarr"
     oblique = Unplugged(corner(), GRID, camera_grid=(27, 50), camera_map=C, response=response, bits=bits)
@@ -175,7 +158,7 @@ def test_a_camera_of_its_own_pixels(
     assert not seen[area < 0.3].any()
     assert 0 < (~seen).sum() < 8
     assert Report.of(path).coverage == seen.mean()
-    scale, P = unit(dense(T)[seen], truth[seen]), held(GRID)
+    scale, P = unit(dense(T)[seen], truth[seen]), unseen_patterns(GRID)
     ours, theirs = scale * (dense(T) @ P)[seen], (truth @ P)[seen]
     errors = np.linalg.norm(ours - theirs, axis=0) / np.linalg.norm(theirs, axis=0)
     assert errors.max() < most, errors
@@ -184,10 +167,6 @@ def test_a_camera_of_its_own_pixels(
     pattern = np.asarray(ltcl.compensate(T, (desired / scale).astype(np.float32), rtol=1e-3).pattern)
     error = (truth @ pattern.ravel().astype(np.float64) - desired.ravel())[seen]
     assert 10 * np.log10(desired.max() ** 2 / np.mean(error**2)) > 30
-    image = (truth.sum(axis=1) / scale).reshape(GRID).astype(np.float32)
-    bounces = ltcl.separate(T, image, bounces=3, rtol=1e-4)
-    direct = np.asarray(ltcl.separate(ltcl.Transport(truth, GRID), image, rtol=1e-4).direct)
-    assert np.linalg.norm((bounces.direct - direct).ravel()[seen]) < 0.03 * np.linalg.norm(direct)
 
 
 def test_pixels_that_every_exposure_saturates(tmp_path: Path) -> None:

@@ -55,22 +55,19 @@ def fill(folder: Path, pictures: np.ndarray | list[np.ndarray]) -> Path:
     return folder
 
 
-def everything(folder: Path) -> dict[str, bytes]:
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+def everything(folder: Path) -> dict[Path, bytes]:
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def patterns(done: CompensatedFrames) -> list[np.ndarray]:
-    suffix = "exr" if any(done.folder.glob("*.exr")) else "png"
-    return [images.read(done.folder / f"pattern_{record.number:06}.{suffix}") for record in done.records]
+    return [images.read(next(done.folder.glob(f"pattern_{each.number:06}.*"))) for each in done.records]
 
 
 @pytest.mark.parametrize("batch", [1, 4, 20])
 def test_pushed_through_T_the_patterns_give_the_frames(T, source, tmp_path, batch):
     calls = []
-    done = compensate_frames(
-        T, source, tmp_path, batch=batch, format="exr", rtol=1e-4, progress=lambda *now: calls.append(now)
-    )
+    common: dict[str, Any] = {"format": "exr", "rtol": 1e-4, "progress": lambda *now: calls.append(now)}
+    done = compensate_frames(T, source, tmp_path, batch=batch, **common)
     np.testing.assert_allclose(np.stack(patterns(done)), LIGHT, rtol=5e-4)
     assert [(r.number, r.name) for r in done.records] == [(n + 1, f"f{n}.exr") for n in range(COUNT)]
     assert calls == [("frames", n, COUNT) for n in [*range(0, COUNT, batch), COUNT]]
@@ -106,10 +103,10 @@ def test_grey_coloured_black_and_bright_frames_are_what_each_is_alone(T, tmp_pat
 def test_one_gain_for_all_frames_from_a_sample_of_all(T, tmp_path):
     scale = np.linspace(1.0, 0.2, 9)
     scale[2] = 5.0  # not in the sample
-    pictures = scale[:, None, None] * seen(LIGHT[:9])
+    pictures, common = scale[:, None, None] * seen(LIGHT[:9]), {"gain": "auto", "rtol": 1e-4}
     source = fill(tmp_path / "in", pictures)
-    done = compensate_frames(T, source, tmp_path / "out", batch=3, gain="auto", format="exr", rtol=1e-4)
-    sample = ltcl.compensate(T, pictures[[0, 4, 8]], gain="auto", rtol=1e-4)
+    done = compensate_frames(T, source, tmp_path / "out", batch=3, format="exr", **common)
+    sample = ltcl.compensate(T, pictures[[0, 4, 8]], **common)
     assert done.gain == pytest.approx(sample.gain, rel=1e-3)
     for pattern, light, factor in zip(patterns(done)[3:], LIGHT[3:9], scale[3:], strict=True):
         np.testing.assert_allclose(pattern, done.gain * factor * light, rtol=1e-3)
@@ -123,56 +120,48 @@ def test_background_and_weights_serve_all_frames_and_sizes_are_scaled_when_asked
     done = compensate_frames(T, source, tmp_path / "out", format="exr", rtol=1e-4, **options)
     np.testing.assert_allclose(np.stack(patterns(done)), LIGHT - 0.1 * LIGHT[0], rtol=2e-3)
     wide = fill(tmp_path / "in", [np.full((4, 16), 0.2)])
-    with pytest.raises(InputError, match=r"frame 1 \(f0\.exr\) is 4 x 16 pixels, but the camera has 8 x 8"):
+    with pytest.raises(InputError, match=r"frame 1 \(f0\.exr\).* 4 x 16 .* 8 x 8"):
         compensate_frames(T, wide, tmp_path / "wide")
     done = compensate_frames(T, wide, tmp_path / "wide", resize=True, format="exr")
     np.testing.assert_allclose(seen(patterns(done)[0][None])[0], 0.2, rtol=0.02)
 
 
-def test_videos_in_and_out(T, tmp_path):
+def test_videos_in_and_out_also_where_sound_outlasts_the_picture(T, tmp_path, caplog):
     film, out = tmp_path / "film.mkv", tmp_path / "out.avi"
     write_video(film, seen(LIGHT), fps=30.0)
-    done = compensate_frames(T, film, tmp_path / "patterns", video=out, rtol=1e-4, batch=4)
-    shown = open_frames(out)
+    data = film.read_bytes()
+    place = data.index(b"\x44\x89\x88") + 3  # its duration, of which the number of frames is estimated
+    (duration,) = struct.unpack_from(">d", data, place)
+    film.write_bytes(data[:place] + struct.pack(">d", 1.2 * duration) + data[place + 8 :])
+    common: dict[str, Any] = {"out": tmp_path / "patterns", "video": out, "rtol": 1e-4, "batch": 4}
+    done, shown = compensate_frames(T, film, **common), open_frames(out)
+    assert f"{film}: 13 of 16" in caplog.text
     assert (shown.count, shown.fps) == (COUNT, pytest.approx(30.0))
     assert [record.name for record in done.records][:2] == ["film.mkv:1", "film.mkv:2"]
     for frame, source, pattern in zip(shown, open_frames(film), patterns(done), strict=True):
         np.testing.assert_allclose(images.to_srgb(frame.picture()), images.to_srgb(pattern), atol=0.6 / 255)
         desired = source.picture()
         assert np.linalg.norm(seen(pattern[None])[0] - desired) < 1e-2 * np.linalg.norm(desired)
-    common: dict[str, Any] = {"video": out, "rtol": 1e-4, "batch": 4, "resume": True}
-    again = compensate_frames(T, film, tmp_path / "patterns", fps=10, **common)
+    again = compensate_frames(T, film, fps=10, resume=True, **common)
     assert (again.solved, again.records) == (0, done.records)
     assert open_frames(out).fps == pytest.approx(10.0)
 
 
-def test_a_matroska_whose_sound_outlasts_its_picture_loses_no_batch(T, tmp_path, caplog):
-    film = tmp_path / "film.mkv"
-    write_video(film, seen(LIGHT))
-    data = film.read_bytes()
-    place = data.index(b"\x44\x89\x88") + 3  # its duration
-    (duration,) = struct.unpack_from(">d", data, place)
-    film.write_bytes(data[:place] + struct.pack(">d", 1.2 * duration) + data[place + 8 :])
-    done = compensate_frames(T, film, tmp_path / "out", batch=8, video=tmp_path / "out.avi")
-    assert len(done.records) == COUNT
-    assert open_frames(tmp_path / "out.avi").count == COUNT
-    assert f"{film}: 13 of 16 frames can be read" in caplog.text
-
-
 def test_resuming_makes_what_is_missing_and_an_earlier_run_is_not_begun_anew(T, source, tmp_path):
     whole = compensate_frames(T, source, tmp_path / "whole", batch=4, resume=True)
-    out = tmp_path / "out"
-    assert len(compensate_frames(T, source, out, batch=4, frames=6).records) == 6
-    before = everything(out)
-    with pytest.raises(InputError, match=r"out: holds 6 frame\(s\) of an earlier run; give resume=True"):
-        compensate_frames(T, source, out, batch=4)
-    assert everything(out) == before
-    done = compensate_frames(T, source, out, batch=4, resume=True)
-    assert done.solved == COUNT - 4  # the second batch was not whole
-    assert done.records == whole.records
+    common = {"T": T, "source": source, "out": (out := tmp_path / "out"), "batch": 4}
+    for frames, solved in ((4, 4), (6, 2), (None, COUNT - 6)):  # each is solved once
+        done = compensate_frames(**common, frames=frames, resume=True)
+        assert (done.solved, len(done.records)) == (solved, frames or COUNT)
+        before = everything(out)
+        with pytest.raises(InputError, match=rf"out: .* {frames or COUNT} .*resume=True"):
+            compensate_frames(**common)
+        assert everything(out) == before
+        ltcl.save(tmp_path / "T.npz", T)  # compensation does not depend on the first bounce
+        common["T"] = ltcl.load(tmp_path / "T.npz", first_bounce=SCENE.F)
     (out / "pattern_000006.png").unlink()
-    assert compensate_frames(T, source, out, batch=4, resume=True).solved == 4
-    assert everything(out) == everything(tmp_path / "whole")
+    assert compensate_frames(**common, resume=True).solved == 1
+    np.testing.assert_allclose(patterns(done), patterns(whole), atol=1e-3)  # 5 to 8 were not one batch
 
 
 class Projector:
@@ -188,39 +177,32 @@ class Projector:
 @pytest.mark.parametrize(
     ("changed", "text"),
     [
-        ({"rtol": 1e-3}, "rtol=0.01, this one has 0.001"),
-        ({"bounds": (0.0, 2.0)}, r"bounds=\[0.0, 1.0\], this one has \[0.0, 2.0\]"),
-        ({"background": np.full(GRID, 0.1)}, "background=None, this one has '8 x 8, sha256"),
+        ({"rtol": 1e-3}, "rtol=0.01.* 0.001"),
+        ({"bounds": (0.0, 2.0)}, r"bounds=\[0.0, 1.0\].* \[0.0, 2.0\]"),
+        ({"background": np.full(GRID, 0.1)}, "background=None.* '8 x 8, sha256"),
         ({"codes": Projector(2.2).codes}, "codes='sha256"),
         ({"exact": ltcl.Transport(NEARLY, GRID)}, "exact='Transport, sha256"),
+        ({"T": ltcl.Transport(NEARLY, GRID)}, "another T"),
+        ({"T": ltcl.Transport(np.float32(SCENE.T), GRID)}, "another T"),
+        ({"T": ltcl.Transport([SCENE.T] * 3, GRID)}, "another T"),
+        ({"source": "f3.exr"}, r"frame 4 \(f3\.exr\)"),
     ],
 )
-def test_other_settings_are_refused_by_their_name(T, source, tmp_path, changed, text):
-    exact = ltcl.Transport(SCENE.T, GRID)
-    common: dict[str, Any] = {"batch": 4, "rtol": 0.01, "codes": Projector(1.8).codes, "exact": exact}
-    compensate_frames(T, source, tmp_path / "out", frames=4, **common)
-    before = everything(tmp_path / "out")
-    with pytest.raises(InputError, match=f"that run had {text}") as error:
-        compensate_frames(T, source, tmp_path / "out", resume=True, **{**common, **changed})
-    assert ("\n" in str(error.value), everything(tmp_path / "out")) == (False, before)
+def test_another_run_is_refused_by_what_differs(T, source, tmp_path, changed, text):
+    out, common = tmp_path / "out", {"batch": 4, "rtol": 0.01, "codes": Projector(1.8).codes, "T": T}
+    if "exact" in changed:
+        common["exact"] = ltcl.Transport(SCENE.T, GRID)
+    if "source" in changed:  # one of its files is another
+        changed = {"source": shutil.copytree(source, tmp_path / "in")}
+        shutil.copy(source / "f4.exr", tmp_path / "in" / "f3.exr")
+    common |= {"source": source, "out": out}
+    compensate_frames(**common, frames=4)
+    before = everything(out)
+    with pytest.raises(InputError, match=text) as error:
+        compensate_frames(**{**common, **changed}, resume=True)
+    assert ("\n" in str(error.value), everything(out)) == (False, before)
     common["codes"] = Projector(1.8).codes  # another object, the same curve
-    assert compensate_frames(T, source, tmp_path / "out", frames=5, resume=True, **common).solved == 1
-
-
-def test_another_T_and_other_frames_are_refused_and_the_same_ones_known_again(T, source, tmp_path):
-    folder, out = tmp_path / "in", tmp_path / "out"
-    shutil.copytree(source, folder)
-    compensate_frames(T, folder, out, frames=8)
-    for matrix in (NEARLY, SCENE.T.astype(np.float32), [SCENE.T] * 3):
-        with pytest.raises(InputError, match="another T"):
-            compensate_frames(ltcl.Transport(matrix, GRID), folder, out, resume=True)
-    ltcl.save(tmp_path / "T.npz", T)
-    again = ltcl.load(tmp_path / "T.npz", first_bounce=SCENE.F)  # compensation does not depend on it
-    assert compensate_frames(again, folder, out, resume=True, frames=9).solved == 1
-    (folder / "f3.exr").write_bytes((source / "f4.exr").read_bytes())
-    with pytest.raises(InputError, match=r"frame 4 \(f3\.exr\) has changed") as error:
-        compensate_frames(T, folder, out, resume=True)
-    assert "goes on from there" not in str(error.value)
+    assert compensate_frames(**common, frames=5, resume=True).solved == 1
 
 
 @pytest.mark.parametrize(
@@ -236,11 +218,12 @@ def test_a_damaged_list_is_refused(T, source, tmp_path, content):
 @pytest.mark.parametrize(
     ("options", "error", "text"),
     [
-        ({"nonsense": 1}, InputTypeError, "frames 1 to 8: unknown option 'nonsense'"),
+        ({"nonsense": 1}, InputTypeError, "frames 1 to 8: .*'nonsense'"),
         ({"codes": "sRGB"}, InputTypeError, "codes is 'sRGB'"),
+        ({"progress": 3}, InputTypeError, "progress is 3"),
         ({"T": SCENE.T}, InputTypeError, "T is a ndarray"),
-        ({"T": ltcl.Transport(np.eye(15), (3, 5)), "video": "a.mkv"}, InputError, "frames are 3 x 5 pixels"),
-        ({"source": "nowhere"}, FileError, "nowhere: no such file"),
+        ({"T": ltcl.Transport(np.eye(15), (3, 5)), "video": "a.mkv"}, InputError, "3 x 5"),
+        ({"source": "nowhere"}, FileError, "nowhere: "),
         ({"T": FAR, "method": "jacobi"}, ConvergenceError, "frames 1 to 8: jacobi: diverged"),
     ],
 )
@@ -248,23 +231,8 @@ def test_bad_settings_leave_no_folder(T, source, tmp_path, options, error, text)
     with pytest.raises(error, match=text):
         compensate_frames(**{"T": T, "source": source, "out": tmp_path / "a" / "out", **options})
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(InputError, match=r"out is .*, where the frames are"):
+    with pytest.raises(InputError, match=f"out is {source}"):
         compensate_frames(T, source, source)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no flock there")
-def test_a_second_run_in_the_folder_is_refused_at_once(T, source, tmp_path):
-    out, refused = tmp_path / "out", []
-
-    def second(step, done, total):
-        before = everything(out)
-        with pytest.raises(FileError, match="out: another run writes there"):
-            compensate_frames(T, source, out, batch=4, resume=True)
-        refused.append(done)
-        assert everything(out) == before
-
-    assert compensate_frames(T, source, out, batch=4, progress=second).solved == COUNT
-    assert len(refused) == 5
 
 
 RUN = """
@@ -284,7 +252,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(T, tmp_path):
     source = fill(tmp_path / "in", seen(random.uniform(0.2, 0.9, (60, *GRID))))
     common: dict[str, Any] = {"batch": 2, "gain": "auto", "appearance": True}
     compensate_frames(T, source, tmp_path / "whole", **common)
-    for trial in range(8):
+    for trial in range(5):
         out = tmp_path / f"out{trial}"
         command = [sys.executable, "-c", RUN, str(tmp_path / "T.npy"), str(source), str(out)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:

@@ -118,14 +118,14 @@ def large_picture(folder: Path) -> Path:
 @pytest.fixture(scope="session")
 def results(program: Program, transport: Path, picture: Path, large_picture: Path, folder: Path) -> Any:
     """The folder and the JSON of compensate, separate and relight on two pictures, all in one folder."""
-    out, told = folder.with_name("results"), {}
+    out, report = folder.with_name("results"), {}
     out.mkdir()
     (out / "mine.txt").write_text("mine")
     common = f"--on-dark mask --encoding linear --grid 5x10 --resize --json --out {out}".split()
     solving = ["--first-bounce", "exact", "--rtol", "1e-4", "--method", "chebyshev"]
     for command, more in (("compensate", solving), ("separate", [*solving, "--bounces", 2]), ("relight", [])):
-        told[command] = program(command, transport, picture, large_picture, *common, *more).json
-    return out, told
+        report[command] = program(command, transport, picture, large_picture, *common, *more).json
+    return out, report
 
 
 @pytest.fixture(scope="session")

@@ -41,8 +41,8 @@ def waves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def compensated(program, store: Path, waves: Path) -> Any:
     """The folder, and what was printed."""
-    arguments = ["compensate", store, waves, "--out", waves.parent / "out", "--rtol", "1e-3"]
-    return waves.parent / "out", program(*arguments).out
+    out = waves.parent / "out"
+    return out, program("compensate", store, waves, "--out", out, "--rtol", "1e-3").out
 
 
 def codes_in(path: Path) -> np.ndarray:
@@ -61,19 +61,19 @@ def error_of(codes: np.ndarray, rig: Any) -> float:
 def test_what_is_projected_looks_like_the_picture(program, store, waves, compensated, tmp_path, rig):
     """In the room with its light; a pattern in sRGB, or without the ambient light, would not."""
     out, printed = compensated
-    told = json.loads((out / "compensate.json").read_text())
-    (entry,) = told["pictures"]
-    assert (told["options"]["gain"], told["options"]["background"]) == ("auto", "measured")
-    assert "codes of the measured projector" in printed
-    assert "the background is the ambient light" in printed
+    report = json.loads((out / "compensate.json").read_text())
+    (entry,) = report["pictures"]
+    assert (report["options"]["gain"], report["options"]["background"]) == ("auto", "measured")
+    assert all(text in printed for text in ("codes of the measured projector", "background"))
     pattern, codes = images.read(out / entry["pattern"]["exr"]), codes_in(out / entry["pattern"]["png"])
     assert (entry["clipped"], pattern.max()) == (0, pytest.approx(1.0, abs=1e-3))  # as bright as can be
     assert error_of(codes, rig) < 0.015
     assert error_of(images.to_srgb(pattern), rig) > 0.05
     np.testing.assert_allclose(codes, Setup.of(store).codes(pattern), atol=0.6 / 255)
     none = write(tmp_path / "none.exr", np.zeros((4, 8)))
-    printed = program("compensate", store, waves, "--out", tmp_path, "--background", none).out
-    assert "the background is" not in printed
+    assert (
+        "background" not in program("compensate", store, waves, "--out", tmp_path, "--background", none).out
+    )
     assert error_of(codes_in(tmp_path / "waves_pattern.png"), rig) > 0.02
 
 
@@ -107,9 +107,7 @@ def test_a_copy_is_told_where_its_calibration_is(program, store, waves, transpor
         assert error_of(codes_in(tmp_path / "out" / "waves_pattern.png"), rig) < 0.04
     arguments = [waves, "--out", tmp_path / "no", "--calibration"]
     program("compensate", transport, *arguments, store).refused("(4, 8)", "(5, 10)")
-    program("compensate", tmp_path / "convert.npz", *arguments, tmp_path / "none.zarr").refused(
-        "none.zarr: no such folder"
-    )
+    program("compensate", tmp_path / "convert.npz", *arguments, tmp_path / "none.zarr").refused("none.zarr: ")
 
 
 def test_pixels_that_the_camera_does_not_see_stay_dark(program, tmp_path):
@@ -120,5 +118,5 @@ def test_pixels_that_the_camera_does_not_see_stay_dark(program, tmp_path):
     ltcl.acquire(rig, geometry="aligned", strategy="pixel", store=store)
     grey = write(tmp_path / "grey.exr", np.full((4, 8), 0.5))
     common = ["compensate", store, grey, "--out", tmp_path / "out"]
-    assert "1 of 32 projector pixels give no direct light; they stay unlit" in program(*common).err
+    assert "T.zarr: 1 of 32 " in program(*common).err
     program(*common, "--on-dark", "raise").refused("T.zarr", "on_dark")

@@ -220,6 +220,7 @@ VALUES: list[tuple[str, Any, tuple[Any, ...]]] = [
     ("basis", (InputError, InputTypeError), NAMES),
     ("memory", (InputError, InputTypeError), ("1GB", -1, 0, 2.5, True)),
     ("budget", InputError, (0,)),
+    ("progress", InputTypeError, (3,)),
     ("grid", InputError, ((1, 1),)),
 ]
 GRID: dict[str, Any] = {"grid": (8, 16)}

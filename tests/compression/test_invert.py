@@ -185,6 +185,7 @@ TALL, GOOD = ltcl.Transport(np.ones((4, 2)), (1, 2), camera_grid=(2, 2)), transp
         *((ltcl.invert, GOOD, {"rtol": rtol}, InputError, f"rtol is {rtol}") for rtol in (0.0, 1.0)),
         (ltcl.invert, GOOD, {"basis": "db2 rows"}, InputError, "basis is 'db2 rows'"),
         (ltcl.invert, GOOD, {"basis": "bior2.2"}, InputError, "basis is 'bior2.2'"),
+        (ltcl.invert, GOOD, {"progress": 3}, InputTypeError, "progress is 3"),
         (ltcl.invert, np.eye(4), {}, InputTypeError, "T is a ndarray"),
         (ltcl.invert, TALL, {}, InputError, "S = T F"),
         (ltcl.invert, SINGULAR, {"basis": "pixels"}, InputError, "singular"),

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import struct
 import sys
@@ -78,40 +77,29 @@ def test_truncated_files_and_any_flip_in_a_png_are_refused(tmp_path, suffix):
         assert refusal(path, data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :])
 
 
-def resized(suffix: str, data: bytes, h: int, w: int) -> bytes:
-    """`data` with a header that declares (h, w), all checksums correct."""
-    changed = bytearray(data)
-    if suffix == ".png":
-        changed[16:24] = struct.pack(">II", w, h)
-        changed[29:33] = struct.pack(">I", zlib.crc32(changed[12:29]))
-    elif suffix == ".tif":
-        for tag, value in ((256, w), (257, h)):
-            for kind in (3, 4):  # stored as SHORT or LONG; becomes LONG
-                place = data.find(struct.pack("<HHI", tag, kind, 1))
-                if place >= 0:
-                    changed[place : place + 12] = struct.pack("<HHII", tag, 4, 1, value)
-    else:
-        for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
-            place = data.index(name) + len(name) + 4
-            changed[place : place + 16] = struct.pack("<4i", 0, 0, w - 1, h - 1)
-    return bytes(changed)
+def png(data: bytes, depth: int = 8, size: tuple[int, int] = (3, 4)) -> bytes:
+    """One whose checksums are right, whatever is in it."""
+    head = struct.pack(">IIBBBBB", *size[::-1], depth, 0, 0, 0, 0)
+    chunks = [b"IHDR" + head, b"IDAT" + data, b"IEND"]
+    sealed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(sealed)
 
 
 @pytest.mark.parametrize("size", [(2**31 - 1, 2**31 - 1), (60000, 60000), (30000, 30000), (0, 5)])
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".exr"])
 def test_absurd_sizes_are_refused_before_decoding(tmp_path, capfd, suffix, size):
-    assert refusal(tmp_path / f"bad{suffix}", resized(suffix, good(tmp_path, suffix), *size))
+    """Headers that declare `size`; a TIFF has each as a SHORT, which becomes a LONG, an EXR two windows."""
+    data, (h, w) = good(tmp_path, suffix), size
+    if suffix == ".tif":
+        for tag, before, now in ((256, 30, w), (257, 20, h)):
+            data = data.replace(struct.pack("<HHII", tag, 3, 1, before), struct.pack("<HHII", tag, 4, 1, now))
+    window = struct.pack("<4i", 0, 0, 29, 19), struct.pack("<4i", 0, 0, w - 1, h - 1)
+    assert refusal(
+        tmp_path / f"bad{suffix}", png(b"", size=size) if suffix == ".png" else data.replace(*window)
+    )
     out, err = capfd.readouterr()
     assert out == ""
     assert suffix == ".exr" or err == ""
-
-
-def png(data: bytes, depth: int = 8) -> bytes:
-    """One of 4 x 3 pixels whose checksums are right, whatever is in it."""
-    head = struct.pack(">IIBBBBB", 4, 3, depth, 0, 0, 0, 0)
-    chunks = [b"IHDR" + head, b"IDAT" + data, b"IEND"]
-    sealed = (struct.pack(">I", len(c) - 4) + c + struct.pack(">I", zlib.crc32(c)) for c in chunks)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(sealed)
 
 
 ROWS = b"\0abcd" * 3
@@ -133,8 +121,8 @@ def test_what_is_no_picture_is_refused(tmp_path, capfd, suffix):
     path = tmp_path / f"bad{suffix}"
     for data in NO_PICTURES:
         assert refusal(path, data)
-    for missing, text in ((tmp_path / f"none{suffix}", "no such file"), (tmp_path, "extension")):
-        with pytest.raises(FileError, match=text):
+    for missing in (tmp_path / f"none{suffix}", tmp_path):
+        with pytest.raises(FileError, match=f"{missing}: "):
             images.read(missing)
     assert capfd.readouterr() == ("", "")
 
@@ -145,12 +133,8 @@ def test_threads_leave_stdout_and_the_log_level_as_they_were(tmp_path):
         data = good(tmp_path, path.suffix)
         path.write_bytes(data[: len(data) // (1 + (path.stem == "1"))])
 
-    def is_read(path: Path) -> bool:
-        with contextlib.suppress(FileError):
-            return images.read(path).shape == (20, 30, 3)
-        return False
-
     before = sys.stdout, os.fstat(2).st_ino, cv2.utils.logging.getLogLevel()
     with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(is_read, paths)) == [path.stem != "1" for path in paths]
+        refused = list(pool.map(lambda path: refusal(path, path.read_bytes()), paths))
+    assert [message is None for message in refused] == [path.stem != "1" for path in paths]
     assert (sys.stdout, os.fstat(2).st_ino, cv2.utils.logging.getLogLevel()) == before

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -45,16 +44,16 @@ def test_frames_of_a_folder_are_what_pictures_are(tmp_path):
 
 
 def test_other_things_than_frames_are_refused(tmp_path):
-    with pytest.raises(FileError, match=r"no pictures; .* \.png"):
+    with pytest.raises(FileError, match=rf"{tmp_path}: .* \.png"):
         open_frames(tmp_path)
     for name in ("a1.png", "a2.png", "a2.tif"):
         images.write(tmp_path / name, np.zeros((2, 3)))
-    with pytest.raises(FileError, match=r"a2\.png and a2\.tif"):
-        open_frames(tmp_path)
-    with pytest.raises(FileError, match=r"a1\.png: extension \.png is unknown; .*\.mp4"):
-        open_frames(tmp_path / "a1.png")
-    with pytest.raises(FileError, match=r"nowhere: no such file"):
-        open_frames(tmp_path / "nowhere")
+    (tmp_path / "text.mp4").write_bytes(b"not a video")
+    (tmp_path / "zeros.mp4").write_bytes(b"\0" * 5000)
+    files = {"a1.png": r"\.png .*\.mp4", "nowhere": "", "text.mp4": "", "zeros.mp4": ""}
+    for name, text in {"": r"a2\.png and a2\.tif", **files}.items():
+        with pytest.raises(FileError, match=rf"{tmp_path / name}: .*{text}"):
+            open_frames(tmp_path / name)
     with pytest.raises(InputError, match="encoding is 'log'"):
         open_frames(tmp_path, encoding="log")  # pyright: ignore[reportArgumentType]
     assert [is_frames(path) for path in (tmp_path, "film.MP4", "sky.png")] == [True, True, False]
@@ -62,16 +61,6 @@ def test_other_things_than_frames_are_refused(tmp_path):
 
 def film(count: int, size: tuple[int, int] = (32, 48)) -> np.ndarray:
     return random.integers(0, 256, (count, *size, 3)).astype(np.uint8)
-
-
-def opencv_writes(path: Path, codes: np.ndarray, fourcc: str = "FFV1") -> bytes:
-    size = codes.shape[2], codes.shape[1]
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*fourcc), 25.0, size)
-    assert writer.isOpened()
-    for code in codes:
-        writer.write(np.ascontiguousarray(code[..., ::-1]))
-    writer.release()
-    return path.read_bytes()
 
 
 @pytest.mark.parametrize("suffix", [".mkv", ".avi"])
@@ -82,6 +71,7 @@ def test_lossless_videos_give_every_code_back(tmp_path, suffix, size):
     pictures = [*images.from_srgb(codes[:4] / 255), 2 * images.from_srgb(codes[4] / 255) - 0.5]  # is clipped
     codes[4] = np.rint(255 * images.to_srgb(np.clip(pictures[4], 0, 1)))
     assert write_video(path, iter(pictures), fps=12.5) == 5
+    np.testing.assert_array_equal(cv2.VideoCapture(str(path)).read()[1][..., ::-1], codes[0])  # BGR
     source = open_frames(path)
     assert (source.count, source.fps) == (5, pytest.approx(12.5))
     for _ in range(2):  # from the start each time
@@ -94,7 +84,8 @@ def test_lossless_videos_give_every_code_back(tmp_path, suffix, size):
 
 
 def test_a_video_is_upright_as_a_player_shows_it(tmp_path):
-    data = opencv_writes(tmp_path / "a.mp4", film(3), "mp4v")
+    write_video(tmp_path / "a.mp4", film(3) / 255)
+    data = (tmp_path / "a.mp4").read_bytes()
     place = data.index(struct.pack(">9i", 65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30), data.index(b"tkhd"))
     turned = struct.pack(">9i", 0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30)
     (tmp_path / "b.mp4").write_bytes(data[:place] + turned + data[place + 36 :])
@@ -104,8 +95,8 @@ def test_a_video_is_upright_as_a_player_shows_it(tmp_path):
 
 def test_a_truncated_video_gives_the_frames_there_are_and_an_error(tmp_path):
     codes, frames, path = film(20), [], tmp_path / "cut.avi"
-    data = opencv_writes(tmp_path / "a.avi", codes)
-    path.write_bytes(data[: int(0.9 * len(data))])
+    write_video(path, images.from_srgb(codes / 255))
+    path.write_bytes(path.read_bytes()[: int(0.9 * path.stat().st_size)])
     with pytest.raises(FileError) as error:
         frames.extend(frame.picture() for frame in open_frames(path))
     assert 0 < len(frames) < 20
@@ -114,34 +105,16 @@ def test_a_truncated_video_gives_the_frames_there_are_and_an_error(tmp_path):
         np.testing.assert_allclose(picture, images.from_srgb(code / 255), rtol=1e-6)
 
 
-def test_a_count_that_is_an_estimate_ends_with_a_warning(tmp_path, caplog):
-    """As of a Matroska file whose duration, that of its sound, is longer than its pictures."""
-    data, path = opencv_writes(tmp_path / "a.mkv", film(20)), tmp_path / "long.mkv"
-    place = data.index(b"\x44\x89\x88") + 3  # the element Duration, a float64
-    (duration,) = struct.unpack(">d", data[place : place + 8])
-    path.write_bytes(data[:place] + struct.pack(">d", 1.5 * duration) + data[place + 8 :])
-    assert open_frames(path).count == 30
-    assert len(list(open_frames(path))) == 20
-    assert "20 of 30 frames" in caplog.text
-
-
-@pytest.mark.parametrize("content", [b"not a video", b"\0" * 5000])
-def test_what_is_no_video_is_refused(tmp_path, content):
-    (tmp_path / "a.mp4").write_bytes(content)
-    with pytest.raises(FileError, match=r"a\.mp4: "):
-        open_frames(tmp_path / "a.mp4")
-
-
 BLACK = np.zeros((4, 4))
 
 
 @pytest.mark.parametrize(
     ("name", "pictures", "fps", "text"),
     [
-        ("a.webm", [BLACK], 25, r"\.webm is unknown; .*\.mkv, \.avi, \.mp4"),
+        ("a.webm", [BLACK], 25, r"\.webm .*\.mkv, \.avi, \.mp4"),
         ("a.mkv", [], 25, "no frames"),
-        ("a.mkv", [np.zeros((5, 8))], 25, "5 x 8 pixels; .* even"),
-        ("a.mkv", [BLACK, np.zeros((4, 6))], 25, r"frame 2 is \(4, 6\); .* \(4, 4\)"),
+        ("a.mkv", [np.zeros((5, 8))], 25, "5 x 8 .* even"),
+        ("a.mkv", [BLACK, np.zeros((4, 6))], 25, r"frame 2 is \(4, 6\).* \(4, 4\)"),
         ("a.mkv", [BLACK, np.full((4, 4), np.inf)], 25, "infinite"),
     ],
 )

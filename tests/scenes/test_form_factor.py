@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 
 import numpy as np
@@ -11,16 +10,14 @@ import pytest
 
 import ltcl
 from ltcl.device import Device
-from ltcl.errors import InputError
 from ltcl.operators import IdentityPlus
 from ltcl.scenes import Block, CornerRows, FormFactor, Patches, box, cut, dihedral, visibility
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.exchange import form_factors
 from ltcl.scenes.visibility import Rays
-from ltcl.scenes.walls import Wall
 from tests import gallery, reference
 from tests.operators import helpers
-from tests.scenes.closed_forms import closed_room
+from tests.scenes.closed_forms import closed_room, slope
 
 BLOCK = [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
 
@@ -79,12 +76,6 @@ def test_products_meet_their_twin(launched, name):
             helpers.close(out, reference.dense_matvec(twin, x, -0.75, y), error)
 
 
-def wing(angle: float) -> Wall:
-    """A wall that rises from the edge of the floor along y, `angle` degrees from the floor."""
-    turn = np.radians(angle)
-    return Wall("wing", corner=(0, 0, 0), right=(float(np.cos(turn)), 0, float(np.sin(turn))), down=(0, 1, 0))
-
-
 def smooth(patches: Patches) -> np.ndarray:
     """Three smooth pictures, (N, 3)."""
     x, y, z = patches.centre.T
@@ -94,7 +85,7 @@ def smooth(patches: Patches) -> np.ndarray:
 @pytest.mark.parametrize(
     ("walls", "n"),
     [(WALLS, 1), (WALLS, 8), (WALLS[:3], 8), (WALLS[:2], 20)]
-    + [((wing(angle), WALLS[2]), 12) for angle in (30, 70, 130)]
+    + [((slope(angle), WALLS[2]), 12) for angle in (30, 70, 120)]
     + [(closed_room((1000.0, 0, 0), (0, 1000.0, 0), (700.0, 0, 700.0)), 6)],
 )
 def test_products_are_those_of_the_exact_matrix(device, walls, n):
@@ -127,8 +118,6 @@ def test_a_scene_gives_its_operators(device, block):
         light = ltcl.solve(IdentityPlus(A, sign=-1), l_d, rtol=1e-4).x
         expected = np.linalg.solve(np.eye(len(l_d)) - dense, l_d)
         assert np.linalg.norm(light - expected) < 0.01 * np.linalg.norm(expected)
-    with pytest.raises(InputError, match=r"scene has walls of 1 x 4 patches; they must be n x n"):
-        FormFactor.of(dataclasses.replace(dihedral(2), grid=(1, 8)), device)
 
 
 def test_launches_in_slabs_give_the_same(device, monkeypatch):
@@ -149,20 +138,11 @@ def test_rays_meet_their_twin(launched, count, boxes, samples):
     blocks = np.stack([low, low + rng.uniform(0.2, 2, (boxes, 3))], axis=1)
     seen = visibility(patches, blocks, launched, samples=samples)
     rays = Rays(patches, blocks, launched, samples)
-    starts, ends = (
-        points.get().reshape(samples**2, 3, -1)[..., :count] for points in (rays._starts, rays._ends)
-    )
+    starts, ends = (p.get().reshape(samples**2, 3, -1)[..., :count] for p in (rays._starts, rays._ends))
     expected = reference.form_factor_visible(starts, ends, rays._normals.get()[:, :count], rays._blocks.get())
     # A ray that grazes a box or a plane to rounding counts either way: one in a hundred entries at most.
     assert np.count_nonzero(np.abs(seen - expected) > 1e-6) <= 0.01 * count**2
     np.testing.assert_array_equal(seen, seen.T)
-
-
-def test_boxes_hide_what_is_behind_them_and_nothing_else(device):
-    patches = cut((WALLS[1], WALLS[5]), 3)  # x = 0 and x = 1
-    across = np.abs(patches.centre[:, None, 0] - patches.centre[:, 0]) > 0.5
-    np.testing.assert_array_equal(visibility(patches, [[(0.4, -1, -1), (0.6, 2, 2)]], device), ~across)
-    assert visibility(patches, [[(2, 2, 2), (3, 3, 3)]], device).min() == 1.0
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
@@ -174,7 +154,3 @@ def test_rows_of_a_corner_are_those_of_the_dihedral(n):
         np.testing.assert_allclose(rows.rows(start, stop), scene.A[start:stop], rtol=1e-6, atol=1e-9)
     for x in (gallery.vectors(2 * n * n, None), gallery.vectors(2 * n * n, 3)):
         np.testing.assert_allclose(rows.matmat(x), scene.A @ x, rtol=1e-6, atol=1e-6)
-    with pytest.raises(InputError, match=r"x has shape \(3, 2\)"):
-        rows.matmat(np.ones((3, 2)))
-    with pytest.raises(InputError, match="albedo has 3 colours"):
-        CornerRows(2, (0.5, 0.4, 0.3))

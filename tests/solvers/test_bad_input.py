@@ -32,6 +32,7 @@ BAD: dict[str, tuple[dict[str, Any], type[LtclError], str]] = {
     "b has Inf": ({"b": [1, 2, 3, np.inf]}, InputError, "b has 1 NaN or infinite value"),
     "b is text": ({"b": "light"}, InputTypeError, "b is the text"),
     "method is unknown": ({"method": "gauss"}, InputError, "method is 'gauss'; .* jacobi, .*, auto"),
+    "method is an array": ({"method": np.ones(2)}, InputError, "method is array"),
     "rtol is zero": ({"rtol": 0.0}, InputError, "rtol is 0; .*or atol above 0"),
     "rtol is negative": ({"rtol": -0.1}, InputError, "rtol is -0.1.* 0"),
     "rtol is one": ({"rtol": 1.0}, InputError, "rtol is 1.0.* 1"),

@@ -56,28 +56,28 @@ def make(path: Path, **options: Any) -> BlockStore:
     return BlockStore.create(path, **sizes)
 
 
-def part(store: BlockStore, T: scipy.sparse.csr_array, block: int) -> scipy.sparse.csr_array:
+def batch(store: BlockStore, T: scipy.sparse.csr_array, block: int) -> scipy.sparse.csr_array:
     """The columns of T in a batch, as rows."""
     start, stop = store.layout.span(block, "columns")
     return scipy.sparse.csr_array(T[:, start:stop].T)
 
 
-def fill(store: BlockStore, *, with_variance: bool = False, final: bool = True) -> BlockStore:
-    """Every batch of `transport()`."""
+def fill(store: BlockStore, *, with_variance=False, final=True, report=lambda c, b: None) -> BlockStore:
+    """Every batch of `transport()` that is missing; `report` each."""
     for channel, block in store.missing():
         T = transport(*store.layout.shape, channel)
-        V = part(store, variance(T), block).data if with_variance else None
-        store.write(channel, block, part(store, T, block), V)
+        V = batch(store, variance(T), block).data if with_variance else None
+        store.write(channel, block, batch(store, T, block), V)
+        report(channel, block)
     if final:
         store.finalize()
     return store
 
 
-def whole(store: BlockStore, channel: int = 0) -> np.ndarray:
+def rows(store: BlockStore, channel: int = 0) -> np.ndarray:
     """T of a store, by its rows."""
-    return np.concatenate(
-        [store.block(channel, block).matrix.toarray() for block in range(store.layout.blocks())]
-    )
+    blocks = (store.block(channel, number).matrix for number in range(store.layout.blocks()))
+    return np.concatenate([block.toarray() for block in blocks])
 
 
 def contents(path: Path) -> dict[str, str]:
@@ -89,31 +89,26 @@ def contents(path: Path) -> dict[str, str]:
 def acquire(path: Path, report: Callable[[int, int], Any] = lambda c, b: None) -> None:
     """What an acquisition does: begin or resume, write what is missing, `report` every block, finish."""
     sizes: dict[str, Any] = {"shape": (12, 12), "camera_grid": None, "block_rows": 5, "channels": 3}
-    store = BlockStore.open(path, "a") if path.exists() else make(path, **sizes)
+    store = BlockStore.open(path) if path.exists() else make(path, **sizes)
     if not store.final:
-        for channel, block in store.missing():
-            T = transport(12, 12, channel)
-            store.write(channel, block, part(store, T, block), part(store, variance(T), block).data)
-            report(channel, block)
+        fill(store, with_variance=True, final=False, report=report)
         if "response" not in store.extras:
             store.extra("response", np.arange(5.0))
         store.update(finished=True)
-        store.finalize(memory=64 * 40)
+    store.finalize(memory=64 * 40)  # or remove what a process that was killed at the very end has left
 
 
 def in_child(work: Callable[[], None]) -> int:
     """Process id of a child that does `work`, and ends with 0, or with 2 of Ctrl-C."""
-    child = os.fork()
-    if child:
+    if child := os.fork():
         return child
-    status = 1
     try:
         work()
-        status = 0
+        os._exit(0)
     except KeyboardInterrupt:
-        status = 2
+        os._exit(2)
     finally:
-        os._exit(status)
+        os._exit(1)
 
 
 def status_of(child: int) -> int:

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy
 import scipy.sparse
 import zarr
 from hypothesis import given, settings
@@ -21,22 +20,18 @@ from hypothesis import strategies as st
 
 import ltcl
 from ltcl.errors import FileError, InputError, InputTypeError
-from ltcl.store import BlockStore, block_store, zarr_arrays
+from ltcl.store import BlockStore, block_store
 
-from .stores import fill, make, part, transport, variance, whole
+from .stores import batch, contents, fill, make, rows, transport, variance
 
 random = np.random.default_rng()
 SQUARE: dict[str, Any] = {"shape": (12, 12), "camera_grid": None, "block_rows": 5}
 
 
-def refused(path: Path, *words: str) -> None:
-    """Assert that `verify` refuses the store in one line that names it and `words`."""
-    with pytest.raises(FileError) as error:
+def refused(path: Path, word: str = "") -> None:
+    """Assert that `verify` refuses the store in one line that names it and a word."""
+    with pytest.raises(FileError, match=f"^{path}.*{word}.*$"):
         BlockStore.open(path).verify()
-    text = str(error.value)
-    assert text.startswith(str(path))
-    assert "\n" not in text
-    assert all(word in text for word in words), text
 
 
 @settings(deadline=None, max_examples=25)
@@ -50,10 +45,10 @@ def test_any_shape_in_any_blocks_and_memory(
     assert (store.final, store.missing(), len(store.written)) == (False, [], -(-N // size) * channels)
     store.finalize(memory=memory)
     again = BlockStore.open(path)
-    assert (again.final, again.missing(), len(again.written)) == (True, [], -(-M // size) * channels)
+    assert (again.final, again.missing()) == (True, [])
     for channel in range(channels):
         T = transport(M, N, channel)
-        np.testing.assert_array_equal(whole(again, channel), T.toarray())
+        np.testing.assert_array_equal(rows(again, channel), T.toarray())
         spread: list[Any] = [again.block(channel, b).variance for b in range(store.layout.blocks())]
         np.testing.assert_array_equal(np.concatenate(spread), variance(T).data)
     again.verify()
@@ -74,18 +69,17 @@ def test_rows_are_changed_once_even_if_all_is_asked_for_again(tmp_path: Path) ->
     assert not store.final
     store.finalize(memory=64, change=change)
     scale = 1.0 + 3 * (np.arange(10) // 3)
-    np.testing.assert_allclose(whole(store), scale[:, None] * transport().toarray())
+    np.testing.assert_allclose(rows(store), scale[:, None] * transport().toarray())
     np.testing.assert_array_equal(store.block(0, 1).variance, 2.0 * variance(transport())[3:6].data)
 
 
 def test_variance_of_some_columns_only_is_unknown_elsewhere(tmp_path: Path) -> None:
     store = make(tmp_path / "T.zarr")
     for block in range(4):
-        columns = part(store, transport(), block)
+        columns = batch(store, transport(), block)
         store.write(0, block, columns, np.ones(columns.nnz) if block == 2 else None)
     store.finalize()
     T, spread = store.block(0, 0)
-    assert spread is not None
     np.testing.assert_array_equal(np.isnan(spread), (T.indices < 6) | (T.indices >= 9))
 
 
@@ -93,16 +87,14 @@ def test_variance_of_some_columns_only_is_unknown_elsewhere(tmp_path: Path) -> N
 def test_plain_zarr_reads_it_and_checks_it(tmp_path: Path, dtype: str) -> None:
     path, T = tmp_path / "T.zarr", transport(12, 12).astype(dtype) * 0.1
     ltcl.save(path, ltcl.Transport(T, (3, 4), on_dark="mask"))
-    root = zarr.open_group(path, mode="r")
-    assert {name for name, _ in root.groups()} == {"channel_0", "extra"}
+    assert {name for name, _ in zarr.open_group(path, mode="r").groups()} == {"channel_0", "extra"}
     group = zarr.open_group(path / "channel_0" / "block_000000.0", mode="r")
     header: Any = group.attrs["binsparse"]
-    values, indices, pointers = (np.asarray(group[n]) for n in ("values", "indices_1", "pointers_to_1"))
-    for name, array in (("values", values), ("indices_1", indices), ("pointers_to_1", pointers)):
-        assert array.dtype == header["data_types"][name]
-    matrix = scipy.sparse.csr_array((values, indices, pointers), shape=header["shape"])
+    arrays = {name: np.asarray(group[name]) for name in ("values", "indices_1", "pointers_to_1")}
+    assert {name: array.dtype for name, array in arrays.items()} == header["data_types"]
+    matrix = scipy.sparse.csr_array(tuple(arrays.values()), shape=header["shape"])
     np.testing.assert_array_equal(matrix.toarray(), T.toarray())
-    assert (values.dtype, len(values)) == (dtype, header["number_of_stored_values"])
+    assert (arrays["values"].dtype, matrix.nnz) == (dtype, header["number_of_stored_values"])
     chunk = path / "channel_0" / "block_000000.0" / "values" / "c" / "0"
     chunk.write_bytes(chunk.read_bytes()[:-9] + b"x" + chunk.read_bytes()[-8:])
     with pytest.raises(ValueError, match="checksum"):
@@ -112,25 +104,22 @@ def test_plain_zarr_reads_it_and_checks_it(tmp_path: Path, dtype: str) -> None:
 def test_missing_blocks_are_named_and_written_ones_replaced(tmp_path: Path) -> None:
     store = make(tmp_path / "T.zarr")
     for block in (0, 2):
-        store.write(0, block, part(store, transport(), block))
-    twice = part(store, transport() * np.float32(2), 2)
+        store.write(0, block, batch(store, transport(), block))
+    twice = batch(store, transport() * np.float32(2), 2)
     store.write(0, 2, twice)
     np.testing.assert_array_equal(store.block(0, 2).matrix.toarray(), twice.toarray())
     assert store.missing() == [(0, 1), (0, 3)]
-    with pytest.raises(FileError, match=r"2 block\(s\) \(channel, block\) \(0, 1\), \(0, 3\)"):
-        store.finalize()
-    with pytest.raises(FileError, match=r"columns_0.000001.npz is missing"):
-        store.block(0, 1)
-    with pytest.raises(FileError, match="finalize"):
-        ltcl.load(store.path)
+    assert repr(store) == f"BlockStore({str(store.path)!r}, shape=(10, 12), final=False)"
+    for work in (store.finalize, lambda: store.block(0, 1), lambda: ltcl.load(store.path)):
+        with pytest.raises(FileError, match=r"T\.zarr.*(\(0, 1\), \(0, 3\)|0\.000001|finalize)"):
+            work()
 
 
 @pytest.mark.parametrize("sigmas", [0.0, 0.5])
 def test_first_bounce(tmp_path: Path, sigmas: float) -> None:
     """Variances of `fill` are 1, 2, ... in the order of the entries; only the first few are far above."""
     store = make(tmp_path / "T.zarr", **SQUARE, channels=3)
-    fill(store, with_variance=True, final=False)
-    store.finalize(sigmas=sigmas)
+    fill(store, with_variance=True, final=False).finalize(sigmas=sigmas)
     expected = []
     for channel in range(3):
         T = transport(12, 12, channel)
@@ -148,7 +137,7 @@ def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
     for name, array in arrays.items():
         store.extra(name, array)
     store.update(step=4, name="π")
-    BlockStore.open(store.path, "a").update(step=5)
+    BlockStore.open(store.path).update(step=5)
     for bad in (float("nan"), object()):
         with pytest.raises(InputError, match="plain JSON"):
             store.update(bad=bad)
@@ -159,8 +148,7 @@ def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
     for name, array in arrays.items():
         np.testing.assert_array_equal(again.extra(name), array, strict=True)
     assert again.attributes == {"step": 5, "name": "π"}
-    versions = {"ltcl": ltcl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
-    assert again.provenance == {"versions": versions, "rig": "virtual", "seed": 3}
+    assert again.provenance == {"versions": {"ltcl": ltcl.__version__}, "rig": "virtual", "seed": 3}
     with pytest.raises(InputError, match=r"\.\./escape" if not final else "final"):
         store.extra("../escape", np.ones(2))
     with pytest.raises(InputTypeError, match="words"):
@@ -173,7 +161,6 @@ def test_extra_arrays_and_attributes(tmp_path: Path, final: bool) -> None:
         ({"grid": (3, 5)}, "h \\* w must be 12"),
         ({"camera_grid": (3, 3)}, "h \\* w must be 10"),
         ({"camera_grid": None}, "camera_grid is None"),
-        ({"channels": 2}, "channels is 2"),
         ({"block_rows": 0}, "block_rows is 0"),
         ({"shape": (1 << 31, 1), "grid": (1, 1), "camera_grid": (1 << 31, 1)}, "2147483647"),
         ({"provenance": {"rig": object()}}, "plain JSON"),
@@ -185,9 +172,9 @@ def test_bad_stores_are_not_made(tmp_path: Path, options: dict[str, Any], text: 
     assert not list(tmp_path.iterdir())
 
 
-def test_bad_blocks_and_modes_are_refused(tmp_path: Path) -> None:
+def test_bad_blocks_are_refused(tmp_path: Path) -> None:
     store = make(tmp_path / "T.zarr")
-    good = part(store, transport(), 0)
+    good = batch(store, transport(), 0)
     wrong: list[tuple[int, Any, Any, str]] = [
         (0, good[:2], None, r"matrix has shape \(2, 10\)"),
         (0, good.toarray(), None, "matrix is a ndarray"),
@@ -202,24 +189,21 @@ def test_bad_blocks_and_modes_are_refused(tmp_path: Path) -> None:
         with pytest.raises((InputError, InputTypeError), match=text):
             store.write(0, block, matrix, spread)
     assert store.written == frozenset()
-    for change in (lambda s: s.write(0, 0, good), lambda s: s.finalize(), lambda s: s.update(a=1)):
-        with pytest.raises(FileError, match="mode 'a'"):
-            change(BlockStore.open(store.path))
     fill(store)
     with pytest.raises(FileError, match="final"):
-        BlockStore.open(store.path, "a").write(0, 0, good)
+        BlockStore.open(store.path).write(0, 0, good)
 
 
 def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
-    path, other = tmp_path / "T.zarr", tmp_path / "other"
+    path, other, record = tmp_path / "T.zarr", tmp_path / "other", ltcl.store.Record((np.eye(6),), (2, 3))
     fill(make(path))
-    with pytest.raises(FileError, match="is there already"):
+    with pytest.raises(FileError, match="overwrite=True"):
         make(path)
     BlockStore.open(path).verify()
     assert make(path, overwrite=True).written == frozenset()
     other.mkdir()
     (other / "thesis.txt").write_text("years of work")
-    for work in (lambda: make(other, overwrite=True), lambda: block_store.write(other, RECORD)):
+    for work in (lambda: make(other, overwrite=True), lambda: block_store.write(other, record)):
         with pytest.raises(FileError, match="no store of ltcl"):
             work()
     assert (other / "thesis.txt").exists()
@@ -230,123 +214,99 @@ def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
             BlockStore.open(tmp_path / name)
 
 
-RECORD = ltcl.store.Record((np.eye(6),), (2, 3))
-
-
-@pytest.fixture(scope="module")
-def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A final store with everything that one can have, but small, and one that grows."""
-    paths = {}
-    for name in ("final", "growing"):
-        store = make(tmp_path_factory.mktemp("damage") / "T.zarr", **SQUARE, provenance={"rig": "π"})
-        store.extra("response", np.linspace(0, 1, 5))
-        store.extra("scalar", np.array(2.0))
-        store.update(step=3)
-        fill(store, with_variance=True, final=name == "final")
-        store.verify()
-        paths[name] = store.path
-    return paths
-
-
 @pytest.fixture(params=["final", "growing"])
-def copy(stores: dict[str, Path], tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    return Path(shutil.copytree(stores[request.param], tmp_path / "T.zarr"))
+def store(tmp_path: Path, request: pytest.FixtureRequest) -> BlockStore:
+    """A small store with everything that one can have."""
+    store = make(tmp_path / "T.zarr", **SQUARE, provenance={"rig": "π"})
+    store.extra("response", np.linspace(0, 1, 5))
+    store.extra("scalar", np.array(2.0))
+    store.update(step=3)
+    return fill(store, with_variance=True, final=request.param == "final")
 
 
-def files(path: Path) -> list[Path]:
-    return sorted(file for file in path.rglob("*") if file.is_file())
-
-
-def test_any_damage_to_any_file_is_noticed(copy: Path) -> None:
-    for file in files(copy):
+def damage_all_files(path: Path) -> None:
+    for file in sorted(file for file in path.rglob("*") if file.is_file()):
         good = file.read_bytes()
         places = random.choice(len(good), min(len(good), 6), replace=False).tolist()
         flipped = [good[:k] + bytes([good[k] ^ (1 << k % 8)]) + good[k + 1 :] for k in places]
         for bad in (*flipped, good[:-1], good[: len(good) // 2], b"", good + b" "):
             file.write_bytes(bad)
-            refused(copy)
+            refused(path)
         file.unlink()
         if file.parent.name != "log":  # a batch that is not there is one to be written
-            refused(copy, "missing")
+            refused(path, "no such file")
         os.mkfifo(file)
-        refused(copy)
-        file.unlink()
-        (copy.parent / "moved").write_bytes(good)
-        file.symlink_to(copy.parent / "moved")
-        refused(copy)
+        refused(path)
         file.unlink()
         file.write_bytes(good)
-    BlockStore.open(copy).verify()
+    BlockStore.open(path).verify()
+
+
+def test_any_damage_to_any_file_is_noticed(store: BlockStore) -> None:
+    damage_all_files(store.path)
 
 
 def forge(file: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Change a document and seal it again, as an enemy could."""
-    attributes = json.loads(file.read_bytes())["attributes"]
-    del attributes["checksum"]
-    change(attributes)
-    file.write_bytes(zarr_arrays.seal(attributes))
+    """Change a document and give it the right checksum, as an enemy could."""
+    document = json.loads(file.read_bytes())
+    change(document["attributes"])
+    document["attributes"]["checksum"] = unsealed = "0" * 64
+    raw = json.dumps(document)
+    file.write_text(raw.replace(unsealed, hashlib.sha256(raw.encode()).hexdigest(), 1))
 
 
+@pytest.mark.parametrize("store", ["growing"], indirect=True)
 @pytest.mark.parametrize(
     ("name", "value", "text"),
     [
         ("schema", 3, "schema is 3"),
         ("schema", 1, "earlier"),
-        ("shape", [12, 1 << 40], "shape"),
+        ("shape", [12, 1 << 40], "1099511627776"),
         ("shape", "12 x 12", "shape is"),
         ("channels", 1 << 40, "channels is"),
         ("block_rows", -1, "block_rows is -1"),
         ("surprise", 1, "surprise"),
     ],
 )
-def test_hostile_layouts(stores: dict[str, Path], tmp_path: Path, name: str, value: Any, text: str) -> None:
-    path = Path(shutil.copytree(stores["growing"], tmp_path / "T.zarr"))
-    forge(path / "zarr.json", lambda attributes: attributes["ltcl"].update({name: value}))
-    refused(path, text)
+def test_hostile_layouts(store: BlockStore, name: str, value: Any, text: str) -> None:
+    forge(store.path / "zarr.json", lambda attributes: attributes["ltcl"].update({name: value}))
+    refused(store.path, text)
 
 
-def test_a_huge_shape_is_only_a_list_of_missing_blocks(stores: dict[str, Path], tmp_path: Path) -> None:
-    path, huge = Path(shutil.copytree(stores["growing"], tmp_path / "T.zarr")), (1 << 31) - 1
+@pytest.mark.parametrize("store", ["growing"], indirect=True)
+def test_a_huge_shape_is_only_a_list_of_missing_blocks(store: BlockStore) -> None:
+    huge = (1 << 31) - 1
     sizes = {"shape": [huge, huge], "grid": [1, huge], "block_rows": 1 << 12}
-    forge(path / "zarr.json", lambda attributes: attributes["ltcl"].update(sizes))
-    with pytest.raises(FileError, match="indptr"):
-        BlockStore.open(path).block(0, 0)
-    with pytest.raises(FileError, match=r"lacks 524285 block\(s\)"):
-        BlockStore.open(path, "a").finalize()
+    forge(store.path / "zarr.json", lambda attributes: attributes["ltcl"].update(sizes))
+    store = BlockStore.open(store.path)
+    with pytest.raises(FileError, match="2147483647"):
+        store.block(0, 0)
+    with pytest.raises(FileError, match="lacks 524285 blocks"):
+        store.finalize()
 
 
-@pytest.mark.parametrize(
-    "change", [{"shape": [1 << 40]}, {"data_type": "O"}, {"codecs": [{"name": "gzip"}]}, None]
-)
-def test_what_cannot_be_rows(stores: dict[str, Path], tmp_path: Path, change: dict[str, Any] | None) -> None:
-    """With all checksums right: arrays that declare terabytes, and columns that do not ascend."""
-    path = Path(shutil.copytree(stores["final"], tmp_path / "T.zarr"))
-    file, node = (path / "channel_0" / "block_000000.0" / name for name in ("values/zarr.json", "indices_1"))
-    if change is None:
-        array = zarr.open_array(node, mode="a")
-        array[...] = np.asarray(array[...])[::-1]
-    else:
-        file.write_text(json.dumps(json.loads(file.read_bytes()) | change))
-    sums = zarr_arrays.manifest(path, ["channel_0", "extra"])
-    forge(path / "zarr.json", lambda attributes: attributes.update(files=sums))
-    with pytest.raises(FileError, match=r"T\.zarr: .*0[./](block_)?000000"):
-        ltcl.load(path, on_dark="mask")
+@pytest.mark.parametrize("store", ["final"], indirect=True)
+@pytest.mark.parametrize("change", [{"shape": [1 << 40]}, {"data_type": "O"}, {"codecs": [{"name": "gzip"}]}])
+def test_arrays_that_declare_terabytes_or_hold_no_numbers(store: BlockStore, change: dict[str, Any]) -> None:
+    file = store.path / "channel_0" / "block_000000.0" / "values" / "zarr.json"
+    file.write_text(json.dumps(json.loads(file.read_bytes()) | change))
+    sums = contents(store.path)
+    del sums["zarr.json"]
+    forge(store.path / "zarr.json", lambda attributes: attributes.update(files=sums))
+    with pytest.raises(FileError, match=r"T\.zarr: .*block_000000"):
+        ltcl.load(store.path, on_dark="mask")
 
 
 def test_stores_of_schema_1_load(tmp_path: Path) -> None:
     """One that an earlier ltcl wrote: plain chunks, their SHA-256 in the document of their block."""
-    path = Path(__file__).with_name("schema-1.zarr.zip")
-    with zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(Path(__file__).with_name("schema-1.zarr.zip")) as archive:
         archive.extractall(tmp_path)
     store = BlockStore.open(tmp_path / "T.zarr")
-    store.verify()
     for channel in range(3):
-        np.testing.assert_array_equal(whole(store, channel), transport(12, 12, channel).toarray())
+        np.testing.assert_array_equal(rows(store, channel), transport(12, 12, channel).toarray())
     assert store.attributes == {"step": 3}
     T = ltcl.load(store.path, on_dark="mask")
     assert np.flatnonzero(T.masked).tolist() == [3]
-    for file in files(store.path):
-        good = file.read_bytes()
-        file.write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
-        refused(store.path)
-        file.write_bytes(good)
+    for group in store.path.glob("*/zarr.json"):
+        group.unlink()  # which say nothing
+    damage_all_files(store.path)

@@ -70,8 +70,8 @@ def test_the_same_transport_comes_back(device: Any, tmp_path: Path, extension: s
         with pytest.raises(FileError, match="on_dark='mask'"):
             ltcl.load(path)
     again: Any = ltcl.load(path, on_dark="mask")
-    assert again.device is device
-    assert (again.shape, again.grid, again.channels, again.error) == (C.shape, C.grid, C.channels, C.error)
+    assert (again.device, again.shape, again.grid) == (device, C.shape, C.grid)
+    assert (again.channels, again.error) == (C.channels, C.error)
     for attribute in ("first_bounce", "masked", "mixing"):
         np.testing.assert_array_equal(getattr(again, attribute), getattr(C, attribute))
     p = random.uniform(0.0, 1.0, (*GRID, 3))
@@ -98,9 +98,9 @@ def test_what_is_known_without_a_device(device: Any, tmp_path: Path) -> None:
 
 def test_what_no_file_holds_is_refused(device: Any, tmp_path: Path) -> None:
     for name in ("C.npy", "C.mtx"):
-        with pytest.raises(FileError, match=r"compressed transports; \.npz and \.zarr"):
+        with pytest.raises(FileError, match=name):
             ltcl.save(tmp_path / name, compressed(device))
-    with pytest.raises(InputTypeError, match="T is made of Dense"):
+    with pytest.raises(InputTypeError, match=r"T .*Dense"):
         ltcl.save(tmp_path / "C.npz", ltcl.Transport(Dense(device, np.eye(N)), GRID))
     assert not list(tmp_path.iterdir())
 
@@ -110,19 +110,13 @@ ALIEN: list[tuple[str, str, Any, str]] = [
     ("C", "grid", None, "'grid'"),
     ("C", "system_0.sign", None, "1 channels, but there are 0 operators"),
     ("C", "grid", np.array([5, 5]), "grid is 5 x 5 = 25 pixels"),
-    ("C", "grid", np.array([42]), r"grid has shape \(1,\)"),
     ("C", "first_bounce", F[:2], r"first_bounce has shape \(2, 42\)"),
-    ("C", "first_bounce", np.full((1, N), np.nan), "'first_bounce' has 42 NaN"),
     ("C", "system_0.R.core.data", np.full(3, np.inf), "data' has 3 NaN or infinite"),
     ("C", "mixing", np.eye(3), "one channel"),
-    ("C", "columns_0", np.ones(3), r"d has shape \(3,\)"),
     ("C", "format", np.array("ltcl-compressed-2"), "'format' is"),
     ("C", "system_0.R.core.shape", np.array([1 << 62, 1 << 62]), "indptr has 43 entries"),
     ("inverse", "errors", None, "'errors'"),
-    ("inverse", "grid", np.array([6, 8]), "grid is 6 x 8"),
-    ("inverse", "errors", np.array([0.1]), "must be 1 or 3"),
     ("inverse", "confidence", np.array(2.0), "confidence is 2.0"),
-    ("inverse", "mixing", np.zeros((3, 3)), "mixing has the condition number"),
     ("inverse", "system_1.sign", np.array(1.0), "I - A"),
     ("inverse", "system_2.R.kind", np.array("magic"), "'magic'"),
 ]
@@ -144,9 +138,6 @@ def saved(device: Any, inverse: ltcl.Inverse, tmp_path: Path) -> Path:
     return tmp_path
 
 
-LOAD: dict[str, Any] = {"C": ltcl.load, "inverse": ltcl.load_inverse}
-
-
 @pytest.mark.parametrize(("file", "name", "value", "text"), ALIEN)
 def test_arrays_that_do_not_fit(saved: Path, file: str, name: str, value: Any, text: str) -> None:
     path = saved / f"{file}.npz"
@@ -154,26 +145,23 @@ def test_arrays_that_do_not_fit(saved: Path, file: str, name: str, value: Any, t
         arrays = {**archive, name: value}
     np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
     with pytest.raises(FileError, match=text) as error:
-        LOAD[file](path)
+        (ltcl.load if file == "C" else ltcl.load_inverse)(path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
 
 
 def test_one_is_not_the_other_and_each_has_its_grid(saved: Path, inverse: ltcl.Inverse) -> None:
-    with pytest.raises(FileError, match=r"inverse\.npz: .*load_inverse"):
-        ltcl.load(saved / "inverse.npz")
-    with pytest.raises(FileError, match=r"C\.npz: is no inverse"):
-        ltcl.load_inverse(saved / "C.npz")
+    for load, name in ((ltcl.load, "inverse.npz"), (ltcl.load_inverse, "C.npz")):
+        with pytest.raises(FileError, match=f"{name}: .*inverse"):
+            load(saved / name)
     with pytest.raises(FileError, match=r"extension is '\.npy'"):
         ltcl.save_inverse(saved / "a.npy", inverse)
     with pytest.raises(InputTypeError, match="inverse is a Transport"):
         ltcl.save_inverse(saved / "a.npz", ltcl.load(saved / "C.npz"))  # pyright: ignore[reportArgumentType]
     assert len(list(saved.iterdir())) == 2
     assert ltcl.load(saved / "C.npz", grid=GRID).grid == GRID
-    wrong: list[dict[str, Any]] = [{"grid": (7, 6)}, {"camera_grid": (1, N)}]
-    for options in wrong:
-        with pytest.raises(FileError, match=r"\(6, 7\)"):
-            ltcl.load(saved / "C.npz", **options)
+    with pytest.raises(FileError, match=r"\(6, 7\)"):
+        ltcl.load(saved / "C.npz", grid=(7, 6))
     columns = ltcl.load(saved / "C.npz", first_bounce=F[0])
     assert columns.systems[0] is columns.matrices[0].A
 
@@ -216,10 +204,8 @@ def test_whatever_arrays_say_there_is_a_transport_or_one_line(device: Any, tmp_p
         for mutant in mutants(array):
             np.savez(path, **{**arrays, name: mutant})
             try:
-                T = ltcl.load(path, on_dark="mask")
+                assert (ltcl.load(path, on_dark="mask") @ np.ones(GRID)).shape == GRID
             except LtclError as error:
                 refusals.append(str(error))
-            else:
-                assert (T @ np.ones(GRID)).shape == GRID
     assert len(refusals) > 3 * len(arrays)
     assert not [text for text in refusals if "\n" in text]

@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import struct
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,17 +17,16 @@ import scipy.io
 import scipy.sparse
 
 import ltcl
-from ltcl.errors import FileError, LtclError, MemoryLimitError
+from ltcl.errors import FileError, InputTypeError, LtclError, MemoryLimitError
 from ltcl.store import Record, formats
 from ltcl.store.record import Matrix
 
 from .stores import dense, sparse
 
 random = np.random.default_rng()
-NAMED = (".npz", ".h5", ".hdf5", ".mat", ".zarr")  # which keep everything
-MIXING = np.eye(3) + np.triu(np.full((3, 3), 0.1))
-CSR = {"format": np.array(b"csr"), "shape": np.array([2, 3])}
+read: Any = formats.read
 COORDINATE = b"%%MatrixMarket matrix coordinate real general\n"
+NO_NUMBERS = (b"x", b"1.5E", b"5,1", b"1..2", b"1 2", b"1\0", b"+-1", b"nan")  # SciPy reads 1 of 1..2
 ARRAY = b"%%MatrixMarket matrix array real general\n"
 
 
@@ -47,13 +44,6 @@ def as_dense(T: Matrix) -> np.ndarray:
     return T if isinstance(T, np.ndarray) else T.tocsr().toarray()
 
 
-def record_in(path: Path) -> Record:
-    """The matrices in a file."""
-    record = formats.read(path)
-    assert isinstance(record, Record)
-    return record
-
-
 def refusal(path: Path, kind: type[LtclError]) -> str:
     """Text behind the file's name of the error that reading `path` gives; it is one line."""
     with pytest.raises(kind) as error:
@@ -64,31 +54,25 @@ def refusal(path: Path, kind: type[LtclError]) -> str:
     return text.removeprefix(f"{path}: ")
 
 
-def matrices(kind: str, channels: int, dtype: str) -> tuple[Any, ...]:
-    """Of 10 x 12, or sparse of 12 x 12 with or without one pattern for all."""
-    if kind == "dense":
-        return tuple(dense(10, 12, dtype, seed) for seed in range(channels))
-    return tuple(sparse(12, dtype, k, pattern=k if kind == "patterns" else 1) for k in range(channels))
-
-
-@pytest.mark.parametrize("extension", NAMED)
+@pytest.mark.parametrize("extension", [".npz", ".h5", ".hdf5", ".mat", ".zarr"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize(
-    ("kind", "channels"), [("dense", 1), ("dense", 3), ("sparse", 1), ("sparse", 3), ("patterns", 3)]
-)
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_everything_comes_back(tmp_path: Path, extension: str, kind: str, channels: int, dtype: str) -> None:
-    T = matrices(kind, channels, dtype)
-    square = kind != "dense"  # else there is no first bounce
+    square = kind == "sparse"  # else there is no first bounce
+    T: Any = [sparse(12, dtype, k, k) if square else dense(10, 12, dtype, k) for k in range(channels)]
     F = random.uniform(1, 2, (12,) if channels == 1 else (3, 12)) if square else None
-    record = Record(T, (3, 4), None if square else (2, 5), F, MIXING if channels == 3 else None)
+    record = Record(
+        tuple(T), (3, 4), None if square else (2, 5), F, np.eye(3) + 0.1 if channels == 3 else None
+    )
     path = tmp_path / f"T{extension}"
     formats.write(path, record)
     formats.write(path, record)  # again, onto itself
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
-    back = record_in(path).in_memory()
+    back = read(path).in_memory()
     if extension == ".zarr":  # which has sparse rows
         record = replace(record, matrices=tuple(map(scipy.sparse.csr_array, T)))
-    if extension == ".mat" and kind != "dense":  # MATLAB's sparse ones are of float64
+    if extension == ".mat" and square:  # MATLAB's sparse ones are of float64
         back = replace(back, matrices=tuple(scipy.sparse.csr_array(T, dtype=dtype) for T in back.matrices))
     same(back, record)
 
@@ -101,7 +85,7 @@ def test_npy_keeps_the_matrix_alone(tmp_path: Path, T: Any, caplog: Any) -> None
         if len(T) == 3:
             formats.write(tmp_path / "T.npy", Record(T, first_bounce=np.ones(12)))
             assert "first bounce" in caplog.text
-    same(record_in(tmp_path / "T.npy"), Record(T))
+    same(read(tmp_path / "T.npy"), Record(T))
     with pytest.raises(FileError, match=r"T\.npy: T is sparse"):
         formats.write(tmp_path / "T.npy", Record((sparse(),)))
 
@@ -111,7 +95,7 @@ def test_npy_keeps_the_matrix_alone(tmp_path: Path, T: Any, caplog: Any) -> None
 def test_mtx_keeps_one_matrix_and_the_grids(tmp_path: Path, make: Any, grids: Any) -> None:
     path, T = tmp_path / "T.MTX", tuple(make(seed=k).astype(np.float64) for k in (1, 2, 3))
     formats.write(path, Record(T[:1], *grids))
-    same(record_in(path), Record(T[:1], *grids))
+    same(read(path), Record(T[:1], *grids))
     np.testing.assert_array_equal(as_dense(scipy.sparse.csr_array(scipy.io.mmread(path))), as_dense(T[0]))
     with pytest.raises(FileError, match=r"three channels"):
         formats.write(path, Record(T, *grids))
@@ -122,7 +106,7 @@ def test_mtx_keeps_one_matrix_and_the_grids(tmp_path: Path, make: Any, grids: An
 def test_every_layout_of_scipy_is_read_and_one_is_written(tmp_path: Path, layout: str, kind: str) -> None:
     T = getattr(scipy.sparse, f"{layout}_{kind}")(sparse(dtype="float64"))
     scipy.sparse.save_npz(tmp_path / "T.npz", T, compressed=kind == "matrix")
-    (result,) = record_in(tmp_path / "T.npz").matrices
+    (result,) = read(tmp_path / "T.npz").matrices
     assert isinstance(result, scipy.sparse.csr_array)
     np.testing.assert_array_equal(result.toarray(), T.toarray())
     formats.write(tmp_path / "T.npz", Record((result,), (3, 4)))
@@ -135,15 +119,15 @@ _READ = {">f4": "f4", ">f8": "f8", "f2": "f4", "u1": "f4", ">u2": "f4", "i4": "f
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
-@pytest.mark.parametrize(("stored", "read"), _READ.items())
-def test_types_and_byte_orders(tmp_path: Path, stored: str, read: str, order: Any) -> None:
+@pytest.mark.parametrize(("stored", "expected"), _READ.items())
+def test_types_and_byte_orders(tmp_path: Path, stored: str, expected: str, order: Any) -> None:
     T = np.asarray(dense(4, 6).astype(stored), order=order)
     np.save(tmp_path / "T.npy", T[None])  # one channel in front is dropped
     np.savez(tmp_path / "T.npz", T=T)
     for path in tmp_path.iterdir():
-        (result,) = record_in(path).matrices
+        (result,) = read(path).matrices
         assert result.dtype.isnative
-        np.testing.assert_array_equal(result, T.astype(read), strict=True)
+        np.testing.assert_array_equal(result, T.astype(expected), strict=True)
 
 
 @pytest.mark.parametrize(
@@ -151,13 +135,12 @@ def test_types_and_byte_orders(tmp_path: Path, stored: str, read: str, order: An
     [
         {"T": dense(), "first_bounce": np.ones(12), "noise": dense()},
         {"light": dense(), "camera_grid": [2, 6], "names": np.array(["a"])},
-        {"light": dense(), "notes": np.array([{"by": "me"}], object)},
     ],
 )
 def test_named_arrays_are_read(tmp_path: Path, arrays: Any) -> None:
     np.savez_compressed(tmp_path / "T.npz", **arrays, grid=[3, 4])
     camera_grid = (2, 6) if "camera_grid" in arrays else None
-    same(record_in(tmp_path / "T.npz"), Record((dense(),), (3, 4), camera_grid, arrays.get("first_bounce")))
+    same(read(tmp_path / "T.npz"), Record((dense(),), (3, 4), camera_grid, arrays.get("first_bounce")))
 
 
 VARIABLES = {"a": dense(), "b": 2 * dense(), "grid": np.array([3, 4])}
@@ -180,9 +163,11 @@ def test_any_variable_by_its_name(tmp_path: Path, extension: str) -> None:
     assert all(word in text for word in ("'a' (12, 12)", "'b' (12, 12)", "variable="))
     with pytest.raises(FileError, match="'c'"):
         formats.read(path, variable="c")
-    formats.write(tmp_path / "T.npy", Record((dense(),)))
+    np.save(tmp_path / "T.npy", dense())
     with pytest.raises(FileError, match="variable is 'a'"):
         formats.read(tmp_path / "T.npy", variable="a")
+    with pytest.raises(InputTypeError, match=r"path is .*\(2, 2\)"):
+        ltcl.load(np.eye(2))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -191,79 +176,62 @@ def test_any_variable_by_its_name(tmp_path: Path, extension: str) -> None:
     [dense(dtype="float64"), dense(), np.eye(12), sparse().tocsc().astype(float), random.random((12, 12, 3))],
 )
 def test_matlab_5(tmp_path: Path, LTM: Any, compressed: bool) -> None:
-    """Integers that MATLAB keeps in fewer bytes, other variables, and colour."""
+    """With other variables, and in colour."""
     others = {"name": "text", "cell": {"a": 1}, "grid": [3, 4], "z": 1j * np.eye(2)}
     scipy.io.savemat(tmp_path / "T.mat", {**others, "LTM": LTM}, do_compression=compressed)
-    record = record_in(tmp_path / "T.mat")
+    record = read(tmp_path / "T.mat")
     assert (record.grid, record.matrices[0].dtype) == ((3, 4), LTM.dtype)
     expected = np.atleast_3d(as_dense(LTM)).transpose(2, 0, 1)
     np.testing.assert_array_equal([as_dense(T) for T in record.matrices], expected)
 
 
 def test_sparse_matrices_of_matlab_7_3(tmp_path: Path) -> None:
-    path, T = tmp_path / "T.mat", scipy.sparse.csc_array(np.array([[0, 1.0, 0], [2, 0, 3], [0, 0, 4]]))
+    path, T = tmp_path / "T.mat", sparse().tocsc()
     with h5py.File(path, "w", userblock_size=512) as file:
         group = file.create_group("LTM")
-        group.attrs["MATLAB_sparse"] = np.uint64(3)
+        group.attrs["MATLAB_sparse"] = np.uint64(12)
         group["data"], group["ir"], group["jc"] = T.data, T.indices.astype("u8"), T.indptr.astype("u8")
-    np.testing.assert_array_equal(as_dense(record_in(path).matrices[0]), T.toarray())
+    np.testing.assert_array_equal(as_dense(read(path).matrices[0]), T.toarray())
 
 
 @pytest.mark.parametrize("symmetry", ["general", "symmetric", "skew-symmetric"])
 @pytest.mark.parametrize("make", [np.asarray, scipy.sparse.coo_array])
 @pytest.mark.parametrize("field", ["real", "integer"])
 def test_mtx_of_others(tmp_path: Path, make: Any, symmetry: str, field: str) -> None:
-    """With and without a last line end; of the symmetric ones those that a sparse transport can be."""
+    """With other line ends, and with and without the last."""
     path, T = tmp_path / "T.mtx", np.arange(16.0).reshape(4, 4)
     T = {"general": T, "symmetric": T + T.T, "skew-symmetric": T - T.T}[symmetry]
     scipy.io.mmwrite(path, make(T), symmetry=symmetry, field=field, comment="ltcl knows nothing of me")
-    if symmetry == "skew-symmetric" or (make is np.asarray and symmetry == "symmetric"):
+    if symmetry == "skew-symmetric":
         assert symmetry in refusal(path, FileError)
         return
-    for _ in range(2):
-        np.testing.assert_array_equal(as_dense(record_in(path).matrices[0]), T)
-        path.write_bytes(path.read_bytes().rstrip())
+    text = path.read_bytes()
+    for changed in (text, text.rstrip(), text + b" \n\n ", text.replace(b"\n", b" \r\n ")):
+        path.write_bytes(changed)
+        np.testing.assert_array_equal(as_dense(read(path).matrices[0]), T)
 
 
 def parts(**changes: object) -> dict[str, object]:
-    """A good (2, 3) matrix in SciPy's layout, with changes; None leaves one out."""
-    good = {"data": np.ones(3), "indices": np.array([0, 2, 1]), "indptr": np.array([0, 2, 3])}
-    return {name: value for name, value in (CSR | good | changes).items() if value is not None}
+    """A good (2, 3) matrix in SciPy's layout, with changes."""
+    good = {"format": "csr", "shape": [2, 3], "data": np.ones(3), "indices": [0, 2, 1], "indptr": [0, 2, 3]}
+    return good | changes
 
 
-def coo(**changes: object) -> dict[str, object]:
-    return CSR | {"format": "coo", "data": [1.0], "row": [1], "col": [0]} | changes
-
-
-def saved(arrays: Any) -> Callable[[Path], object]:
-    return lambda path: np.savez(path, **arrays)
-
-
-def raw(data: bytes) -> Callable[[Path], object]:
-    return lambda path: path.write_bytes(data)
-
-
-def npy(descr: str, shape: str, fortran: str = "False", body: bytes = b"") -> bytes:
-    text = f"{{'descr': {descr}, 'fortran_order': {fortran}, 'shape': {shape}, }}".encode()
+def npy(descr: str, shape: str, body: bytes = b"") -> bytes:
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode()
     return b"\x93NUMPY\x01\0" + struct.pack("<H", len(text)) + text + body
 
 
 @pytest.mark.parametrize(
     "data",
     [
-        b"PK\x03\x04 an archive under another name",
         b"\x93NUMPY\x09\0\x76\0\0\0",
         b"\x93NUMPY\x02\0\xff\xff\xff\xff",
         npy("'<f4'", "(4, 4)", body=bytes(60)),
         npy("'<f4'", "(4000000, 4000000)"),
-        npy("'<f4'", f"({2**62}, {2**62})"),
         npy("'<f4'", "(-4, -4)", body=bytes(64)),
-        npy("'<f4'", "(True, 4)", body=bytes(16)),
-        npy("'<f4'", "(4, 4)", "0", body=bytes(64)),
-        npy("'<f4'", "(" * 3000),
         npy("__import__('os')", "(4, 4)"),
         npy("'|O'", "(4, 4)", body=bytes(128)),
-        npy("'<c8'", "(4, 4)", body=bytes(128)),
         npy("'<f4'", "(16,)", body=bytes(64)),
         npy("'<f4'", "(0, 4)"),
     ],
@@ -285,12 +253,10 @@ HUGE = {"shape": (1 << 20, 1 << 20), "dtype": "f4"}
     [
         (HUGE | {"chunks": (8, 8)}, "4 TiB"),
         (HUGE, "4 TiB"),
-        (h5py.ExternalLink("/etc/passwd", "T"), "link"),
-        (h5py.SoftLink("/T"), "link"),
+        (h5py.ExternalLink("/etc/passwd", "T"), "no numbers"),
+        (h5py.SoftLink("/T"), "no numbers"),
         ({"shape": (12, 12), "dtype": "f4", "external": [(__file__, 0, 576)]}, "other files"),
         ({"data": np.ones((2, 2), complex)}, "complex128"),
-        ({"data": np.ones((0, 2))}, "not empty"),
-        ({"data": np.ones((2, 2, 2))}, "not empty"),
     ],
 )
 def test_hostile_hdf5(tmp_path: Path, name: str, value: Any, text: str) -> None:
@@ -306,38 +272,32 @@ def test_hostile_hdf5(tmp_path: Path, name: str, value: Any, text: str) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "text"),
     [
-        ("indices", lambda T: T.indices + 20, "column indices must be in 0..11"),
-        ("indptr", lambda T: np.where(np.arange(13) == 5, -1, T.indptr), "fall"),
-        ("shape", lambda T: (1 << 60, 1 << 60), "1152921504606846976"),
-        ("shape", lambda T: (12,), "shape of 'T' is [12]"),
+        ("ir", lambda T: T.indices + 20, "0..11"),
+        ("jc", lambda T: np.where(np.arange(13) == 5, -1, T.indptr), "indptr"),
+        ("MATLAB_sparse", lambda T: 1 << 60, "1152921504606846976"),
+        ("MATLAB_sparse", lambda T: 0.5, "0.5"),
         ("data", lambda T: T.data * np.nan, "NaN"),
-        ("data", lambda T: T.data[:-1], "same size"),
     ],
 )
 def test_sparse_groups_that_lie(tmp_path: Path, name: str, change: Any, text: str) -> None:
-    path, T = tmp_path / "T.h5", sparse()
-    formats.write(path, Record((T,), (3, 4)))
+    path, T = tmp_path / "T.h5", sparse().tocsc()
+    formats.write(path, Record((sparse(),), (3, 4)))
     with h5py.File(path, "r+") as file:
-        group: Any = file["T"]
-        if name == "shape":
-            group.attrs["shape"] = change(T)
-        else:
-            del group[name]
-            group[name] = change(T)
+        place: Any = file["T"] if name != "MATLAB_sparse" else file["T"].attrs
+        del place[name]
+        place[name] = change(T)
     assert text in refusal(path, FileError)
 
 
-def test_a_small_archive_cannot_declare_terabytes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("claims", [(), ("file_size",), ("file_size", "compress_size")])
+def test_a_small_archive_cannot_declare_terabytes(tmp_path: Path, claims: tuple[str, ...]) -> None:
     """The sizes lie in all three places: local header, directory, and the array's own header."""
-    path, array = tmp_path / "T.npz", npy("'<f4'", "(3000000, 3000000)")
-    claimed = len(array) + 4 * 3000000**2
-    for sizes in ({}, {"file_size": claimed}, {"file_size": claimed, "compress_size": claimed}):
-        with zipfile.ZipFile(path, "w") as archive:
-            info = zipfile.ZipInfo("T.npy")
-            archive.writestr(info, array)
-            for name, size in sizes.items():  # goes into the directory on closing
-                setattr(info, name, size)
-        assert "TiB" in refusal(path, FileError)
+    array, info = npy("'<f4'", "(3000000, 3000000)"), zipfile.ZipInfo("T.npy")
+    with zipfile.ZipFile(tmp_path / "T.npz", "w") as archive:
+        archive.writestr(info, array)
+        for name in claims:  # goes into the directory on closing
+            setattr(info, name, len(array) + 4 * 3000000**2)
+    assert "TiB" in refusal(tmp_path / "T.npz", FileError)
 
 
 @pytest.mark.parametrize("extension", [".npz", ".npy", ".mtx", ".h5", "5.mat", ".zarr"])
@@ -353,62 +313,40 @@ def test_an_honest_giant_is_a_matter_of_memory(
     assert "host has" in refusal(path, MemoryLimitError)
 
 
-def archive_of(array: np.ndarray, compression: int) -> bytes:
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", compression) as archive, archive.open("T.npy", "w") as stream:
-        np.save(stream, array)
-    return file.getvalue()
-
-
-DEFLATED = archive_of(dense(), zipfile.ZIP_DEFLATED)
-
-
-REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
-    (".npz", saved({"words": np.array(["x"])}), "no numbers"),
-    (".npz", saved({"T": np.ones((2, 4, 4))}), "T has shape (2, 4, 4)"),
-    (".npz", saved({"T": np.array([[None]])}), "Object arrays cannot be loaded"),
-    (".npz", saved({"T": np.ones((2, 2), complex)}), "'T' holds complex128"),
-    (".npz", saved({"T": dense(), "grid": [3, 4, 5]}), "'grid' is [3, 4, 5]"),
-    (".npz", saved({"T": dense(), "grid": [2.5, 3.0]}), "'grid' is [2.5, 3.0]"),
-    (".npz", saved({"T": dense(), "first_bounce": np.ones(11)}), "first_bounce has shape (11,)"),
-    (".npz", saved(parts(format=np.array(b"lil"))), "lil"),
-    (".npz", saved(parts(shape=np.array([2.5, 3.0]))), "'shape' is [2.5, 3.0]"),
-    (".npz", saved(parts(shape=np.array([2, 2**62]))), "(2, 4611686018427387904) with 3 entries"),
-    (".npz", saved(parts(shape=np.array([3, 3]))), "index pointer size 3"),
-    (".npz", saved(parts(indices=np.array([0, -1, 1]))), "indices holds -1"),
-    (".npz", saved(parts(indices=np.array([0.0, 2.0, 1.0]))), "'indices' holds float64"),
-    (".npz", saved(parts(indptr=np.array([0, 3, 2]))), ""),
-    (".npz", saved(parts(data=np.array([1, np.nan, 2]))), "1 NaN"),
-    (".npz", saved(parts(format=np.array(b"csc"))), ""),
-    (".npz", saved(parts(indices=None)), "indices"),
-    (".npz", saved(coo(row=[2])), "index 2"),
-    (".npz", saved(CSR | {"format": "dia", "data": np.ones((2, 3)), "offsets": [0, 0]}), "duplicate"),
-    (".npz", saved(parts(format="bsr", data=np.ones((3, 1, 1)), indices=[0, 9, 1])), "9"),
-    (".npz", saved(parts(format="ltcl-rgb-csr-1", data=np.ones((3, 4)))), ""),
-    (".npz", saved(CSR | {"format": "ltcl-rgb-csr-1"}), "'data_0' is missing"),
-    (".mtx", raw(b"\x93NUMPY\x01\0"), "line of sizes"),
-    (".mtx", raw(COORDINATE.replace(b"real", b"complex") + b"2 2 1\n1 1 1 1\n"), "complex"),
-    (".mtx", raw(COORDINATE + b"% words\n" * 10), "line of sizes"),
-    (".mtx", raw(COORDINATE + b"-2 2 1\n1 1 1\n"), "'-2 2 1'"),
-    (".mtx", raw(COORDINATE + b"9 9 1000000000000\n1 1 1\n"), "3000000000000 numbers"),
-    (".mtx", raw(COORDINATE + b"9 9 2\n1 1 1.00\n2 2 1.00\n3 3 1.00\n"), "6 numbers"),
-    (".mtx", raw(COORDINATE + b"9 9 1\n1 1 1.5E"), "1.5E"),
-    (".mtx", raw(COORDINATE + b"900000000000 9 1\n1 1 1\n"), "(900000000000, 9) with 1 entries"),
-    (".mtx", raw(COORDINATE.replace(b"general", b"symmetric") + b"2 3 1\n1 1 1\n"), "2 x 3"),
-    (".mtx", raw(ARRAY + b"2 2\n1\n1\n1\nx\n"), "unmatched"),
-    (".mtx", raw(COORDINATE + b"2 2 2\n1 1 1\n1 0 1\n"), "column 0"),
-    (".mtx", raw(COORDINATE + b"2 2 1\n1 99999999999999999999 1\n"), "column 1e+20"),
-    (".npz", raw(archive_of(dense(), zipfile.ZIP_BZIP2)), "method 12"),
-    (".npz", raw(archive_of(dense(), zipfile.ZIP_LZMA)), "method 14"),
-    (".npz", raw(DEFLATED[:-1]), "zip"),
-    (".npz", raw(DEFLATED + b"x"), "appended"),
-    (".npz", raw(b"not an archive at all"), "zip"),
+REFUSED: list[tuple[str, Any, str]] = [
+    (".npz", {"T": np.ones((2, 4, 4))}, "(2, 4, 4)"),
+    (".npz", {"T": dense(), "note": np.array({"by": "me"})}, "'note' is declared as object"),
+    (".npz", {"T": np.ones((2, 2), complex)}, "complex128"),
+    (".npz", {"T": dense(), "grid": [2.5, 3.0]}, "'grid' is [2.5, 3.0]"),
+    (".npz", {"T": dense(), "first_bounce": np.ones(11)}, "(11,)"),
+    (".npz", parts(format=np.array(b"lil")), "lil"),
+    (".npz", parts(shape=np.array([2.5, 3.0])), "'shape' is [2.5, 3.0]"),
+    (".npz", parts(shape=np.array([2, 2**62])), "(2, 4611686018427387904)"),
+    (".npz", parts(indices=np.array([0, -1, 1])), "-1"),
+    (".npz", parts(indices=np.array([0.0, 1.5, 1.0])), "'indices' holds float64"),
+    (".npz", parts(data=np.array([1, np.nan, 2])), "1 NaN"),
+    (".npz", parts(format="bsr", data=np.ones((3, 1, 1)), indices=[0, 9, 1]), "9"),
+    (".npz", b"not an archive at all", "zip"),
+    (".mtx", COORDINATE.replace(b"real", b"complex") + b"2 2 1\n1 1 1 1\n", "complex"),
+    (".mtx", COORDINATE + b"-2 2 1\n1 1 1\n", "Line 2"),
+    (".mtx", COORDINATE + b"9 9 1000000000000\n1 1 1\n", "1000000000000"),
+    (".mtx", COORDINATE + b"9 9 2\n1 1 1.00\n2 2 1.00\n3 3 1.00\n", "3"),
+    (".mtx", COORDINATE + b"900000000000 9 1\n1 1 1\n", "(900000000000, 9)"),
+    (".mtx", COORDINATE.replace(b"general", b"symmetric") + b"2 3 1\n1 3 1\n", "2 x 3"),
+    (".mtx", ARRAY.replace(b"general", b"symmetric") + b"1 3\n1\n1\n1\n", "1 x 3"),
+    (".mtx", ARRAY + b"0 2\n", "0 x 2"),
+    (".mtx", COORDINATE.replace(b"real", b"integer") + b"9 9 1\n1 1 1.5\n", "'1 1 1.5'"),
+    (".mtx", COORDINATE + b"2 2 2\n1 1 1\n1 0 1\n", "Line 4"),
+    *((".mtx", ARRAY + b"1 1\n" + value, f"line 3 is {value!r}") for value in NO_NUMBERS),
+    (".mat", b"MATLAB 4".ljust(600), "7.3"),
+    (".mat", b"MATLAB 5.0 MAT-file".ljust(124) + b"\1\0MI" + bytes(600), "7.3"),
 ]
 
 
-@pytest.mark.parametrize(("extension", "write", "text"), REFUSED)
-def test_what_holds_no_transport_is_refused(tmp_path: Path, extension: str, write: Any, text: str) -> None:
-    write(path := tmp_path / f"T{extension}")
+@pytest.mark.parametrize(("extension", "content", "text"), REFUSED)
+def test_what_holds_no_transport_is_refused(tmp_path: Path, extension: str, content: Any, text: str) -> None:
+    path = tmp_path / f"T{extension}"
+    path.write_bytes(content) if isinstance(content, bytes) else np.savez(path, **content)
     assert text in refusal(path, FileError)
 
 

@@ -12,10 +12,12 @@ import itertools
 import os
 import shutil
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -24,62 +26,31 @@ import ltcl
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
 
-from .stores import (
-    acquire,
-    at_line,
-    contents,
-    fill,
-    in_child,
-    interrupt,
-    kill,
-    make,
-    part,
-    status_of,
-    transport,
-    whole,
-)
+from . import stores
 
 random = np.random.default_rng()
 MOMENTS = int(os.environ.get("LTCL_KILLS", "8"))
-ENDS = {"SIGKILL": (kill, -signal.SIGKILL), "Ctrl-C": (interrupt, 2)}
-
-
-def moments(lines: int) -> list[int]:
-    """Lines at which to end: some, or all."""
-    return sorted(random.choice(lines, min(MOMENTS or lines, lines), replace=False).tolist())
-
-
-def lines_of(work: Callable[[], object]) -> int:
-    """How many lines of ltcl `work` runs through."""
-    reader, writer = os.pipe()
-
-    def counted() -> None:
-        lines = at_line(-1, interrupt)
-        work()
-        os.write(writer, str(lines[0]).encode())
-
-    assert status_of(in_child(counted)) == 0
-    os.close(writer)
-    with os.fdopen(reader) as file:
-        return int(file.read())
+ENDS = {"SIGKILL": (stores.kill, -signal.SIGKILL), "Ctrl-C": (stores.interrupt, 2)}
 
 
 def end_at_lines(folder: Path, prepare: Callable[[Path], object], work: Any, end: str) -> Iterator[Any]:
     """Folder of a store whose `work` (path, report) ended at a line, and the blocks it reported."""
     act, status = ENDS[end]
     prepare(folder / "count" / "T.zarr")
-    lines = lines_of(lambda: work(folder / "count" / "T.zarr", lambda *_: None))
+    trace, count = sys.gettrace(), stores.at_line(-1, act)
+    work(folder / "count" / "T.zarr", lambda *_: None)
+    sys.settrace(trace)
     shutil.rmtree(folder / "count")
-    for line in moments(lines):
+    for line in random.choice(count[0], MOMENTS or count[0], replace=False).tolist():
         path, log = folder / str(line) / "T.zarr", folder / f"{line}.log"
         prepare(path)
         with log.open("wb", buffering=0) as file:
 
             def ended(line: int = line, path: Path = path, write: Any = file.write) -> None:
-                at_line(line + 1, act)
+                stores.at_line(line + 1, act)
                 work(path, lambda *block: write(bytes(block)))
 
-            assert status_of(in_child(ended)) == status, line
+            assert stores.status_of(stores.in_child(ended)) == status, line
         raw = log.read_bytes()
         yield path, set(zip(raw[::2], raw[1::2], strict=True))
         assert os.listdir(path.parent) == ["T.zarr"], line
@@ -88,54 +59,56 @@ def end_at_lines(folder: Path, prepare: Callable[[Path], object], work: Any, end
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What an undisturbed acquisition leaves."""
-    path = tmp_path_factory.mktemp("whole") / "T.zarr"
-    acquire(path)
-    return contents(path)
+    path = tmp_path_factory.mktemp("finished") / "T.zarr"
+    stores.acquire(path)
+    return stores.contents(path)
 
 
-def committed_is_whole(path: Path, reported: set[tuple[int, int]]) -> None:
+def check_committed(path: Path, reported: set[tuple[int, int]]) -> None:
     store = BlockStore.open(path)
     store.verify()
+    expected = [stores.transport(12, 12, channel) for channel in range(3)]
     for channel in range(3 if store.final else 0):
-        np.testing.assert_array_equal(whole(store, channel), transport(12, 12, channel).toarray())
-    if not store.final:
-        assert reported <= store.written
-        for channel, block in store.written:
-            expected = part(store, transport(12, 12, channel), block)
-            np.testing.assert_array_equal(store.block(channel, block).matrix.toarray(), expected.toarray())
+        np.testing.assert_array_equal(stores.rows(store, channel), expected[channel].toarray())
+    assert store.final or reported <= store.written
+    for channel, block in store.written if not store.final else ():
+        columns = stores.batch(store, expected[channel], block).toarray()
+        np.testing.assert_array_equal(store.block(channel, block).matrix.toarray(), columns)
 
 
 @pytest.mark.parametrize("end", ENDS)
 def test_an_acquisition_that_ends_at_any_line(tmp_path: Path, finished: dict[str, str], end: str) -> None:
-    for path, reported in end_at_lines(tmp_path, lambda path: None, acquire, end):
+    for path, reported in end_at_lines(tmp_path, lambda path: None, stores.acquire, end):
         if path.exists():
-            committed_is_whole(path, reported)
-        acquire(path)
-        assert contents(path) == finished
+            check_committed(path, reported)
+        stores.acquire(path)
+        assert stores.contents(path) == finished
 
 
 def test_killed_from_outside(tmp_path: Path, finished: dict[str, str]) -> None:
     path, seconds = tmp_path / "T.zarr", 0.0
     for _ in range(MOMENTS or 100):
         started = time.perf_counter()
-        child = in_child(lambda: acquire(path))
+        child = stores.in_child(lambda: stores.acquire(path))
         time.sleep(float(random.uniform(0, seconds or 1.0)))
         os.kill(child, signal.SIGKILL)
-        if status_of(child) == 0:
+        if stores.status_of(child) == 0:
             seconds = time.perf_counter() - started
         if path.exists():
-            committed_is_whole(path, set())
-            if BlockStore.open(path, "a").final:  # which removes a log that was left
-                assert contents(path) == finished
+            check_committed(path, set())
+            if (store := BlockStore.open(path)).final:
+                store.finalize()  # which removes a log that was left
+                assert stores.contents(path) == finished
                 shutil.rmtree(path)
-    acquire(path)
-    assert contents(path) == finished
+    stores.acquire(path)
+    assert stores.contents(path) == finished
     assert os.listdir(tmp_path) == ["T.zarr"]
 
 
+T = stores.transport(12, 12)
 REPLACING: dict[str, Callable[..., object]] = {
-    "create": lambda path, _: make(path, overwrite=True),
-    "save": lambda path, _: ltcl.save(path, ltcl.Transport(2 * transport(12, 12), (3, 4), on_dark="mask")),
+    "create": lambda path, _: stores.make(path, overwrite=True),
+    "save": lambda path, _: ltcl.save(path, ltcl.Transport(2 * T, (3, 4), on_dark="mask")),
 }
 
 
@@ -143,56 +116,49 @@ REPLACING: dict[str, Callable[..., object]] = {
 @pytest.mark.parametrize("name", REPLACING)
 def test_one_store_is_there_at_every_line_of_replacing_it(tmp_path: Path, name: str, end: str) -> None:
     """The old one or the new one, whole."""
-    good = fill(make(tmp_path / "good.zarr", shape=(12, 12), camera_grid=None)).path
+    good = stores.fill(stores.make(tmp_path / "good.zarr", shape=(12, 12), camera_grid=None)).path
     prepare = functools.partial(shutil.copytree, good)
     for path, _ in end_at_lines(tmp_path, prepare, REPLACING[name], end):
-        store = BlockStore.open(path, "a")
+        store = BlockStore.open(path)
         store.verify()
+        (store.finalize if store.final else store.update)()  # removes what the process left
         assert store.final or (name == "create" and not store.written)
         if store.final:
-            assert abs(whole(store)).max() in (np.float32(2.0), np.float32(4.0))
+            assert abs(stores.rows(store)).max() in (np.float32(2.0), np.float32(4.0))
 
 
 def test_writers_at_once(tmp_path: Path) -> None:
     """Of distinct blocks nothing is lost; of one array one of them wins; after the end all are refused."""
-    path = tmp_path / "T.zarr"
-    store = make(path, shape=(12, 60), grid=(6, 10), camera_grid=(3, 4), block_rows=3)
-    T = transport(12, 60)
+    path, T = tmp_path / "T.zarr", stores.transport(12, 60)
+    store = stores.make(path, shape=(12, 60), grid=(6, 10), camera_grid=(3, 4))
 
     def work(first: int) -> None:
-        own = BlockStore.open(path, "a")
+        own = BlockStore.open(path)
         for block in range(first, 20, 3):
-            own.write(0, block, part(own, T, block))
+            own.write(0, block, stores.batch(own, T, block))
             own.update(**{f"done_{block}": True})
             own.extra("same", np.full(1000, first))
 
-    children = [in_child(lambda first=first: work(first)) for first in range(3)]
-    assert [status_of(child) for child in children] == [0, 0, 0]
+    children = [stores.in_child(lambda first=first: work(first)) for first in range(3)]
+    assert [stores.status_of(child) for child in children] == [0, 0, 0]
     assert len(np.unique(store.extra("same"))) == 1
-    late = BlockStore.open(path, "a")
+    late = BlockStore.open(path)
     store.finalize()
     store.verify()
     assert store.attributes == {f"done_{block}": True for block in range(20)}
-    np.testing.assert_array_equal(whole(store), T.toarray())
+    np.testing.assert_array_equal(stores.rows(store), T.toarray())
     with pytest.raises(FileError, match="final"):
-        late.write(0, 0, part(late, T, 0))
+        late.write(0, 0, stores.batch(late, T, 0))
 
 
 @pytest.mark.parametrize("name", ["write", "replace", "open", "fsync", "mkdir"])
-def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_full_disk_loses_nothing(tmp_path: Path, name: str) -> None:
     """At each call of the system in turn, until the commit gets through."""
-    store = fill(make(tmp_path / "T.zarr"), final=False)
-    before, real = part(store, transport(), 1), getattr(os, name)
+    store = stores.fill(stores.make(tmp_path / "T.zarr"), final=False)
+    before, works = stores.batch(store, stores.transport(), 1), itertools.repeat(mock.DEFAULT)
     for failing in range(60):
-        calls = itertools.count()
-
-        def full(*arguments: Any, calls: Any = calls, failing: int = failing, **options: Any) -> Any:
-            if next(calls) == failing:
-                raise OSError(28, "No space left on device")
-            return real(*arguments, **options)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(os, name, full)
+        calls = itertools.chain([mock.DEFAULT] * failing, [OSError(28, "No space left on device")], works)
+        with mock.patch.object(os, name, wraps=getattr(os, name), side_effect=calls):
             try:
                 store.write(0, 1, 2 * before)
                 store.update(step=1)

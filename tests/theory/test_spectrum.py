@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ltcl import theory
+from ltcl.diagnostics import reciprocity_defect
+from ltcl.errors import InputError
 from ltcl.operators import CSR, Dense, IdentityPlus, as_operator
 from tests.problems import enclosure, lambertian
 
@@ -25,6 +27,13 @@ def test_the_radius_is_that_of_the_eigenvalues(device, rho, density):
     assert found.value == pytest.approx(wanted, rel=5e-3)
     assert found.albedo == pytest.approx(wanted / (1 + wanted), rel=5e-3)  # eq. 14
     assert found.change < 1e-3
+
+
+@pytest.mark.parametrize("call", [theory.spectral_radius, theory.two_norm, reciprocity_defect])
+def test_a_seed_is_checked(device, call):
+    F = {"F": np.ones(4), "entries": 4} if call is reciprocity_defect else {}
+    with pytest.raises(InputError, match="seed is -1"):
+        call(as_operator(np.eye(4), device), **F, seed=-1)
 
 
 @pytest.mark.parametrize("m", [0.1, 0.5, 0.9])

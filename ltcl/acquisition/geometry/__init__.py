@@ -2,7 +2,6 @@
 """Which projector pixel each camera pixel sees, and photographs on the projector's grid.
 
 graycode         patterns, and the coordinates that their photographs give
-subpixel         fractions of a pixel from the edges of stripes
 correspondence   the map; `decode` makes it from photographs
 resample         photographs on the projector's grid: its pixels separated by smaller camera pixels
 sharpness        how much of a pixel's light comes out at its neighbours

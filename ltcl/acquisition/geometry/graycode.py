@@ -15,35 +15,34 @@ much light from elsewhere as from the projector, as in a closed white room, has 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition.radiometry.camera import photographs
+from ltcl.acquisition.radiometry.merge import in_strips
 from ltcl.errors import InputError
 
-_STRIP = 1 << 19  # values of all pictures of a strip of rows: 2 MiB of float32 stay in the cache
+STRIP = 1 << 19  # values of all pictures of a strip of rows: 2 MiB of float32 stay in the cache
 FINE = 4  # bits of an axis whose stripes, 16 pixels and less, count as narrow enough to light evenly
-_SIGMAS = 3.0  # standard deviations of a difference: 1 bit in 400 of noise alone passes
-_WINDOW = 5  # side of the neighbourhood that a coordinate must fit
-_FAR = np.float32(1e9)  # beyond any coordinate
+SIGMAS = 3.0  # standard deviations of a difference: 1 bit in 400 of noise alone passes
+DARK, STEPS = 2e-3, 1.5  # least difference that counts, of the brightest pixel and of the camera's codes
+# Pixels and those next to them, to the right and below.
+ADJACENT = (np.s_[..., :-1], np.s_[..., 1:]), (np.s_[..., :-1, :], np.s_[..., 1:, :])
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One projector coordinate of every camera pixel, arrays (H, W).
+    """One projector coordinate of every camera pixel, arrays (H, W) float32.
 
-    `value` and `width`, float32, are the middle and the length of the interval that is known, in projector
-    pixels with centres at integers: 1 where every bit is certain, 2 on an edge between two stripes, infinite
-    elsewhere. `place`, int32, is the whole coordinate that the brighter pictures give, however faintly.
-    Where it differs by 1 from that of the next pixel, `right` and `below` are the fraction in [0, 1] of the
-    distance at which it changes; NaN elsewhere.
+    `value` and `width` are the middle and the length of the interval that is known, in projector pixels with
+    centres at integers: 1 where every bit is certain, 2 on an edge between two stripes, infinite elsewhere.
+    `place` is the whole coordinate that the brighter pictures give, however faintly. Where it differs by 1
+    from that of the next pixel, `right` and `below` are the fraction in [0, 1] of the distance at which it
+    changes; NaN elsewhere.
     """
 
     value: np.ndarray
@@ -51,13 +50,6 @@ class Axis:
     place: np.ndarray
     right: np.ndarray
     below: np.ndarray
-
-    @classmethod
-    def empty(cls, shape: tuple[int, int]) -> Axis:
-        """To be filled a strip of rows at a time."""
-        value, width = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        right, below = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
-        return cls(value, width, np.zeros(shape, np.int32), right, below)
 
 
 @dataclass(frozen=True)
@@ -99,21 +91,23 @@ class GrayCode:
                 patterns += [plane, 1.0 - plane]
         return [*patterns, np.ones(self.grid, np.float32), np.zeros(self.grid, np.float32)]
 
-    def decode(self, images: Sequence[Any], *, dark: float = 2e-3, edges: bool = True) -> tuple[Axis, Axis]:
-        """x and y of every camera pixel, from photographs (H, W) or (H, W, 3) of `patterns()`, in that order.
+    def decode(
+        self, images: Sequence[Any], *, levels: int | None = None, edges: bool = True
+    ) -> tuple[Axis, Axis]:
+        """x and y of every camera pixel, from photographs of `patterns()`, in that order.
 
-        They are linear or raw; `dark` is the least direct light, relative to the brightest; `edges`: also
-        find where stripes end between pixels. Errors are those of `decode` of the whole map.
+        Arguments and errors are those of `decode` of the whole map; `edges`: also find where stripes end
+        between pixels.
         """
         if len(images) != self.count:
             raise InputError(f"photographs are {len(images)}; they must be {self.count}, one a pattern")
         pictures = photographs("photographs", images)
         pictures = [p.mean(axis=2, dtype=np.float32) if p.ndim == 3 else p for p in pictures]
-        checks.number("dark", dark, least=0.0, below=1.0)
+        dark = DARK if levels is None else max(DARK, STEPS / (checks.count("levels", levels, least=2) - 1))
         step = 1.0 if pictures[0].dtype.kind == "u" else 0.0  # of whole numbers
         least = max(dark * _brightest(pictures), step)
         H, W = pictures[0].shape
-        axes = Axis.empty((H, W)), Axis.empty((H, W))
+        axes = [Axis(*np.full((5, H, W), np.nan, np.float32)) for _ in self.grid]
         fine = [k < FINE for bits in self.bits for k in reversed(range(bits))]
 
         def strip(rows: slice) -> None:
@@ -127,15 +121,15 @@ class GrayCode:
             lit = stack[np.repeat(fine, 2)] if fine else stack
             lowest = np.maximum(lit.min(axis=0), 0.0)
             direct, indirect = lit.max(axis=0) - lowest, 2.0 * lowest
-            threshold = np.maximum(least, _SIGMAS * np.sqrt(2.0 * _variance(pattern, inverse)))
+            threshold = np.maximum(least, SIGMAS * np.sqrt(2.0 * _variance(pattern, inverse)))
             difference = pattern - inverse
             on = difference > 0
             np.abs(difference, out=difference)
             certain = (difference > threshold) & (direct > threshold)
             dim = direct <= indirect
-            for k in range(len(certain)) if dim.any() else ():
-                bright, faint = np.maximum(pattern[k], inverse[k]), np.minimum(pattern[k], inverse[k])
-                certain[k] &= ~dim | ((bright > indirect) & (faint < direct))
+            if dim.any():
+                bright, faint = np.maximum(pattern, inverse), np.minimum(pattern, inverse)
+                certain &= ~dim | ((bright > indirect) & (faint < direct))
             split = self.bits[0]
             for axis, size, own in zip(axes, self.grid[::-1], (np.s_[:split], np.s_[split:]), strict=True):
                 _decode_rows(axis, rows, on[own], certain[own], size)
@@ -143,38 +137,8 @@ class GrayCode:
                 if edges and size > 1:
                     _mark_edges(axis, rows, difference[own])
 
-        in_strips(H, _STRIP // (W * self.count), strip)
-        return axes
-
-
-def in_strips(H: int, rows: int, work: Callable[[slice], None]) -> None:
-    """Do `work` on slices of at most `rows` (at least one) of H rows, in parallel."""
-    strips = [slice(top, min(top + max(rows, 1), H)) for top in range(0, H, max(rows, 1))]
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(strips))) as pool:
-        list(pool.map(work, strips))
-
-
-def consistent(value: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Which of the valid coordinates (H, W) fit their neighbours'.
-
-    The centre of a plane is the median of its 5 x 5 neighbourhood. A pixel may deviate from that by one
-    projector pixel and twice the median absolute deviation of the neighbours, which is large at folds and
-    borders, and must have three valid neighbours (fewer only where the picture is that small).
-    """
-    deviation = np.abs(value - _median(value, valid, -_FAR))
-    # Invalid pixels count as half very near and half very far: they leave the median where it is.
-    spread = np.minimum(_median(deviation, valid, np.float32(0.0)), _FAR / 4)
-    size, border = (_WINDOW, _WINDOW), cv2.BORDER_CONSTANT
-    count = cv2.boxFilter(valid.view(np.uint8), -1, size, normalize=False, borderType=border)
-    return valid & (count > min(3, value.size - 1)) & (deviation <= 1.0 + 2.0 * spread)
-
-
-def _median(value: np.ndarray, valid: np.ndarray, low: np.float32) -> np.ndarray:
-    """Of the valid pixels of each neighbourhood, within one rank; invalid ones are `low` and far in turn."""
-    filled = np.full(value.shape, _FAR)
-    filled[::2, 1::2] = filled[1::2, ::2] = low
-    np.copyto(filled, value, "same_kind", where=valid)
-    return cv2.medianBlur(filled, _WINDOW)
+        in_strips(H, STRIP // (W * self.count), strip)
+        return axes[0], axes[1]
 
 
 def _variance(pattern: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -191,13 +155,15 @@ def _variance(pattern: np.ndarray, inverse: np.ndarray) -> np.ndarray:
 
 
 def _decode_rows(axis: Axis, rows: slice, on: np.ndarray, certain: np.ndarray, size: int) -> None:
-    """Coordinates of some rows, from the bits (B, rows, W)."""
-    code, undecided = _number(on), _number(~certain)
-    low, other = _position(code), _position(code ^ undecided)
-    edge = (undecided != 0) & (undecided & (undecided - 1) == 0) & (np.abs(low - other) == 1)
-    value = np.where(edge, low + other, 2 * low) * np.float32(0.5)
-    width = np.where(edge, np.float32(2.0), np.float32(1.0))
-    width[(undecided != 0) & ~edge | (value > size - 1)] = np.inf
+    """Coordinates of some rows, from the bits (B, rows, W), highest first."""
+    n = np.arange(1 << len(on))
+    places = np.argsort(n ^ (n >> 1)).astype(np.float32)  # of codes
+    powers = np.exp2(np.arange(len(on))[::-1], dtype=np.float32)
+    code, flips = (np.tensordot(powers, bits, 1).astype(np.int32) for bits in (on, ~certain))
+    low, other = places.take(code), places.take(code ^ flips)
+    distance = np.abs(low - other)  # 1 where one bit is undecided, on an edge
+    value = np.where(distance == 1, 0.5 * (low + other), low)
+    width = np.where((distance > 1) | (value > size - 1), np.inf, distance + 1)
     axis.value[rows], axis.width[rows], axis.place[rows] = value, width, low
 
 
@@ -207,40 +173,18 @@ def _mark_edges(axis: Axis, rows: slice, difference: np.ndarray) -> None:
     Albedo scales both pictures alike, and blur is even about an edge: neither moves the zero. At an edge of
     two neighbouring columns n - 1 and n only the bit of the lowest one in n flips.
     """
-    low, W = axis.place[rows].ravel(), axis.place.shape[1]
-    n = np.arange(1 << len(difference))
-    flips = len(difference) - np.frexp((n & -n).astype(np.float64))[1]  # highest bit first
-    for fractions, step in ((axis.right[rows], 1), (axis.below[rows], W)):
-        site = np.flatnonzero(np.abs(low[step:] - low[:-step]) == 1)
-        if step == 1 < W:
-            site = site[site % W != W - 1]  # the next pixel is the first of the next row
+    low, n = axis.place[rows].astype(np.int32), np.arange(1 << len(difference))
+    flips = len(difference) - np.frexp(n & -n)[1]  # highest bit first
+    sides = zip((axis.right[rows], axis.below[rows]), (1, low.shape[1]), ADJACENT, strict=True)
+    for fractions, step, (here, there) in sides:
+        changes = np.zeros(low.shape, bool)
+        changes[here] = np.abs(low[there] - low[here]) == 1
+        site = np.flatnonzero(changes)
         index = flips.take(np.maximum(low.take(site), low.take(site + step))) * low.size + site
         before, after = difference.take(index), difference.take(index + step)
         total = before + after
         total[total <= 0] = np.nan
         fractions.ravel()[site] = before / total
-
-
-def _number(bits: np.ndarray) -> np.ndarray:
-    """Bits (B, ...), highest first, as whole numbers; bytes at a time, which is four times as fast."""
-    code = np.zeros(bits.shape[1:], np.int32)
-    for start in range(0, len(bits), 8):
-        group = bits[start : start + 8].view(np.uint8)
-        byte = group[0].copy()
-        for bit in group[1:]:
-            byte <<= 1
-            byte |= bit
-        code <<= len(group)
-        code |= byte
-    return code
-
-
-def _position(code: np.ndarray) -> np.ndarray:
-    """The place of a Gray code: b = g ^ g >> 1 ^ g >> 2 ..."""
-    place = code.copy()
-    for shift in (1, 2, 4, 8, 16):
-        place ^= place >> shift
-    return place
 
 
 def _brightest(pictures: list[np.ndarray]) -> float:

@@ -8,8 +8,9 @@ A camera pixel m shows the mean over its footprint, so with p the radiance of pr
 where the second term is what an error of the map does to pixels that straddle. Regularised least squares,
 `(C^T V^-1 C + I) p = C^T V^-1 c`, is solved for each pixel with its neighbours, 5 x 5; pixels just outside
 the projector's grid are unknown, too. Entries below a thousandth of a row's largest are dropped, and rows sum
-to one. A pixel that camera pixels do not separate from its neighbours is interpolated: a mean of those that
-see it, by the part of a tent over twice their footprint that lies in it.
+to one; a pixel that camera pixels do not separate from its neighbours is not seen. Where most are larger than
+0.85 of the projector's, a pixel is a mean of those that see it, by the part of a tent over twice their
+footprint that lies in it.
 
 A dark pixel next to a bright one, of which few camera pixels were decoded, would be a small difference of two
 large numbers: where what its weights take away of white is more than 0.7 of what they add, errors are
@@ -37,17 +38,16 @@ from ltcl.errors import InputError
 # In brackets: the error of pictures of noise with 2 camera pixels to a side and an exact map, measured.
 NOISE, MAP = 0.02, 0.1  # S and K, of the light (S half, twice: 0.9 %; K half: 0.8 %, twice: 1.1 %)
 REACH = 2  # pixels to each side that are solved together (1: 1.0 %, 2 and 3: 0.9 %)
-SIDE = 2 * REACH + 1
 POINTS = 8  # of a footprint, to each side (4: 1.2 %, 8: 0.9 %, 16: 0.6 % in four times the time)
 RIM = REACH + 1  # unknown pixels around the grid, and what a window reads around these
 LEAST = 0.001  # of the largest weight of a row (0: 0.9 %, 0.01: 1.2 %)
 AT_ONCE = 1 << 12  # pixels solved, or camera pixels cast on the grid: 20 MB of 25 x 25 systems
 BREAK = 2.5  # times the other difference: one that crosses the border of an object (perspective: below 1.1)
 WIDEST = 6.0  # times the median: what no camera pixel spans on a surface that it sees at less than 80 degrees
-FINE = 0.85  # length of a camera pixel in projector pixels: above, least squares have 10 % of error and more
-RESOLVED = 0.9  # part of the answer of least squares that is a pixel's own light
+SEPARABLE = 0.85  # length of a camera pixel in projector pixels: above, least squares err by 10 % and more
+RESOLVED = 0.9  # part of the answer of least squares that is a pixel's own light; with less it is not seen
 NEGATIVE = 0.7  # of what is added under white: more of it taken away leaves nothing that is known
-AREA, HALF = 0.15, 0.5  # of its area, where it is resolved (less may be an error of the map), and where not
+AREA, HALF = 0.15, 0.5  # of a pixel's area, seen where it is separated (less: an error of the map), where not
 
 
 @dataclass(frozen=True)
@@ -73,34 +73,27 @@ class Resampling:
     @classmethod
     def of(cls, mapping: Correspondence) -> Resampling:
         """The resampling by a measured map; InputError where no two neighbouring pixels of it are valid."""
-        if not isinstance(mapping, Correspondence):
-            raise InputError(f"mapping is a {type(mapping).__name__}; it must be a Correspondence")
         footprints = Footprints.of(mapping)
         if not footprints.known.any():
             raise InputError("mapping has no two valid neighbours; the size of a camera pixel is unknown")
         C, pixels = footprints.shares(), inner(mapping.grid)
         coverage = np.asarray(np.abs(np.linalg.det(footprints.J)).ravel() @ C)[pixels]
-        blurred = coverage >= HALF
-        matrix = scipy.sparse.csr_array((len(pixels), mapping.valid.size))
-        if footprints.width < FINE:
-            weights, resolved = _unmix(C, footprints)
-            resolved &= coverage >= AREA
-            matrix, blurred = _rows(resolved) @ weights, blurred & ~resolved
-        coverage = np.where((matrix.sum(axis=1) > 0) | blurred, np.minimum(coverage, 1.0), 0.0)
-        if blurred.any():
-            matrix = matrix + _normalised(_rows(blurred) @ footprints.shares(tent=True)[:, pixels].T)
-        matrix = scipy.sparse.csr_array(matrix, dtype=np.float32)
+        if footprints.width < SEPARABLE:
+            matrix, least = _unmix(C, footprints), AREA
+        else:
+            matrix, least = _normalised(footprints.shares(tent=True)[:, pixels].T), HALF
+        seen = (coverage >= least) & (np.asarray(matrix.sum(axis=1)).ravel() > 0)
+        matrix = scipy.sparse.csr_array(_rows(seen) @ matrix, dtype=np.float32)
         matrix.eliminate_zeros()
         matrix.sort_indices()
-        coverage = coverage.reshape(mapping.grid).astype(np.float32)
+        coverage = np.where(seen, np.minimum(coverage, 1.0), 0.0).reshape(mapping.grid).astype(np.float32)
         return cls(matrix, coverage, mapping.grid, mapping.camera_grid)
 
     @classmethod
     def aligned(cls, grid: tuple[int, int]) -> Resampling:
         """The identity: the camera already on the projector's grid."""
         h, w = checks.grid("grid", grid)
-        identity = scipy.sparse.csr_array(_rows(np.ones(h * w)))
-        return cls(identity, np.ones((h, w), np.float32), (h, w), (h, w))
+        return cls(scipy.sparse.csr_array(_rows(np.ones(h * w))), np.ones((h, w), np.float32), (h, w), (h, w))
 
     def ascertained(self, white: Any, valid: Any) -> Resampling:
         """The same without pixels that would be small differences of large numbers.
@@ -167,14 +160,11 @@ class Footprints:
         """
         x = np.stack([mapping.x, mapping.y], axis=-1).astype(np.float64)  # NaN where not valid
         (du, both_u), (dv, both_v) = _slope(x, 1), _slope(x, 0)
-        turned = np.array([1.0, -1.0])
-        squares = dv[..., ::-1] * turned, du[..., ::-1] * -turned
-        J = np.stack([np.where(np.isnan(d), s, d) for d, s in zip((du, dv), squares, strict=True)], axis=-1)
-        for axis, n in enumerate(mapping.grid[::-1]):
-            if n == 1:
-                J[..., axis, :] = J[..., 1 - axis, ::-1] * turned
-        known = mapping.valid & np.isfinite(J).all(axis=(2, 3))
-        J = np.where(known[..., None, None], J, 0.0)
+        J = np.stack([du, dv], axis=-1)
+        J[:, :, np.equal(mapping.grid[::-1], 1)] = np.nan
+        # What is missing, of a square: Cauchy and Riemann's equations.
+        J = np.nan_to_num(np.where(np.isnan(J), J[..., ::-1, ::-1] * [[1, -1], [-1, 1]], J))
+        known = np.linalg.det(J) != 0
         span = np.abs(J).max(axis=(2, 3))
         if known.any():
             known &= span <= WIDEST * np.median(span[known])
@@ -190,31 +180,28 @@ class Footprints:
 
         With `tent`, of twice the footprint, less towards its border: as bilinear interpolation weighs.
         """
-        mapping, known = self.mapping, self.known
-        h, w = mapping.grid
-        width, pixels = w + 2 * RIM, np.flatnonzero(known)
-        points = 2 * POINTS if tent else POINTS
+        h, w = self.mapping.grid
+        width, points = w + 2 * RIM, 2 * POINTS if tent else POINTS
         i, j = (place.ravel() for place in np.mgrid[:points, :points])
         # Sheared: no two points lie on one line along a side, which a border may be, too.
         du, dv = ((a + (b + 0.5) / points) / points - 0.5 for a, b in ((i, j), (j, i)))
         if tent:
             du, dv = (np.copysign(1.0 - np.sqrt(1.0 - 2.0 * np.abs(d)), d) for d in (du, dv))
-        x, y, slopes = (values.reshape(known.size, -1)[pixels] for values in (mapping.x, mapping.y, self.J))
-        counts = np.zeros(known.size, np.int64)
-        columns, values = [], []
-        for start in range(0, len(pixels), AT_ONCE):
+        known = self.known.ravel()
+        x, y = (np.where(self.known, c, 0.0).ravel() for c in (self.mapping.x, self.mapping.y))
+        J, shares = self.J.reshape(-1, 4), []
+        for start in range(0, known.size, AT_ONCE):
             some = slice(start, start + AT_ONCE)
-            xu, xv, yu, yv = slopes[some].T[..., None]
-            i = np.clip(np.rint(x[some] + xu * du + xv * dv), -1, w).astype(np.int64) + RIM
-            j = np.clip(np.rint(y[some] + yu * du + yv * dv), -1, h).astype(np.int64) + RIM
-            place = np.sort(j * width + i, axis=1)
-            first = np.diff(place, axis=1, prepend=-1) != 0
-            counts[pixels[some]] = first.sum(axis=1)
-            columns.append(place[first])
-            values.append(np.diff(np.append(np.flatnonzero(first), first.size)) / points**2)
-        indptr = np.concatenate([[0], np.cumsum(counts)])
-        shape = (known.size, (h + 2 * RIM) * width)
-        return scipy.sparse.csr_array((np.concatenate(values), np.concatenate(columns), indptr), shape=shape)
+            xu, xv, yu, yv = J[some].T[..., None]
+            i = np.clip(np.rint(x[some, None] + xu * du + xv * dv), -1, w).astype(np.int32) + RIM
+            j = np.clip(np.rint(y[some, None] + yu * du + yv * dv), -1, h).astype(np.int32) + RIM
+            place = (j * width + i)[known[some]]
+            indptr = np.append(0, np.cumsum(known[some], dtype=np.int32) * points**2)
+            ones = np.full(place.size, 1.0 / points**2)
+            chunk = scipy.sparse.csr_array((ones, place.ravel(), indptr), (len(i), (h + 2 * RIM) * width))
+            chunk.sum_duplicates()
+            shares.append(chunk)
+        return scipy.sparse.csr_array(scipy.sparse.vstack(shares))
 
 
 def inner(grid: tuple[int, int]) -> np.ndarray:
@@ -237,39 +224,28 @@ def _slope(x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0), count[..., 0] == 2
 
 
-def _unmix(C: scipy.sparse.csr_array, footprints: Footprints) -> tuple[scipy.sparse.csr_array, np.ndarray]:
-    """Rows of weights of all projector pixels by least squares, (N, M); which pixels they separate, (N,)."""
+def _unmix(C: scipy.sparse.csr_array, footprints: Footprints) -> scipy.sparse.csr_array:
+    """Weights of camera pixels for all projector pixels by least squares, (N, M)."""
     h, w = footprints.mapping.grid
     mixed = C.copy()
     mixed.data *= 1.0 - mixed.data
-    blurred = mixed.sum(axis=1) + footprints.straddling.ravel()
+    blurred = np.asarray(mixed.sum(axis=1)).ravel() + footprints.straddling.ravel()
     back = (C * (1.0 / (NOISE**2 + MAP**2 * blurred))[:, None]).T.tocsr()  # C^T V^-1
-    width, pixels = w + 2 * RIM, inner((h, w))
-    # Bands G[n, n + offset] of C^T V^-1 C, for the offsets of a window.
-    G = (back @ C).tocoo()
-    bands = np.zeros(((h + 2 * RIM) * width, SIDE, SIDE))
-    n, other = G.coords
-    dj, di = other // width - n // width + REACH, other % width - n % width + REACH
-    near = (np.abs(dj - REACH) <= REACH) & (np.abs(di - REACH) <= REACH)
-    bands[n[near], dj[near], di[near]] = G.data[near]
-    # Rows of (G + I)^-1 within the window of each pixel; (G + I)^-1 G has the diagonal 1 - Z_nn.
-    j, i = (place.ravel() for place in np.mgrid[:SIDE, :SIDE] - REACH)
-    dj, di = (np.subtract.outer(place, place).T + REACH for place in (j, i))  # from a to b
-    near = (dj >= 0) & (dj < SIDE) & (di >= 0) & (di < SIDE)
-    dj, di = np.where(near, dj, 0), np.where(near, di, 0)
-    centre, unit = SIDE * SIDE // 2, np.eye(SIDE * SIDE)
-    weights, resolved = [], []
+    G, pixels, steps = (back @ C).tocsr(), inner((h, w)), np.arange(-REACH, REACH + 1)
+    window = np.add.outer(steps * (w + 2 * RIM), steps).ravel()
+    n, unit, weights = len(window), np.eye(len(window)), []
+    G.sort_indices()  # entries are found three times as fast
     for start in range(0, h * w, AT_ONCE):
-        places = pixels[start : start + AT_ONCE, None] + j * width + i
-        local = bands[places[..., None], dj, di] * near
-        Z = np.linalg.solve(local + unit, unit[:, [centre]])[..., 0]
-        indptr = np.arange(0, Z.size + 1, SIDE * SIDE)
-        rows = scipy.sparse.csr_array((Z.ravel(), places.ravel(), indptr), shape=(len(Z), len(bands))) @ back
+        places = pixels[start : start + AT_ONCE, None] + window
+        local = G[np.repeat(places, n, axis=1), np.tile(places, n)].toarray().reshape(-1, n, n)
+        Z = np.linalg.solve(local + unit, unit[:, [n // 2]])[..., 0]  # rows of (G + I)^-1
+        Z *= 1.0 - Z[:, [n // 2]] >= RESOLVED  # (G + I)^-1 G has the diagonal 1 - Z_nn
+        entries = Z.ravel(), places.ravel(), np.arange(0, Z.size + 1, n)
+        rows = scipy.sparse.csr_array(entries, (len(Z), G.shape[0])) @ back
         least = LEAST * np.asarray(abs(rows).max(axis=1).todense()).ravel()
         rows.data[np.abs(rows.data) < np.repeat(least, np.diff(rows.indptr))] = 0.0
         weights.append(_normalised(rows))
-        resolved.append(1.0 - Z[:, centre] >= RESOLVED)
-    return scipy.sparse.csr_array(scipy.sparse.vstack(weights)), np.concatenate(resolved)
+    return scipy.sparse.csr_array(scipy.sparse.vstack(weights))
 
 
 def _normalised(rows: scipy.sparse.csr_array) -> scipy.sparse.csr_array:

@@ -24,16 +24,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
 
 from ltcl.acquisition.geometry.correspondence import Correspondence
 from ltcl.acquisition.geometry.graycode import FINE, GrayCode
-from ltcl.acquisition.geometry.resample import Footprints, Resampling, inner
+from ltcl.acquisition.geometry.resample import SEPARABLE, Footprints, Resampling
 from ltcl.errors import AcquisitionError
 
 logger = logging.getLogger(__name__)
 BAD, HOPELESS = 0.035, 0.3  # blur from which there is a warning (a sharp camera has 1 to 2 %), and a refusal
 OF_MAP = 0.07  # q of errors of the map, of camera pixels as wide as the projector's: measured, above
+OF_MEANS = 13 / 32  # q of means by a tent: E |a + b + c|, even in [-1/2, 1/2] (footprint: a, tent: b + c)
 _LEAST = 3  # patterns that determine l and q
 
 
@@ -54,10 +54,10 @@ class Sharpness:
     @classmethod
     def of(cls, mapping: Correspondence, R: Resampling, light: Sequence[np.ndarray] = ()) -> Sharpness:
         """By photographs (H, W[, c]) of Gray code, linear in light; without and of small grids by the map."""
-        footprints = Footprints.of(mapping)
+        width = Footprints.of(mapping).width
+        by_map = min(OF_MEANS * width, 1.0) if width >= SEPARABLE else 0.0
         y, x = (_leak(R, light, axis) for axis in (0, 1))
-        leak = _leak_of_map(R, footprints) if y is None or x is None else (y, x)
-        return cls(leak, footprints.width)
+        return cls((by_map, by_map) if y is None or x is None else (y, x), width)
 
     def of_blocks(self, side: int) -> Sharpness:
         """Of blocks of `side` x `side` pixels: less of their light crosses a border."""
@@ -114,24 +114,11 @@ def _leak(R: Resampling, light: Sequence[np.ndarray], axis: int) -> float | None
     if len(fine) < _LEAST or len(light) < last or not seen.any():
         return None
     patterns = code.patterns()
-    b = np.moveaxis(np.stack([2.0 * patterns[k] - 1.0 for k in fine]), 1 + axis, -1)
+    b = np.stack([2.0 * patterns[k].take(0, 1 - axis) - 1.0 for k in fine], axis=-1)  # (n, patterns)
+    A = np.stack([b[1:-1], (b[:-2] + b[2:]) / 2], axis=-1)
     D = np.stack([R.apply(light[k] - light[k + 1]).reshape(*R.grid, -1).mean(axis=-1) for k in fine])
-    D = np.moveaxis(D, 1 + axis, -1)[..., 1:-1]  # (patterns, rows, columns)
-    A = np.stack([b[..., 1:-1], (b[..., :-2] + b[..., 2:]) / 2], axis=-1)
-    G, y = np.einsum("krci,krcj->rcij", A, A)[seen], np.einsum("krci,krc->rci", A, D)[seen]
-    z = np.linalg.solve(G, y[..., None])[..., 0]  # l (1 - q), l q
-    l = z.sum(axis=1)
+    D = np.moveaxis(D, 1 + axis, -1)[..., 1:-1]  # (patterns, lines, n - 2)
+    z = np.einsum("nik,kjn->ijn", np.linalg.pinv(A), D)[:, seen]  # l (1 - q), l q
+    l = z.sum(axis=0)
     lit = l > 0
-    return float(np.clip(np.median(z[lit, 1] / l[lit]), 0.0, 1.0)) if lit.any() else None
-
-
-def _leak_of_map(R: Resampling, footprints: Footprints) -> tuple[float, float]:
-    """q along y and x by what camera pixels cover: of a lens in focus."""
-    h, w = R.grid
-    B = scipy.sparse.coo_array(R.weights.astype(np.float64) @ footprints.shares()[:, inner(R.grid)])
-    (n, m), seen = B.coords, R.seen.ravel()
-    y, x = (
-        float(np.clip(np.median(np.bincount(n, B.data * away, h * w)[seen]), 0.0, 1.0))
-        for away in (n // w != m // w, n % w != m % w)
-    )
-    return y, x
+    return float(np.clip(np.median(z[1, lit] / l[lit]), 0.0, 1.0)) if lit.any() else None

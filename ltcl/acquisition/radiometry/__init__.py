@@ -13,12 +13,11 @@ from __future__ import annotations
 
 from ltcl.acquisition.radiometry.camera import NoiseModel, black_level, estimate
 from ltcl.acquisition.radiometry.merge import Radiance, merge
-from ltcl.acquisition.radiometry.projector import ProjectorResponse, mixing, projector_response
+from ltcl.acquisition.radiometry.projector import mixing, projector_response
 from ltcl.acquisition.radiometry.response import Response, calibrate
 
 __all__ = [
     "NoiseModel",
-    "ProjectorResponse",
     "Radiance",
     "Response",
     "black_level",

@@ -15,7 +15,7 @@ deviations); a pixel whose photographs are saturated or at the lowest code is in
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,7 +29,7 @@ from ltcl.acquisition.radiometry.response import Response
 from ltcl.errors import InputError
 
 _MARGIN = 2.0  # standard deviations: clipping there moves a mean by less than a hundredth of one
-_BLOCK = 1 << 15  # pixels at once: 128 KiB of float32, which six exposures keep in a cache of 1 MiB
+_BLOCK = 1 << 14  # pixels at once: 64 KiB of float32, which six exposures keep in a cache of 1 MiB
 _VALUES = 4096  # linear values that weights are tabulated at: photon noise changes by 1 % from 0.02 on
 _TINY = np.float32(1e-30)  # instead of a division by zero
 
@@ -88,22 +88,26 @@ def merge(
     planes = [np.empty((pixels, channels), dtype) for dtype in (np.float32, np.float32, bool)]
     mergers = [_Channel(bracket, response, noise, level, c) for c, level in enumerate(offset)]
 
-    def run(block: tuple[int, int]) -> None:
-        rows, c = slice(block[0], block[0] + _BLOCK), block[1]
-        for plane, values in zip(planes, mergers[c](rows), strict=True):
-            plane[rows, c] = values
+    def run(rows: slice) -> None:
+        for c, merge_channel in enumerate(mergers):
+            for plane, values in zip(planes, merge_channel(rows), strict=True):
+                plane[rows, c] = values
 
-    blocks = [(start, c) for start in range(0, pixels, _BLOCK) for c in range(channels)]
-    if len(blocks) == 1:  # a thread takes longer to start than a small picture to merge
-        run(blocks[0])
-    else:
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(run, blocks))
+    in_strips(pixels, _BLOCK, run)
     return Radiance(*(plane.reshape(bracket.shape) for plane in planes))
 
 
+def in_strips(H: int, rows: int, work: Callable[[slice], None]) -> None:
+    """Do `work` on slices of at most `rows` (at least one) of H rows, in parallel."""
+    strips = [slice(top, min(top + max(rows, 1), H)) for top in range(0, H, max(rows, 1))]
+    if len(strips) == 1:  # a thread takes longer to start than a small picture to merge
+        return work(strips[0])
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(work, strips))
+
+
 class _Channel:
-    """Merges blocks of pixels of one channel, arrays (pixels,), by tables that are made once."""
+    """Merges blocks of pixels of one channel, arrays (K, pixels) of K exposures, by tables made once."""
 
     def __init__(
         self, bracket: Stack, response: Response, noise: NoiseModel, black: np.float32, c: int
@@ -111,59 +115,50 @@ class _Channel:
         self.response = Response(response.values[c % response.channels])
         self.black, self.saturation = black, np.float32(noise.saturation)
         self.images = [image[:, c] for image in bracket.images]
-        self.t = [np.float32(t) for t in bracket.seconds]
+        self.t = bracket.seconds.astype(np.float32)[:, None]
         self.table = self.response.linear(np.linspace(0.0, 1.0, max(bracket.levels, 2)))
-        # Of whole codes the lowest is 0; floats have no end there.
-        self.lowest = self.table[0] if bracket.levels else np.float32(-np.inf)
+        # Above black. Of whole codes the lowest is 0; floats have no end there.
+        self.lowest = self.table[0] - black if bracket.levels else np.float32(-np.inf)
         x = np.linspace(0.0, 1.0, _VALUES)
         slope = self.response.derivative(self.response.codes(x + black))
         variance = replace(noise, levels=bracket.levels).variance(x, slope)
         self.weights = (1.0 / variance).astype(np.float32)  # of the value x above black
         low, high = _MARGIN * np.sqrt(variance[[0, -1]]).astype(np.float32)
-        # Values above black whose noise is clipped at neither end.
-        self.clear = self.lowest + low - black, self.saturation - high - black
+        # Radiance whose noise is clipped at neither end of an exposure.
+        self.clear = (self.lowest + low) / self.t, (self.saturation - high - black) / self.t
 
     def __call__(self, pixels: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Value, variance and validity of some pixels."""
-        light = [self._linear(image[pixels]) for image in self.images]
-        unsaturated = [value <= self.saturation for value in light]
-        dark = [value <= self.lowest for value in light]
-        light = [(value - self.black) * usable for value, usable in zip(light, unsaturated, strict=True)]
-        time = sum(s * t for s, t in zip(unsaturated, self.t, strict=True))
-        pilot = sum(light) / np.maximum(time, _TINY)
-        low, high = self.clear
-        clear = [s & (pilot > low / t) & (pilot < high / t) for s, t in zip(unsaturated, self.t, strict=True)]
+        light = self._linear(np.stack([image[pixels] for image in self.images]))
+        unsaturated = light <= self.saturation
+        light -= self.black
+        light *= unsaturated
+        pilot = light.sum(axis=0) / np.maximum(np.einsum("kn,k->n", unsaturated, self.t[:, 0]), _TINY)
+        clear = unsaturated & (pilot > self.clear[0]) & (pilot < self.clear[1])
         L, precision = self._mean(pilot, clear, light)
-        valid = precision > 0
-        rest = np.flatnonzero(~valid)
+        rest = np.flatnonzero(precision == 0)
         if len(rest):
-            unclear = [[array[rest] for array in arrays] for arrays in (unsaturated, light)]
-            L[rest], precision[rest] = self._mean(pilot[rest], *unclear)
-            valid[rest] = np.any([s[rest] & ~d[rest] for s, d in zip(unsaturated, dark, strict=True)], axis=0)
-        variance = np.float32(1.0) / np.maximum(precision, _TINY)
-        if not valid.all():
-            L[~valid], variance[~valid] = 0.0, np.inf
-        return L, variance, valid
+            L[rest], precision[rest] = self._mean(pilot[rest], unsaturated[:, rest], light[:, rest])
+            precision[rest] *= (unsaturated & (light > self.lowest))[:, rest].any(axis=0)
+        valid = precision > 0
+        variance = np.where(valid, 1.0 / np.maximum(precision, _TINY), np.float32(np.inf))
+        return L * valid, variance, valid
 
     def _linear(self, codes: np.ndarray) -> np.ndarray:
         """Linear values, black still in them."""
         if codes.dtype.kind == "f":
             return self.response.linear(codes)
         if codes.dtype == np.uint8 and len(self.table) == 256:
-            return cv2.LUT(np.ascontiguousarray(codes), self.table).ravel()
+            return cv2.LUT(codes, self.table)
         return self.table.take(codes)
 
     def _mean(
-        self, pilot: np.ndarray, usable: list[np.ndarray], light: list[np.ndarray]
+        self, pilot: np.ndarray, usable: np.ndarray, light: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """L and sum w t^2, by the weights that the pilot predicts."""
-        total, precision = np.zeros_like(pilot), np.zeros_like(pilot)
-        for t, counts, value in zip(self.t, usable, light, strict=True):
-            place = (pilot * (t * np.float32(_VALUES - 1))).astype(np.int32)
-            weight = self.weights.take(place, mode="clip")
-            weight *= counts
-            weight *= t
-            precision += weight * t
-            weight *= value
-            total += weight
-        return total / np.maximum(precision, _TINY), precision
+        place = (self.t * (pilot * np.float32(_VALUES - 1))).astype(np.int32)
+        weight = self.weights.take(place, mode="clip")
+        weight *= usable
+        weight *= self.t
+        precision = np.einsum("kn,k->n", weight, self.t[:, 0])
+        return np.einsum("kn,kn->n", weight, light) / np.maximum(precision, _TINY), precision

@@ -20,7 +20,6 @@ one for the set-up. Known limit: it is the mean over surfaces, but what mixes de
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -37,15 +36,7 @@ _TABLE = 1025  # four values for each code of 8 bits
 _SIGNIFICANT = 3.0  # standard errors that white must be above black: one black projector in 700 passes
 
 
-@dataclass(frozen=True, repr=False, eq=False)
-class ProjectorResponse(Response):
-    """Tables from codes in [0, 1] to linear light in [0, 1], as those of a camera.
-
-    `linear(codes)` is the light of codes; `codes(linear)`, for the projector, inverts it.
-    """
-
-
-def projector_response(codes: Any, channels: Sequence[Sequence[Radiance]]) -> ProjectorResponse:
+def projector_response(codes: Any, channels: Sequence[Sequence[Radiance]]) -> Response:
     """The response from merged pictures of the scene under uniform codes, which rise from 0 to 1.
 
     `channels` holds one sequence of pictures, with all channels of the projector lit at once, or three, each
@@ -60,7 +51,7 @@ def projector_response(codes: Any, channels: Sequence[Sequence[Radiance]]) -> Pr
     if levels.ndim != 1 or len(levels) < 2 or np.any(np.diff(levels) <= 0) or levels[0] or levels[-1] != 1:
         raise InputError(f"codes is {codes!r}; it must rise from 0 to 1")
     tables = [_table(levels, pictures, f"channels[{c}]") for c, pictures in enumerate(channels)]
-    return ProjectorResponse(np.stack(tables))
+    return Response(np.stack(tables))
 
 
 def _table(codes: np.ndarray, pictures: Sequence[Radiance], name: str) -> np.ndarray:

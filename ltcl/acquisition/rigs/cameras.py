@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Cameras of a `LiveRig`: `OpenCVCamera`, whatever OpenCV opens; `GPhoto2Camera`, one on a cable (gphoto2).
 
-Backends of OpenCV differ: V4L2 (Linux) counts exposure in units of 100 microseconds and calls manual exposure
-1; Media Foundation and DirectShow (Windows) count in powers of two of a second and call it 0. A camera behind
-another backend, a file or a stream has the one exposure that its user states. libgphoto2 names settings after
-the camera's maker, so several names are tried. What adapts in spite of its settings is found by `survey`.
+Of OpenCV's backends V4L2 (Linux) sets exposures, in units of 100 microseconds; behind others a camera has the
+one that its user states. What adapts all the same is found by the tests of `LiveRig`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import re
 import tempfile
@@ -23,14 +20,13 @@ import cv2
 import numpy as np
 
 from ltcl import checks
-from ltcl.acquisition.rig import LONGEST, SHORTEST, Closing, as_seconds, exact, load_extra
+from ltcl.acquisition.rig import LONGEST, SHORTEST, Closing, exact, load_extra
 from ltcl.acquisition.rigs.folder import read_photograph
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 
-_MANUAL_EXPOSURE = {"V4L2": 1.0, "MSMF": 0.0, "DSHOW": 0.0}  # by the backend
-_POWERS = tuple(2.0**k for k in range(-13, 1))
+_MANUAL_EXPOSURE = 1.0  # V4L2's value of it
 _SIDES = (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH)
-_TOLERANCE = 0.05  # relative difference of an exposure read back that rounding to the camera's steps explains
+_TOLERANCE = 0.05  # relative difference of an exposure that is read back: cameras round to their steps
 _UNKNOWN = -1.0  # OpenCV's value of a property that the camera does not have
 _SHUTTER = ("shutterspeed2", "shutterspeed")  # the first, where both are there, is not rounded
 _MANUAL = {"autoexposuremode": ("Manual",), "expprogram": ("M", "Manual")}
@@ -39,19 +35,14 @@ _AUTOMATIC = re.compile(r"\s*(auto|on\b|bulb)", re.IGNORECASE)
 
 
 class OpenCVCamera(Closing):
-    """A camera (its number, from 0), a video file or a stream ("rtsp://...") that `cv2.VideoCapture` opens.
+    """A camera (its number, from 0) or a stream ("rtsp://...") that `cv2.VideoCapture` opens.
 
-    One channel is the green one. `seconds` is the exposure of a camera whose exposure cannot be set, needed
-    for files, streams and unknown backends; `size`, (H, W), is that of frames to ask for. Automatic exposure
-    and white balance are switched off where there are such settings: AcquisitionError for a camera that keeps
-    them, cannot be opened, or gives frames of another size.
-
-    Examples
-    --------
-    >>> OpenCVCamera("none.avi", seconds=1 / 30)
-    Traceback (most recent call last):
-    ltcl.errors.AcquisitionError: OpenCV cannot open 'none.avi'; it is no camera, video or stream
+    One channel is the green one. `seconds` is the exposure where it cannot be set, of streams and without
+    V4L2; `size` is (H, W). AcquisitionError for a camera that cannot be opened, keeps automatic exposure or
+    white balance, or gives frames of another size.
     """
+
+    stream = True
 
     def __init__(
         self,
@@ -63,43 +54,36 @@ class OpenCVCamera(Closing):
     ) -> None:
         self.channels = checks.one_of("channels", channels, (1, 3))
         if not isinstance(source, int | str | os.PathLike):
-            raise InputTypeError(f"source is {source!r}; it must be the number of a camera, a file or a URL")
+            raise InputTypeError(f"source is {source!r}; it must be the number of a camera or a URL")
         self.source = source if isinstance(source, int) else os.fspath(source)
-        self.stream = isinstance(source, int) or not os.path.isfile(source)
-        self.exposures = None if seconds is None else (as_seconds(seconds),)
+        self.exposures = None if seconds is None else (checks.number("seconds", seconds, above=0.0),)
         self.limits = SHORTEST, LONGEST
         size = None if size is None else checks.grid("size", size)
         self._capture = cv2.VideoCapture(self.source)
         with self._closed_on_error():
             if not self._capture.isOpened():
-                raise AcquisitionError(
-                    f"OpenCV cannot open {self.source!r}; it is no camera, video or stream"
-                )
+                raise AcquisitionError(f"OpenCV cannot open {self.source!r}; it must be a camera or a stream")
             self._backend = self._capture.getBackendName()
-            manual = _MANUAL_EXPOSURE.get(self._backend)
-            self._is_fixed, self._counts_powers = seconds is not None, manual == 0.0
-            if manual is None and not self._is_fixed:
-                camera = f"the exposure of {self.source!r}: {self._backend} sets none"
-                raise InputError(f"seconds is None; it must be {camera}")
+            if self._backend != "V4L2" and seconds is None:
+                raise InputError(f"seconds is None; it must be the exposure: {self._backend} sets none")
             for side, pixels in zip(_SIDES, size or (), strict=False):
                 self._capture.set(side, pixels)
             actual = tuple(int(self._capture.get(side)) for side in _SIDES)
             if size not in (None, actual):
                 raise AcquisitionError(f"{self.source!r} gives frames of {actual}; size asks for {size}")
-            if manual is not None:
-                self._lock("exposure", cv2.CAP_PROP_AUTO_EXPOSURE, manual)
+            if self._backend == "V4L2":
+                self._lock("exposure", cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE)
                 self._lock("white balance", cv2.CAP_PROP_AUTO_WB, 0.0)
-            if self._counts_powers and not self._is_fixed:
-                self.exposures = _POWERS
-            elif not self._is_fixed:  # where the driver clips
+            if seconds is None:  # where the driver clips
                 least, most = (self._set_exposure(limit) for limit in self.limits)
                 if SHORTEST <= least < most <= LONGEST:
                     self.limits = least, most
 
     def expose(self, seconds: float) -> None:
-        """Set the exposure, and read it back; AcquisitionError where the camera sets another."""
+        """Set the exposure; AcquisitionError where the camera sets another."""
         seconds = exact("seconds", seconds, self.exposures)
-        if not self._is_fixed and abs((actual := self._set_exposure(seconds)) / seconds - 1.0) > _TOLERANCE:
+        actual = self._set_exposure(seconds) if self.exposures is None else seconds
+        if abs(actual / seconds - 1.0) > _TOLERANCE:
             raise AcquisitionError(f"exposure {seconds:.4g} s was set, but the camera has {actual:.4g} s")
 
     def frame(self) -> np.ndarray:
@@ -113,13 +97,9 @@ class OpenCVCamera(Closing):
 
     def describe(self) -> dict[str, Any]:
         """Plain JSON for the records."""
-        return {
-            "kind": "opencv",
-            "source": self.source if isinstance(self.source, int) else os.path.basename(self.source),
-            "backend": self._backend,
-            "channels": self.channels,
-            "exposures": None if self.exposures is None else list(self.exposures),
-        }
+        source = self.source if isinstance(self.source, int) else os.path.basename(self.source)
+        facts = {"kind": "opencv", "source": source, "backend": self._backend}
+        return facts | {"channels": self.channels, "exposures": self.exposures}
 
     def close(self) -> None:
         """Let the camera go."""
@@ -127,10 +107,8 @@ class OpenCVCamera(Closing):
 
     def _set_exposure(self, seconds: float) -> float:
         """Set an exposure; the seconds that the camera has then."""
-        units = round(math.log2(seconds)) if self._counts_powers else round(seconds * 1e4)
-        self._capture.set(cv2.CAP_PROP_EXPOSURE, units)
-        actual = self._capture.get(cv2.CAP_PROP_EXPOSURE)
-        return 2.0**actual if self._counts_powers else actual / 1e4
+        self._capture.set(cv2.CAP_PROP_EXPOSURE, round(seconds * 1e4))
+        return self._capture.get(cv2.CAP_PROP_EXPOSURE) / 1e4
 
     def _lock(self, name: str, setting: int, value: float) -> None:
         """Switch off what adapts, where the camera has such a setting."""
@@ -138,24 +116,16 @@ class OpenCVCamera(Closing):
         self._capture.set(setting, value)
         actual = self._capture.get(setting)
         if actual != value and not before == actual == _UNKNOWN:
-            raise AcquisitionError(
-                f"automatic {name} of {self.source!r} cannot be switched off: {value:g} was set, {actual:g} "
-                "read back; switch it off in the camera's own program"
-            )
+            text = f"{value:g} was set, {actual:g} read back; use the camera's own program"
+            raise AcquisitionError(f"automatic {name} of {self.source!r} cannot be switched off: {text}")
 
 
 class GPhoto2Camera(Closing):
     """The camera that libgphoto2 finds first, in manual exposure, by python-gphoto2 (extra `camera`).
 
     Each frame is one release of the shutter; its file is fetched, and deleted on the camera. One channel is
-    the green one. AcquisitionError where python-gphoto2 or the camera is not there, a file cannot be read or
+    the green one. AcquisitionError where python-gphoto2 or the camera is missing, a file cannot be read or
     was exposed for other seconds, or exposure, sensitivity or white balance is automatic.
-
-    Examples
-    --------
-    >>> GPhoto2Camera(channels=2)
-    Traceback (most recent call last):
-    ltcl.errors.InputError: channels is 2; it must be one of 1, 3
     """
 
     stream = False

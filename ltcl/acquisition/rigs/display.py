@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Display`: codes, full screen, on a projector that is a display of this computer; `show` of a folder there.
 
-Pixels of the projector's grid become square blocks of whole display pixels, without smoothing: code x in
-[0, 1] is fed as round(255 x) to each pixel of its block. Around the blocks it is black. pygame-ce (SDL 2)
-draws. Known limits: 8 bits; one display in a process; to be used from the main thread.
+Pixels of the grid become square blocks of display pixels, of codes round(255 x) for x in [0, 1], with black
+around. pygame-ce (SDL 2) draws. Known limits: 8 bits; one display in a process, used from the main thread.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 
 from ltcl import checks, images
 from ltcl.acquisition.rig import Closing, as_codes, load_extra
-from ltcl.acquisition.rigs.folder import FolderRig, Shot, enlarge, inside
+from ltcl.acquisition.rigs.folder import FolderRig, Shot, enlarge
 from ltcl.errors import AcquisitionError, FileError, InputError
 from ltcl.files import as_path
 from ltcl.images.frames import open_frames
@@ -29,9 +28,9 @@ _POLL = 0.05  # seconds
 class Display(Closing):
     """One display, full screen, that shows codes of `grid` (h, w), at most its pixels (extra `projector`).
 
-    `index` counts from 0; None is the second display where there are two or more, else the only one.
-    InputError where there is no such display, the grid does not fit, or pygame has a window already;
-    AcquisitionError where pygame-ce is not installed, or there is no display that goes full screen.
+    `index` counts from 0; None is the second display, or the only one. InputError where it is missing, the
+    grid does not fit, or pygame has a window already; AcquisitionError where pygame-ce is not installed, or
+    no display goes full screen.
 
     Examples
     --------
@@ -48,16 +47,12 @@ class Display(Closing):
             raise InputError("pygame shows a window in this process already; close it first")
         with self._closed_on_error():
             try:
-                self._pygame.display.init()
                 self._open(index)
             except self._pygame.error as error:
                 raise AcquisitionError(f"no display can be opened: {error}") from error
 
     def show(self, codes: Any) -> None:
-        """Show codes, (h, w) or (h, w, 3) in [0, 1]; returns when they are handed to the display.
-
-        AcquisitionError where that was closed, by its window's button or the Escape key.
-        """
+        """Show codes, (h, w) or (h, w, 3) in [0, 1]; AcquisitionError once the display is closed."""
         codes = as_codes(codes, self.grid, 3)
         self.key_pressed()
         levels = enlarge(np.rint(codes * 255).astype(np.uint8), self.size)
@@ -66,7 +61,7 @@ class Display(Closing):
         self._pygame.display.flip()
 
     def key_pressed(self) -> bool:
-        """Whether a key was pressed since the last call. Errors as of `show`."""
+        """Whether a key was pressed since the last call; Escape and the window's button close the display."""
         if self._screen is None:
             raise AcquisitionError("the display is closed")
         pygame, pressed = self._pygame, False
@@ -79,7 +74,7 @@ class Display(Closing):
 
     def describe(self) -> dict[str, Any]:
         """Plain JSON for the records."""
-        return {"kind": "display", "index": self.index, "size": list(self.size), "period": self.period}
+        return {"kind": "display", "index": self.index, "size": self.size, "period": self.period}
 
     def close(self) -> None:
         """Give the display back; it cannot show anything after that."""
@@ -88,6 +83,7 @@ class Display(Closing):
 
     def _open(self, index: int | None) -> None:
         display = self._pygame.display
+        display.init()
         sizes = display.get_desktop_sizes()
         self.index = min(1, len(sizes) - 1) if index is None else checks.count("index", index, least=0)
         if self.index not in range(len(sizes)):
@@ -114,10 +110,10 @@ def show(
     """Show the patterns of a folder full screen, one after the other; returns how many.
 
     Of a `FolderRig` in the order of the shooting list, without photographs that are there already; else the
-    pictures of the folder in the order of the numbers in their names. `display` counts from 0. `advance` says
-    when the next one is shown: after a "key", at the "arrival" of the photograph in the folder, or after so
-    many seconds. `progress` is called with each `Shot`, how many were before it, and how many there are.
-    Errors as of `Display`; InputError or FileError for an unusable `advance`, nothing to show.
+    pictures of the folder by the numbers in their names. `display` counts from 0. The next one is shown after
+    a "key", at the "arrival" of the photograph in the folder, or after so many seconds, as `advance` says.
+    `progress` is called with each `Shot`, how many were before it, and how many there are. Errors as of
+    `Display`; InputError or FileError for an unusable `advance`, nothing to show.
 
     Examples
     --------
@@ -136,20 +132,17 @@ def show(
         raise FileError(f"{folder}: has no shooting list, which 'ltcl acquire run' writes")
     else:
         shots = [Shot(frame.number, frame.name, 0.0, "") for frame in open_frames(folder)]
-    with contextlib.ExitStack() as opened:
-        screen = None
+    if not shots:
+        return 0
+    h, w = images.read(folder / shots[0].pattern).shape[:2]
+    with Display((h, w), index=display) as screen:
         for done, shot in enumerate(shots):
-            codes = images.read(inside(folder, shot.pattern), encoding="linear")
-            if screen is None:
-                screen = opened.enter_context(Display((codes.shape[0], codes.shape[1]), index=display))
-            screen.show(codes)
+            screen.show(images.read(folder / shot.pattern, encoding="linear"))
             if progress is not None:
                 progress(shot, done, len(shots))
-            start = time.monotonic()
-            while not (
-                (screen.key_pressed() and advance == "key")
-                or (advance == "arrival" and shot.number not in rig.missing())
-                or time.monotonic() - start >= patience
-            ):
+            end = time.monotonic() + patience
+            while time.monotonic() < end and not (screen.key_pressed() and advance == "key"):
+                if advance == "arrival" and shot.number not in rig.missing():
+                    break
                 time.sleep(_POLL)
     return len(shots)

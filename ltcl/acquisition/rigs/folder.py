@@ -7,8 +7,7 @@
     folder/shots.json                       the same list, for the rig itself
 
 A shot is known by a hash of what is projected, its seconds and the number of equal ones before it, so a run
-that is started again finds its photographs. No file name is taken from the list; links out of the folder are
-refused. Codes of photographs are not changed.
+that is started again finds its photographs. Their codes are not changed.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from ltcl import checks, images
-from ltcl.acquisition.rig import as_codes, as_seconds, load_extra, shot_key
+from ltcl.acquisition.rig import as_exposures, as_shot, load_extra, shot_key
 from ltcl.errors import AcquisitionError, FileError, InputError, MemoryLimitError, PhotographMissing
 from ltcl.files import as_path, input_file, replace_file
 
@@ -44,7 +43,7 @@ _Key = tuple[str, float]  # hash of a pattern, seconds
 
 
 class Shot(NamedTuple):
-    """A photograph to take: what to project, for how long to expose, and where to put it (any extension)."""
+    """A photograph to take: what to project, how long to expose, and where to put it (any extension)."""
 
     number: int
     pattern: str
@@ -55,16 +54,17 @@ class Shot(NamedTuple):
 class FolderRig:
     """A projector and a camera that somebody works by hand, through a folder; `shots` are on the list there.
 
-    Photographs are PNG, TIFF, JPEG, BMP, EXR or camera RAW (extra `camera`), of which one channel takes the
-    green one. Full scale of floats is 1, what the sensor holds at most, at every exposure. `pattern_bits`, 8
-    or 16, are of the patterns, `camera_bits` those in use in photographs of 16 bits (None: all; RAW is scaled
-    to 16). `exposures` are the seconds that the camera offers, ascending (None: any). With the pixels of the
-    `projector`, (H, W), patterns have so many, with square blocks for the pixels of the grid, as large as
-    fit, in the middle. InputError, FileError for an unusable argument or a damaged list.
+    Photographs are PNG, TIFF, JPEG, BMP, EXR (full scale 1) or camera RAW (extra `camera`); one channel is
+    the green one. `pattern_bits`, 8 or 16, are of the patterns, `camera_bits` those in use in photographs of
+    16 bits (None: all; RAW is scaled to 16). `exposures` are the seconds that the camera offers, ascending
+    (None: any). For a `projector` of (H, W) pixels the grid's pixels become square blocks, as large as fit,
+    in the middle. InputError, FileError for an unusable argument or a damaged list.
 
     Examples
     --------
-    >>> import tempfile
+    >>> import tempfile, numpy as np
+    >>> from ltcl import images
+    >>> from ltcl.acquisition import FolderRig
     >>> rig = FolderRig(tempfile.mkdtemp(), projector_grid=(2, 2))
     >>> white = np.ones((2, 2))
     >>> rig.prepare([(white, 0.5)])
@@ -95,7 +95,7 @@ class FolderRig:
         self.projector_grid = checks.grid("projector_grid", projector_grid)
         self.channels = checks.one_of("channels", channels, (1, 3))
         self.bits = camera_bits and checks.count("camera_bits", camera_bits, least=9, most=16)
-        self.exposures = None if exposures is None else tuple(exposures)
+        self.exposures = as_exposures("exposures", exposures)
         self.number = 0
         self._bits = checks.one_of("pattern_bits", pattern_bits, (8, 16))
         self._projector = None if projector is None else checks.grid("projector", projector)
@@ -103,7 +103,7 @@ class FolderRig:
         self._shots: dict[tuple[_Key, int], Shot] = {}  # by the number of equal ones before
         self._patterns: dict[str, int] = {}
         before: Counter[_Key] = Counter()
-        for key in _read_list(inside(self.folder, "shots.json")):
+        for key in _read_list(self.folder / "shots.json"):
             self._add(key, before[key])
             before[key] += 1
         self._saved = len(self._shots)
@@ -116,7 +116,7 @@ class FolderRig:
         return list(self._shots.values())
 
     def prepare(self, shots: Iterable[tuple[Any, float]]) -> None:
-        """Write patterns and list of the (codes, seconds) that come next, in order; InputError, FileError."""
+        """Put the (codes, seconds) that come next on the list, in order; InputError, FileError."""
         asked = self._asked.copy()
         for codes, seconds in shots:
             asked[self._enter(codes, seconds, asked)[1]] += 1
@@ -125,27 +125,24 @@ class FolderRig:
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
         """The photograph of a shot, as the camera stored it: uint8, uint16 or float, (H, W) or (H, W, 3).
 
-        Errors as of `prepare`. `PhotographMissing`, with the next step, where it is not there yet; its
-        pattern and its line in the list are. AcquisitionError where it is there twice, damaged, reaches
-        beyond full scale, or was exposed 5 % longer or shorter than the list asks.
+        Errors as of `prepare`. `PhotographMissing`, of the first of the list, where it is not there yet.
+        AcquisitionError where it is there twice, damaged, above full scale, or its exposure deviates by 5 %.
         """
         shot, key = self._enter(codes, seconds, self._asked)
         self._save()
-        files, name = self._files.get(shot.number, []), f"photograph {shot.number}"
+        files = self._files.get(shot.number, [])
         if len(files) != 1 or not files[0].exists():
-            count = len(self.missing())
-            files = self._files.get(shot.number, [])
+            missing, files = self.missing(), self._files.get(shot.number, [])
             if not files:
-                text = (
-                    f"{name} is missing ({count} in all): project {shot.pattern}, expose for "
-                    f"{shot.seconds:.6g} s, save as {shot.save_as} in {self.folder}, as {_KINDS}"
-                )
-                raise PhotographMissing(text, shot.number, shot, count)
+                first, place = self.shots[missing[0] - 1], f"{self.folder}, as {_KINDS}"
+                text = f"project {first.pattern}, expose for {first.seconds:.6g} s, save as {first.save_as}"
+                text = f"photograph {first.number} is missing ({len(missing)} in all): {text} in {place}"
+                raise PhotographMissing(text, first.number, first, len(missing))
             if len(files) > 1:
                 names = " and ".join(path.name for path in files)
-                raise AcquisitionError(f"{name} is there as {names}; keep one of them")
-        path = inside(self.folder, f"photographs/{files[0].name}")
-        image = read_photograph(f"{name} ({path.name})", path, self.channels, shot.seconds)
+                raise AcquisitionError(f"photograph {shot.number} is there as {names}; keep one of them")
+        name = f"photograph {shot.number} ({files[0].name})"
+        image = read_photograph(name, files[0], self.channels, shot.seconds)
         self._asked[key] += 1
         self.number = shot.number
         return image
@@ -156,7 +153,7 @@ class FolderRig:
 
     def missing(self) -> tuple[int, ...]:
         """Numbers on the list whose photographs are not there yet."""
-        self._files, place = {}, inside(self.folder, "photographs")
+        self._files, place = {}, self.folder / "photographs"
         for path in sorted(place.iterdir()) if place.is_dir() else ():
             match = _PHOTO.fullmatch(path.stem)
             if match and path.suffix.lower() in _SUFFIXES:
@@ -166,8 +163,7 @@ class FolderRig:
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in the order of the numbers in their names.
 
-        InputError where there are more or fewer of them than photographs are missing, FileError for one of an
-        unknown kind: nothing is copied.
+        Nothing is copied where as many are not missing (InputError), or one is no photograph (FileError).
         """
         numbers = self.missing()
         paths = sorted(map(as_path, files), key=lambda p: re.sub("[0-9]+", lambda n: n[0].zfill(20), p.name))
@@ -178,30 +174,24 @@ class FolderRig:
             if path.suffix.lower() not in _SUFFIXES:
                 raise FileError(f"{path}: is no photograph; it must be {_KINDS}")
         for number, path in zip(numbers, paths, strict=True):
-            target = inside(self.folder, self.shots[number - 1].save_as + path.suffix.lower())
+            target = self.folder / (self.shots[number - 1].save_as + path.suffix.lower())
             with replace_file(target) as temporary:
                 shutil.copyfile(path, temporary)
 
     def describe(self) -> dict[str, Any]:
         """The rig as plain JSON."""
-        return {
-            "kind": "folder",
-            "projector_grid": list(self.projector_grid),
-            "channels": self.channels,
-            "pattern_bits": self._bits,
-            "projector": self._projector,
-            "camera_bits": self.bits,
-            "exposures": None if self.exposures is None else list(self.exposures),
-        }
+        facts = {"kind": "folder", "projector_grid": self.projector_grid, "projector": self._projector}
+        facts |= {"pattern_bits": self._bits, "camera_bits": self.bits, "exposures": self.exposures}
+        return facts | {"channels": self.channels}
 
     def _enter(self, codes: Any, seconds: float, asked: Counter[_Key]) -> tuple[Shot, _Key]:
         """Put a shot on the list and its pattern in the folder, unless they are there."""
-        codes, seconds = as_codes(codes, self.projector_grid, self.channels), as_seconds(seconds)
+        codes, seconds = as_shot(self, codes, seconds)
         # Of what is projected: shots that differ by less than a level are the same.
         levels = np.rint(codes * ((1 << self._bits) - 1)).astype("<u2")
         key = shot_key(levels, *(self._projector or ())), seconds
         is_new, shot = key[0] not in self._patterns, self._add(key, asked[key])
-        path = inside(self.folder, shot.pattern)
+        path = self.folder / shot.pattern
         if is_new or not path.exists():
             images.write(path, enlarge(codes, self._projector), encoding="linear", bits=self._bits)
         return shot, key
@@ -217,7 +207,7 @@ class FolderRig:
 
     def _save(self) -> None:
         """Write both files of the list, and make the folder of the photographs."""
-        table, path = inside(self.folder, "shots.csv"), inside(self.folder, "shots.json")
+        table, path = self.folder / "shots.csv", self.folder / "shots.json"
         if self._saved < len(self._shots) or not (path.exists() and table.exists()):
             with replace_file(table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
                 rows = csv.writer(file)
@@ -227,17 +217,11 @@ class FolderRig:
             with replace_file(path) as temporary:
                 temporary.write_text(json.dumps({"format": _FORMAT, "shots": shots}, indent=0))
             self._saved = len(self._shots)
-        inside(self.folder, "photographs").mkdir(exist_ok=True)
+        (self.folder / "photographs").mkdir(exist_ok=True)
 
 
 def enlarge(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
-    """A picture (h, w[, c]) in square blocks of whole pixels, as large as fit, centred in `size` (H, W).
-
-    >>> enlarge(np.array([[1, 2]]), (3, 5))
-    array([[1, 1, 2, 2, 0],
-           [1, 1, 2, 2, 0],
-           [0, 0, 0, 0, 0]])
-    """
+    """A picture (h, w[, c]) in square blocks of whole pixels, as large as fit, centred in `size` (H, W)."""
     (h, w), (H, W) = picture.shape[:2], size or picture.shape[:2]
     side = min(H // h, W // w)
     if side < 1:
@@ -247,19 +231,11 @@ def enlarge(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
     return np.pad(blocks, [*margins, (0, 0)][: picture.ndim])
 
 
-def inside(folder: Path, name: str) -> Path:
-    """A path in the folder; FileError where a link leads out of it."""
-    path = folder / name
-    if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
-        raise FileError(f"{path}: leads out of the folder; it must stay inside")
-    return path
-
-
 def read_photograph(name: str, path: Path, channels: int, seconds: float | None) -> np.ndarray:
     """The codes of a file for a rig of so many channels, exposed for `seconds` as far as its EXIF says.
 
-    One channel of a colour photograph is the green one: a sensor has the most pixels of it, and a mean of
-    channels with different response curves would follow none. AcquisitionError begins with `name`.
+    One channel of a colour photograph is the green one: a mean of channels with different response curves
+    would follow none. AcquisitionError begins with `name`.
     """
     try:
         raw = path.suffix.lower() in RAW
@@ -269,18 +245,15 @@ def read_photograph(name: str, path: Path, channels: int, seconds: float | None)
     if exposed and seconds is not None and abs(exposed / seconds - 1.0) > _ROUNDING:
         raise AcquisitionError(f"{name} was exposed for {exposed:.4g} s by its EXIF, not {seconds:.4g} s")
     if codes.dtype.kind == "f" and np.mean(codes > _FULL) > _DEFECTS:
-        raise AcquisitionError(
-            f"{name} reaches {codes.max():.4g}; full scale of float photographs is 1: divide all of them by "
-            "the largest value that the camera gives"
-        )
+        text = "full scale of float photographs is 1: divide all by the largest value of the camera"
+        raise AcquisitionError(f"{name} reaches {codes.max():.4g}; {text}")
     return np.ascontiguousarray(codes[..., 1]) if codes.ndim == 3 and channels == 1 else codes
 
 
 def _develop(path: Path) -> tuple[np.ndarray, float]:
-    """Codes of camera RAW, linear, and the seconds in its header.
+    """Linear codes of camera RAW, of which nothing is automatic, and the seconds in its header.
 
-    No automatic brightness, white balance, conversion of colours or rotation; bilinear demosaicing. The black
-    level stays, as subtracting it would clip noise; 65535 is the sensor's white level.
+    The black level stays, as subtracting it would clip noise; 65535 is the sensor's white level.
     """
     rawpy = load_extra("rawpy", "camera", f"{path}, camera RAW instead of 16-bit TIFF,")
     try:
@@ -322,11 +295,11 @@ def _read_list(path: Path) -> list[_Key]:
     if not path.exists():
         return []
     try:
-        content = json.loads(input_file(path).read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != _FORMAT:
             raise ValueError(f"format {content['format']!r:.40}")
-        seconds = [checks.number("seconds", shot["seconds"], above=0.0) for shot in content["shots"]]
-        return [(str(shot["codes"]), time) for shot, time in zip(content["shots"], seconds, strict=True)]
+        shots = [(str(shot["codes"]), shot["seconds"]) for shot in content["shots"]]
+        return [(codes, checks.number("seconds", seconds, above=0.0)) for codes, seconds in shots]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise FileError(f"{path}: is no shooting list, or a damaged one ({reason})") from None

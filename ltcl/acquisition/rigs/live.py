@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`LiveRig`: a camera on a cable photographs what a display shows.
 
-Frames are compared by the means of square cells, about 64 along the shorter side: fine enough for a torn
-strip or a single bright spot, coarse enough to average noise. Before the first photograph is measured:
+Frames are compared by the means of square cells, about 64 along the shorter side. Before the first photograph
+is measured:
 
     exposure    at most 1/15 s, halved until white saturates less than a hundredth of the cells
     noise       the largest change of a cell between frames of the same picture, black and white
     dimming     a strip of white, then all white: no cell may get darker, as by a fast automatic exposure
     latency     from a flash until all but a hundredth of the cells show it, to a tenth of the contrast
-    drift       of the mean, right after a flash and a while later, by a slow automatic exposure or white
-                balance; later also between photographs of the same codes and seconds
+    drift       of the mean, right after a flash and at rest, by a slow automatic exposure or white balance
 
-    steady?     After that time two frames in a row must be the same but for noise, none half-changed (torn).
-    fresh?      Where codes or exposure changed and the frame did not, or both changed, it may be an old one:
-                a flash, blocks at random, is shown in between and must be seen to come and to go.
-
-Most projectors show colours one after the other, or switch mirrors, within each picture. An exposure of n + f
-periods, 0 < f < 1, catches up to f / (n + f) more or less of white light, three times that of a colour shown
-a third of the time. So exposures are offered only within 2 % of a whole number of periods.
+Then two frames in a row must be the same but for noise, none half-changed (torn). Where codes or exposure
+changed and the frame did not, or both changed, it may be an old one: a flash, blocks at random, is shown in
+between and must be seen to come and to go. Photographs of the same codes and seconds must be as bright.
+Projectors show colours one after the other: an exposure of n + f periods, 0 < f < 1, catches up to
+3 f / (n + f) more or less of one. So exposures are offered only within 2 % of a whole number of periods.
 """
 
 from __future__ import annotations
@@ -25,7 +22,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import cv2
@@ -33,7 +29,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition import rig
-from ltcl.acquisition.rig import Closing, as_codes, exact, require_members, shot_key, to_unit
+from ltcl.acquisition.rig import Closing, as_exposures, as_shot, require_members, shot_key, to_unit
 from ltcl.errors import AcquisitionError, InputError
 
 _log = logging.getLogger(__name__)
@@ -44,26 +40,23 @@ _ARRIVED, _OUTLIERS = 0.1, 0.01  # difference from a flash, of white; share of c
 _SAFETY = 1.5  # over the largest noise that was seen in some ten thousand differences
 _STEP = 1 / 255  # a code of the coarsest camera: changes below are none
 _VISIBLE = 4.0  # times the noise: what must be seen
-_FLICKER = 0.1  # of full scale: more noise than that
-_BRIGHT = 0.98  # of full scale: here a pixel may hold no more
+_FLICKER, _BRIGHT = 0.1, 0.98  # of full scale: more noise than that; here a pixel may hold no more
 _DIM = 0.1  # of full scale: brightness is compared relative to that at least
 _MARGIN = 0.02  # seconds to wait beyond the slowest flash
-_TRIES = 6  # frames before a photograph is refused
-_TWINS = 3  # frames without any difference before a camera counts as free of noise
+_TRIES, _TWINS = 6, 3  # frames before refusal; frames without any difference that a camera may repeat
 _FRACTION = 0.02  # of an exposure, which is no whole period
 _PERIODS = sorted(count << k for count in (1, 3) for k in range(20))  # of an exposure: 1, 2, 3, 4, 6, 8, 12
 
 
 class Frame(NamedTuple):
-    """A frame as the camera gave it, its cells, and when it came or its shutter opened."""
+    """A frame as the camera gave it, and when it came or its shutter opened."""
 
     codes: np.ndarray  # (H, W) or (H, W, 3)
     cells: np.ndarray  # (a, b, channels) float32, of full scale
     waited: float  # seconds since the last change
 
 
-@dataclass(frozen=True)
-class Survey:
+class Survey(NamedTuple):
     """What the tests measured; of full scale where nothing else is said."""
 
     latency: float  # the most seconds from a change to its first frame
@@ -78,39 +71,26 @@ class LiveRig(Closing):
 
     A camera is `OpenCVCamera`, `GPhoto2Camera`, or any with `channels`, 1 or 3; `stream`, whether frames come
     by themselves and may wait in a queue; `expose(seconds)`; and `frame()`, uint8, uint16 or float, (H, W) or
-    (H, W, 3). Used where it has them: `exposures`, seconds, ascending (else any within `limits`, else 1e-4 to
-    30); `bits` of uint16 (else 16); `describe()`, a dict of plain JSON; `close()`. A display is `Display`, or
-    any with `grid`, `period` and `show(codes)`.
+    (H, W, 3). Optional: `exposures`, seconds, ascending (else any within `limits`, else 1e-4 to 30); `bits`
+    of uint16 (else 16); `describe()`, a dict of plain JSON; `close()`. A display is `Display`, or any with
+    `grid`, `period` and `show(codes)`.
 
     `period` is that of the projector's pictures, whose multiples are offered as `exposures`: seconds, as the
     "display" says, or None for steady light (LCD, LCoS). `drift` is the largest relative difference of
     brightness between identical shots. Within `patience` seconds everything is at rest.
-
-    Examples
-    --------
-    >>> LiveRig(camera=0, display=1)
-    Traceback (most recent call last):
-    ltcl.errors.InputTypeError: camera is a int without channels, stream, expose, frame
     """
 
     def __init__(
-        self,
-        camera: Any,
-        display: Any,
-        *,
-        period: str | float | None = "display",
-        drift: float = 0.02,
-        patience: float = 1.0,
+        self, camera: Any, display: Any, *, period: Any = "display", drift: float = 0.02, patience: float = 1
     ) -> None:
         require_members("camera", camera, "channels", "stream", "expose", "frame")
         require_members("display", display, "grid", "period", "show")
         self.projector_grid = checks.grid("display.grid", display.grid)
         self.channels = checks.one_of("camera.channels", camera.channels, (1, 3))
         self.bits = getattr(camera, "bits", None)
-        self.exposures = getattr(camera, "exposures", None)
-        if period == "display" and display.period is None:
+        self.exposures = as_exposures("camera.exposures", getattr(camera, "exposures", None))
+        if period == "display" and (period := display.period) is None:
             _log.warning("the display has no known period: exposures are not checked for whole periods")
-        period = display.period if period == "display" else period
         self._period = None if period is None else checks.number("period", period, above=0.0, most=1.0)
         if self._period is not None:
             limits = getattr(camera, "limits", (rig.SHORTEST, rig.LONGEST))
@@ -130,24 +110,20 @@ class LiveRig(Closing):
         self._random = np.random.default_rng(0)
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
-        """What the camera gives under `codes`, (h, w) or (h, w, 3) in [0, 1], checked: as `camera.frame()`.
+        """The camera's frame under `codes`, (h, w) or (h, w, 3) in [0, 1].
 
-        AcquisitionError, with the photograph's number, where the camera is gone, adapts, drifts, or shows old
-        or half-changed frames.
+        AcquisitionError where the camera is gone, adapts, drifts, or shows old or half-changed frames.
         """
-        codes, seconds = self._validate(codes, seconds)
+        codes, seconds = as_shot(self, codes, seconds)
         try:
-            if self.survey is None:
-                self.survey = self._measure()
-                self._latency = self.survey.latency
+            self.survey = self.survey or self._measure()
+            self._latency = max(self._latency, self.survey.latency)
             frame = self._fresh(codes, seconds, self.survey)
             mean = frame.cells.mean(axis=(0, 1))
             before = self._brightness.setdefault(shot_key(codes, seconds), mean)
             if (drift := _drift(mean, before, _DIM)) > self._drift:
-                raise AcquisitionError(
-                    f"brightness deviates by {drift:.1%} from an earlier one of the same codes and "
-                    f"seconds, drift={self._drift:g}: camera, projector or the light of the room drifts"
-                )
+                text = f"brightness deviates by {drift:.1%} from an earlier one of the same codes and seconds"
+                raise AcquisitionError(f"{text}, drift={self._drift:g}: camera, lamp or room light drifts")
         except AcquisitionError as error:
             raise AcquisitionError(f"photograph {self._count + 1}: {error}") from error
         self._count += 1
@@ -155,7 +131,7 @@ class LiveRig(Closing):
 
     def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
         """Remember a photograph of an earlier session: one of the same shot must be as bright."""
-        key = shot_key(*self._validate(codes, seconds))
+        key = shot_key(*as_shot(self, codes, seconds))
         self._brightness.setdefault(key, _cells(to_unit("image", image, self)).mean(axis=(0, 1)))
         self._count += 1
 
@@ -163,28 +139,17 @@ class LiveRig(Closing):
         """The rig as plain JSON."""
         ends = (self._camera, self._display)
         camera, display = (getattr(e, "describe", lambda e=e: {"kind": type(e).__name__})() for e in ends)
-        return {
-            "kind": "live",
-            "projector_grid": list(self.projector_grid),
-            "channels": self.channels,
-            "camera": camera,
-            "display": display,
-            "period": self._period,
-            "exposures": None if self.exposures is None else list(self.exposures),
-            "survey": None if self.survey is None else asdict(self.survey),
-        }
+        facts = {"kind": "live", "projector_grid": self.projector_grid, "channels": self.channels}
+        facts |= {"camera": camera, "display": display, "period": self._period, "exposures": self.exposures}
+        return facts | {"survey": self.survey and self.survey._asdict()}
 
     def close(self) -> None:
         """Close camera and display, where they can be closed."""
         for end in (self._camera, self._display):
             getattr(end, "close", lambda: None)()
 
-    def _validate(self, codes: Any, seconds: Any) -> tuple[np.ndarray, float]:
-        codes = as_codes(codes, self.projector_grid, self.channels)
-        return codes, exact("seconds", seconds, self.exposures)
-
     def _fresh(self, codes: np.ndarray, seconds: float, survey: Survey) -> Frame:
-        """A frame of `codes`, exposed for `seconds`; AcquisitionError where frames stay unsteady or old."""
+        """A frame of `codes`, exposed for `seconds`."""
         shown, last = self._shown, self._last
         self._shown = self._last = None  # after an error nothing is known of the frames to come
         moved = shown is None or not np.array_equal(shown, codes)
@@ -205,28 +170,23 @@ class LiveRig(Closing):
         if self._camera.stream:  # a frame comes at the end of its exposure, which may be longer now
             wait += max(0.0, self._seconds - survey.seconds)
         self._settle(wait)
-        first, twins, changed, tries = self._frame(), 0, 0.0, _TRIES
-        while tries:
+        first, twins, changed = self._frame(), 0, 0.0
+        for _ in range(_TRIES + _TWINS):
             second = self._frame()
-            if np.array_equal(first.codes, second.codes) and twins < _TWINS:
-                twins += 1  # the same frame once more, perhaps
-                continue
+            twins = twins + 1 if np.array_equal(first.codes, second.codes) else 0
             changed = _change(first, second)
-            if changed <= survey.tolerance:
+            if changed <= survey.tolerance and not 0 < twins <= _TWINS:  # the same frame once more, perhaps
                 return second
-            first, twins, tries = second, 0, tries - 1
-        raise AcquisitionError(
-            f"frames still change by {changed:.1%} of full scale, {survey.tolerance:.1%} is noise: "
-            "half-changed frames, flicker, or something moves"
-        )
+            first = second
+        text = f"frames still change by {changed:.1%} of full scale, {survey.tolerance:.1%} is noise"
+        raise AcquisitionError(f"{text}: half-changed frames, flicker, or something moves")
 
     def _after_flash(self, codes: np.ndarray, frame: Frame, survey: Survey) -> Frame:
         """A frame that looks the same before and after a flash, which looks different.
 
-        Frames come in the order in which pictures were shown, and of these only `codes` were shown twice:
-        flashes are blocks at random. Where that fails, latency has grown, and from now on `patience` passes
-        before each frame. In an exposure too short to see a flash, or where all is saturated, frames could
-        not be distinguished.
+        Frames come in the order of what was shown, and only `codes` twice. Where that fails, latency has
+        grown, and from now on `patience` passes before each frame. In an exposure too short to see a flash,
+        or where all is saturated, nothing can be compared.
         """
         h, w = self.projector_grid
         light = survey.contrast * min(1.0, self._seconds / survey.seconds)
@@ -290,42 +250,29 @@ class LiveRig(Closing):
         dark, lit = self._still(0.0, _FRAMES), self._still(1.0, _FRAMES)
         noise = max(float(np.abs(np.diff(frames, axis=0)).max()) for frames in (dark, lit))
         if noise > _FLICKER:
-            raise AcquisitionError(
-                f"frames of the same picture differ by {noise:.1%} of full scale: something flickers or "
-                "moves, or the exposure is no multiple of the display's period"
-            )
+            text = f"frames of the same picture differ by {noise:.1%} of full scale"
+            raise AcquisitionError(f"{text}: something flickers or moves, or the display's period is wrong")
         black, white = dark[-1], lit[-1]
         contrast = float((white - black).max())
         if contrast < _VISIBLE * max(noise, _STEP):
-            raise AcquisitionError(
-                f"the camera does not see the display: white is {contrast:.2%} of full scale above black, "
-                f"noise {noise:.2%}, exposure {seconds:.4g} s; open the aperture, or point the camera there"
-            )
+            text = f"white is {contrast:.2%} of full scale above black, noise {noise:.2%}, at {seconds:.4g} s"
+            raise AcquisitionError(f"the camera does not see the display: {text}; open the aperture, or aim")
         tolerance = _SAFETY * (noise + _STEP)
         h, w = self.projector_grid
         strip = np.broadcast_to(np.arange(w) < max(1, w // 4), (h, w)).astype(np.float32)
         dimmed = float((self._still(strip)[0] - white).max())
         if dimmed > tolerance:
-            raise AcquisitionError(
-                f"the camera adapts: a strip is {dimmed:.1%} of full scale darker when the rest is lit as "
-                "well; switch off the camera's automatic exposure and the projector's dynamic contrast"
-            )
+            text = f"the camera adapts: a strip is {dimmed:.1%} of full scale darker when the rest is lit"
+            raise AcquisitionError(f"{text}; switch off automatic exposure and dynamic contrast")
         self._still(0.0)
         accuracy = max(tolerance, _ARRIVED * contrast)
         flashes = [(1.0, white), (0.0, black)] * _FLASHES
         latency = max(self._wait_for(code, cells, accuracy) for code, cells in flashes)
-        self._still(0.0)
-        self._show(1.0)
-        means = []
-        for wait in (latency, latency + self._patience):
-            self._settle(wait)
-            frames = [self._frame().cells for _ in range(3)][1:]  # the first may have begun before
-            means.append(np.mean(frames, axis=(0, 1, 2)))
-        if (drift := _drift(means[1], means[0], _STEP)) > self._drift:
-            raise AcquisitionError(
-                f"the camera drifts by {drift:.1%} between identical shots, {self._drift:.1%} is accepted: "
-                "switch off automatic exposure and white balance, and lamps that flicker"
-            )
+        self._wait_for(1.0, white, accuracy)
+        mean = self._frame().cells.mean(axis=(0, 1))  # the frame before may have begun too early
+        if (drift := _drift(mean, lit.mean(axis=(0, 1, 2)), _STEP)) > self._drift:
+            text = f"the camera drifts by {drift:.1%} between identical shots, drift={self._drift:g}"
+            raise AcquisitionError(f"{text}: switch off automatic exposure, white balance, flickering lamps")
         return Survey(latency, seconds, tolerance, contrast, drift)
 
     def _wait_for(self, code: float, after: np.ndarray, tolerance: float) -> float:
@@ -360,17 +307,10 @@ def _drift(now: np.ndarray, before: np.ndarray, least: float) -> float:
 def _whole_periods(
     offered: Sequence[float] | None, period: float, limits: tuple[float, float]
 ) -> tuple[float, ...]:
-    """The camera's exposures that see whole periods; where it has any in `limits`, multiples of the period.
-
-    >>> _whole_periods((1 / 125, 1 / 60, 1 / 50, 1 / 30), 1 / 60, (1e-4, 30))
-    (0.016666666666666666, 0.03333333333333333)
-    """
-    least, most = limits if offered is None else (offered[0], offered[-1])
+    """The camera's exposures that see whole periods; where it has any in `limits`, multiples of it."""
     if offered is None:
-        offered = [n * period for n in _PERIODS if least <= n * period <= most * (1 + 1e-9)]
-    counts = {seconds: round(seconds / period) for seconds in offered}
-    whole = tuple(t for t, n in counts.items() if n and abs(t - n * period) <= _FRACTION * t)
+        offered = [n * period for n in _PERIODS if limits[0] <= n * period <= limits[1] * (1 + 1e-9)]
+    whole = tuple(t for t in offered if abs(t - max(round(t / period), 1) * period) <= _FRACTION * t)
     if not whole:
-        span = f"{least:.4g} to {most:.4g} s"
-        raise InputError(f"period is {period:.4g} s; exposures of the camera, {span}, hold no multiple of it")
+        raise InputError(f"period is {period:.4g} s; it must divide an exposure of the camera")
     return whole

@@ -4,8 +4,8 @@
 Every pattern is rendered with the same seed: radiance is linear in the projector's light, and noise between
 photographs is that of the sensor. Known limit: the renderer's own noise is part of T.
 
-In the scenes that have a name, walls are diffuse unit squares, y is up. The projector, on the z axis, looks
-towards -z. It and the camera are pinholes whose frames hold all walls, so that T contains all light.
+In a named scene walls are diffuse unit squares, y is up. The projector, on the z axis, looks towards -z. It
+and the camera are pinholes whose frames hold all walls, so that T contains all light.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ltcl.acquisition.rigs.virtual import SimulatedRig
 from ltcl.errors import AcquisitionError, InputError, InputTypeError
 from ltcl.files import input_file
 
+_VARIANT = "scalar_rgb"  # of Mitsuba's builds the one that runs everywhere
 _DISTANCE = 3.0  # of the projector from the origin
 _MARGIN = 1.02  # of the frame around the walls
 _HALF, _THIRD, _WIDE = math.sqrt(1 / 2), math.sqrt(1 / 3), math.sqrt(2 / 3)
@@ -34,7 +35,6 @@ SCENES: dict[str, Any] = {
         ((-_HALF, -0.5, _HALF), (_HALF, 0, -_HALF), (0, 1, 0)),
         ((0, -0.5, 0), (_HALF, 0, _HALF), (0, 1, 0)),
     ),
-    # The corner of a cube seen along its diagonal; the inside of one from its open front.
     "trihedral": tuple(((0, 0, 0), _AXES[k], _AXES[(k + 1) % 3]) for k in range(3)),
     "box": (
         ((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0)),
@@ -56,13 +56,13 @@ class MitsubaRig(SimulatedRig):
         `irradiance` is replaced, and one sensor. Other emitters are ambient light.
     projector_grid, camera_grid : (h, w), (H, W)
         By default the camera has the film of the scene, or `projector_grid` in a named one.
-    channels, samples, variant : 1 or 3, int, str
-        One channel is the green one; paths for each camera pixel; "llvm_ad_rgb" may be faster, or abort.
+    channels, samples : 1 or 3, int
+        One channel is the green one; paths for each camera pixel.
     sensitivity : float, optional
         Linear value for radiance 1 in one second; by default the brightest 1 % of the white picture has 0.5.
     albedo, baseline, depth : array_like in [0, 1), float, int
         Of a named scene: (), (3,) or (walls, 3), 0.7 by default; how far to the right of the projector the
-        camera is, at most 2; longest path in edges, of which 2 are direct light alone, 16 by default.
+        camera is, at most 2; longest path in edges (2 is direct light alone), 16 by default.
     **sensor : of `ltcl.acquisition.rigs.virtual.Sensor`
 
     Examples
@@ -80,7 +80,6 @@ class MitsubaRig(SimulatedRig):
         camera_grid: tuple[int, int] | None = None,
         channels: int = 3,
         samples: int = 64,
-        variant: str = "scalar_rgb",
         sensitivity: float | None = None,
         albedo: Any = None,
         baseline: float | None = None,
@@ -92,24 +91,19 @@ class MitsubaRig(SimulatedRig):
         size = None if camera_grid is None else checks.grid("camera_grid", camera_grid)
         checks.number("sensitivity", 1.0 if sensitivity is None else sensitivity, above=0.0)
         if not isinstance(scene, (dict, str, os.PathLike)):
-            names, kind = ", ".join(SCENES), type(scene).__name__
-            raise InputTypeError(f"scene is a {kind}; it must be one of {names}, a dict or an XML file")
+            raise InputTypeError(f"scene is a {type(scene).__name__}; it must be a name, dict or XML file")
         self._mi = mi = load_extra("mitsuba", "rig", "MitsubaRig")
-        self._facts = {
-            "kind": "mitsuba",
-            "scene": "dict" if isinstance(scene, dict) else os.path.basename(os.fspath(scene)),
-            "mitsuba": str(mi.__version__),
-            "variant": checks.one_of("variant", variant, [v for v in mi.variants() if v.endswith("_rgb")]),
-            "samples": checks.count("samples", samples),
-        }
-        walls = {"albedo": albedo, "baseline": baseline, "depth": depth}
-        walls = {name: value for name, value in walls.items() if value is not None}
+        name = "dict" if isinstance(scene, dict) else os.path.basename(os.fspath(scene))
+        self._facts = {"kind": "mitsuba", "scene": name, "mitsuba": mi.__version__, "variant": _VARIANT}
+        self._facts["samples"] = checks.count("samples", samples)
+        options = {"albedo": albedo, "baseline": baseline, "depth": depth}
+        options = {name: value for name, value in options.items() if value is not None}
         with self._mitsuba(InputError, "scene cannot be loaded"):
             if isinstance(scene, str) and scene in SCENES:
-                scene = _named_scene(mi, scene, grid, size or grid, **walls)
-            elif walls:
-                raise InputError(f"{next(iter(walls))} is of {', '.join(SCENES)}; others have their own")
-            self._scene = _load(mi, variant, scene, grid)
+                scene = _named_scene(mi, scene, grid, size or grid, options)
+            elif options:
+                raise InputError(f"{next(iter(options))} is of {', '.join(SCENES)}; others have their own")
+            self._scene = _load(mi, scene, grid)
             self._parameters = mi.traverse(self._scene)
             if size is not None:
                 self._parameters[self._key("film.size")] = mi.ScalarVector2u(*size[::-1])
@@ -129,7 +123,7 @@ class MitsubaRig(SimulatedRig):
     def _mitsuba(self, kind: type[Exception], subject: str) -> Iterator[None]:
         """Mitsuba with its variant, one for the whole process, for a while; its errors in one line."""
         before = self._mi.variant()
-        self._mi.set_variant(self._facts["variant"])
+        self._mi.set_variant(_VARIANT)
         try:
             yield
         except RuntimeError as error:
@@ -152,32 +146,24 @@ class MitsubaRig(SimulatedRig):
 
 
 def _named_scene(
-    mi: Any,
-    name: str,
-    grid: tuple[int, int],
-    camera_grid: tuple[int, int],
-    albedo: Any = 0.7,
-    baseline: float = 0.0,
-    depth: int = 16,
+    mi: Any, name: str, grid: tuple[int, int], camera_grid: tuple[int, int], options: dict[str, Any]
 ) -> dict[str, Any]:
     walls = np.array(SCENES[name], np.float64)  # (walls, 3 vectors, 3)
-    colours = checks.finite("albedo", checks.real("albedo", albedo))
+    colours = checks.finite("albedo", checks.real("albedo", options.get("albedo", 0.7)))
     checks.shape("albedo", colours, (), (3,), (len(walls), 3))
     if colours.min() < 0 or colours.max() >= 1:
         raise InputError(f"albedo reaches from {colours.min():g} to {colours.max():g}; it must be in [0, 1)")
-    x = checks.number("baseline", baseline, least=-2.0, most=2.0)
-    depth = checks.count("depth", depth, least=2)
+    x = checks.number("baseline", options.get("baseline", 0.0), least=-2.0, most=2.0)
+    depth = checks.count("depth", options.get("depth", 16), least=2)
     scene: dict[str, Any] = {"type": "scene", "integrator": {"type": "path", "max_depth": depth}}
     for k, (start, right, up) in enumerate(walls):
-        # Mitsuba's rectangle is [-1, 1]^2 with its front towards z.
-        axes = right / 2, up / 2, np.cross(right, up), start + (right + up) / 2
+        axes = right / 2, up / 2, np.cross(right, up), start + (right + up) / 2  # of [-1, 1]^2, front to z
         colour = np.broadcast_to(colours, (len(walls), 3))[k].tolist()
         scene[f"wall {k + 1}"] = {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f(np.vstack([np.transpose(axes), [0, 0, 0, 1]])),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": colour}},
         }
-    # A box filter: each pixel is the mean of what it sees alone.
     film = {"type": "hdrfilm", "component_format": "float32", "rfilter": {"type": "box"}}
     film |= {"height": camera_grid[0], "width": camera_grid[1], "pixel_format": "rgb"}
     corners = np.concatenate([walls[:, 0] + a * walls[:, 1] + b * walls[:, 2] for a, b in np.ndindex(2, 2)])
@@ -199,13 +185,11 @@ def _pinhole(mi: Any, x: float, grid: tuple[int, int], corners: np.ndarray) -> d
     return {"fov": math.degrees(2 * math.atan(tangent)), "fov_axis": "x", "to_world": there}
 
 
-def _load(mi: Any, variant: str, scene: Any, grid: tuple[int, int]) -> Any:
+def _load(mi: Any, scene: Any, grid: tuple[int, int]) -> Any:
     """The scene of a dict or an XML file, with a white pattern of sharp pixels in its one projector."""
-    settings = mi.parser.ParserConfig(variant)
-    if isinstance(scene, dict):
-        parsed = mi.parser.parse_dict(settings, scene)
-    else:
-        parsed = mi.parser.parse_file(settings, str(input_file(scene)))
+    settings, is_dict = mi.parser.ParserConfig(_VARIANT), isinstance(scene, dict)
+    parse = mi.parser.parse_dict if is_dict else mi.parser.parse_file
+    parsed = parse(settings, scene if is_dict else str(input_file(scene)))
     projectors = [node for node in parsed.nodes if node.props.plugin_name() == "projector"]
     if len(projectors) != 1:
         raise InputError(f"scene has {len(projectors)} projectors; it must have one emitter of that type")

@@ -12,8 +12,7 @@ code 0, ambient light a (M,), and C (H W, M): what camera pixels see of the M pi
     c   = o + (1 - o) f(min(n, 1))          offset o and camera curve f, where n < 0 as -f(-n)
     code = round(c (2^bits - 1))            in [0, 2^bits - 1]; or c itself of a float camera
 
-The unit of light is that of T: rows that sum to 1 give 1 per second under white. Known limit: no blur but
-that of C, no light that reaches the camera outside T.
+The unit of light is that of T: rows that sum to 1 give 1 per second under white. The only blur is that of C.
 """
 
 from __future__ import annotations
@@ -29,14 +28,13 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import checks, layout
-from ltcl.acquisition.rig import as_codes, as_seconds, fingerprint, shot_key
+from ltcl.acquisition.rig import as_codes, as_exposures, fingerprint, shot_key
 from ltcl.errors import InputError
 from ltcl.images import from_srgb, to_srgb
 
 Curve = Callable[[np.ndarray], np.ndarray]
 Place = Callable[[np.ndarray, np.ndarray], tuple[Any, Any]]
-# film: c = (1 + m^g) l^g / (l^g + m^g), a logistic in log l, as characteristic curves (Hurter and Driffield)
-_G, _M = 1.2, 0.25**1.2
+_G, _M = 1.2, 0.25**1.2  # film: c = (1 + m^g) l^g / (l^g + m^g), a logistic in log l (Hurter and Driffield)
 # Light to code of a camera, and code to light of a projector, by name; 0 to 0 and 1 to 1.
 CURVES: dict[str, tuple[Curve, Curve]] = {
     "linear": (np.array, np.array),
@@ -79,7 +77,7 @@ class Sensor:
 class SimulatedRig:
     """A projector and a camera whose light comes from `_radiance(codes)` of a subclass.
 
-    Noise depends on seed, codes, seconds and the earlier photographs of the same, so that a run can resume.
+    Noise depends on seed, codes, seconds and the number of equal shots before, so that a run can resume.
     """
 
     sensitivity = 1.0
@@ -87,24 +85,24 @@ class SimulatedRig:
     def __init__(self, projector_grid: tuple[int, int], channels: int, sensor: dict[str, Any]) -> None:
         self.sensor = Sensor(**sensor)
         self.projector_grid, self.channels = projector_grid, channels
-        self.exposures = None if self.sensor.exposures is None else tuple(self.sensor.exposures)
+        self.exposures = as_exposures("exposures", self.sensor.exposures)
         self.bits = None if isinstance(self.sensor.bits, str) else self.sensor.bits
-        self._encode, _ = _curves("response", self.sensor.response, channels)
-        _, self._decode = _curves("projector_response", self.sensor.projector_response, channels)
-        self._facts: dict[str, Any] = {}  # of the subclass, for `describe`
+        self._camera = _curves("response", self.sensor.response, channels)
+        self._projector = _curves("projector_response", self.sensor.projector_response, channels)
+        self._facts: dict[str, Any] = {}  # of the subclass
         self._repeats: Counter[str] = Counter()
         self._last: tuple[np.ndarray, np.ndarray] | None = None  # a bracket repeats its codes
 
     def photograph(self, codes: Any, seconds: float) -> np.ndarray:
         """What the camera gives for codes (h, w[, 3]) in [0, 1]: uint8, uint16 or float32, (H, W[, 3])."""
-        codes, seconds = as_codes(codes, self.projector_grid, self.channels), as_seconds(seconds)
+        codes = as_codes(codes, self.projector_grid, self.channels)
+        checks.number("seconds", seconds, above=0.0)  # any, also where a camera would offer others
         value = np.maximum(self.sensitivity * seconds * self.radiance(codes), 0.0)
         noise, sensor = self._noise(codes, seconds), self.sensor
-        if sensor.gain is not None:
-            # Far beyond saturation nothing changes, and Poisson draws end at about 2^63.
+        if sensor.gain is not None:  # far beyond saturation nothing changes; Poisson draws end at about 2^63
             value = noise.poisson(sensor.gain * np.minimum(value, 1e6)) / sensor.gain
         value = value + noise.normal(0.0, sensor.read, value.shape)
-        code = sensor.black + (1.0 - sensor.black) * _apply(self._encode, np.minimum(value, 1.0))
+        code = sensor.black + (1.0 - sensor.black) * _apply(self._camera, 0, np.minimum(value, 1.0))
         if self.bits is None:
             return code.astype(np.float32)
         largest = (1 << self.bits) - 1
@@ -112,7 +110,7 @@ class SimulatedRig:
 
     def recall(self, codes: Any, seconds: float, image: np.ndarray) -> None:
         """Skip the noise of a photograph that was taken in an earlier session."""
-        self._noise(as_codes(codes, self.projector_grid, self.channels), as_seconds(seconds))
+        self._noise(as_codes(codes, self.projector_grid, self.channels), seconds)
 
     def radiance(self, codes: Any) -> np.ndarray:
         """L without a sensor, to compare photographs with: float64, (H, W) or (H, W, 3)."""
@@ -124,7 +122,7 @@ class SimulatedRig:
     def describe(self) -> dict[str, Any]:
         """What makes the photographs, as plain JSON."""
         sensor = {name: value for name, value in asdict(self.sensor).items() if name != "exposures"}
-        shape = {"projector_grid": list(self.projector_grid), "channels": self.channels}
+        shape = {"projector_grid": self.projector_grid, "channels": self.channels}
         return self._facts | shape | sensor | {"sensitivity": self.sensitivity}
 
     def _radiance(self, codes: np.ndarray) -> np.ndarray:
@@ -134,9 +132,9 @@ class SimulatedRig:
         """p: float64, (h, w) or (h, w, 3), of the projector's channels."""
         light = codes.astype(np.float64)
         if self.channels == 3 and light.ndim == 2:
-            light = np.repeat(light[..., None], 3, axis=-1)
+            light = light[..., None].repeat(3, axis=-1)
         black = self.sensor.projector_black
-        return black + (1.0 - black) * _apply(self._decode, light)
+        return black + (1.0 - black) * _apply(self._projector, 1, light)
 
     def _noise(self, codes: np.ndarray, seconds: float) -> np.random.Generator:
         """The counter-based stream (Philox) of the next photograph of `codes` for `seconds`."""
@@ -147,20 +145,18 @@ class SimulatedRig:
         return np.random.Generator(np.random.Philox(key=key))
 
 
-def _curves(argument: str, value: Any, channels: int) -> tuple[list[Curve], list[Curve]]:
+def _curves(argument: str, value: Any, channels: int) -> list[tuple[Curve, Curve]]:
     names = list(value) if isinstance(value, (list, tuple)) else [value] * channels
     if len(names) != channels:
         raise InputError(f"{argument} has {len(names)} curves; it must be one curve, or {channels}")
-    pairs = [CURVES[checks.one_of(argument, name, CURVES)] for name in names]
-    return [encode for encode, _ in pairs], [decode for _, decode in pairs]
+    return [CURVES[checks.one_of(argument, name, CURVES)] for name in names]
 
 
-def _apply(curves: list[Curve], value: np.ndarray) -> np.ndarray:
-    """The curve of each channel, odd about 0."""
-    size = np.abs(value)
-    if size.ndim == 2:
-        return np.copysign(curves[0](size), value)
-    return np.copysign(np.stack([curve(size[..., c]) for c, curve in enumerate(curves)], axis=-1), value)
+def _apply(curves: list[tuple[Curve, Curve]], direction: int, value: np.ndarray) -> np.ndarray:
+    """The curve of each channel, to codes (0) or to light (1), odd about 0."""
+    planes = np.abs(value).reshape(*value.shape[:2], -1)
+    applied = [curve[direction](planes[..., c]) for c, curve in enumerate(curves)]
+    return np.copysign(np.stack(applied, axis=-1).reshape(value.shape), value)
 
 
 class VirtualRig(SimulatedRig):
@@ -203,15 +199,11 @@ class VirtualRig(SimulatedRig):
         self._T = [A.astype(np.float32) if A.dtype.kind in "iub" else A for A in matrices]
         rows, columns = self._T[0].shape
         super().__init__(checks.grid("grid", grid, columns), len(self._T), sensor)
-        self._map, pixels = None, rows
-        if camera_map is not None:
-            maps = layout.matrices(camera_map, "camera_map")
-            (pixels, width), self._map = maps[0].shape, maps[0]
-            if len(maps) > 1 or width != rows:
-                shape = f"{len(maps)} x {(pixels, width)}"
-                raise InputError(f"camera_map has shape {shape}; it must be 1 x (H W, {rows}), the rows of T")
-        if camera_grid is None and pixels != columns:
-            raise InputError(f"camera_grid is None; it must be (H, W) of the {pixels} camera pixels")
+        maps = [] if camera_map is None else layout.matrices(camera_map, "camera_map")
+        (pixels, width), self._map = (maps[0].shape, maps[0]) if maps else ((rows, rows), None)
+        if len(maps) > 1 or width != rows:
+            shape = f"{len(maps)} x {(pixels, width)}"
+            raise InputError(f"camera_map has shape {shape}; it must be 1 x (H W, {rows}), the rows of T")
         self.camera_grid = checks.grid("camera_grid", grid if camera_grid is None else camera_grid, pixels)
         mixing = getattr(T, "mixing", None) if mixing is None else mixing
         self._mixing = None if mixing is None else layout.mixing(mixing, self.channels, None)
@@ -221,19 +213,15 @@ class VirtualRig(SimulatedRig):
             raise InputError(f"ambient is as low as {a.min():g}; light is never negative")
         self.ambient = a[:, None] if a.shape == (rows,) != (self.channels,) else np.atleast_2d(a)
         self.sensitivity = checks.number("sensitivity", sensitivity, above=0.0)
-        self._facts = {
-            "kind": "virtual",
-            "camera_grid": list(self.camera_grid),
-            "mixing": None if self._mixing is None else self._mixing.tolist(),
-            "ambient": self.ambient.mean(axis=0).tolist(),
-            "digests": {"transport": fingerprint(*self._T), "ambient": fingerprint(self.ambient)},
-        }
-        self._facts["digests"]["camera_map"] = None if self._map is None else fingerprint(self._map)
+        mapped = None if self._map is None else fingerprint(self._map)
+        digests = {"transport": fingerprint(*self._T), "ambient": fingerprint(self.ambient)}
+        self._facts = {"kind": "virtual", "digests": digests | {"camera_map": mapped}}
+        self._facts |= {"camera_grid": self.camera_grid, "ambient": self.ambient.mean(axis=0).tolist()}
+        self._facts["mixing"] = None if self._mixing is None else self._mixing.tolist()
 
     def _radiance(self, codes: np.ndarray) -> np.ndarray:
         p = self._light(codes)
         q = (p if self._mixing is None else p @ self._mixing.T).reshape(-1, self.channels)
-        # In the precision of T, which would be copied otherwise.
         L = np.stack([T @ q[:, c].astype(T.dtype) for c, T in enumerate(self._T)], axis=-1) + self.ambient
         L = L if self._map is None else self._map @ L
         return L.reshape(self.camera_grid if self.channels == 1 else (*self.camera_grid, 3))
@@ -246,7 +234,7 @@ def camera_map(
 
     C is (H W, h w), float64. place(u, v) gives column and row of the projector (x, y) that the ray through
     column u and row v of the camera hits, arrays of one shape, centres of pixels at integers; NaN or a place
-    outside the grid for nothing lit. Entries are good to about 1 / points^1.5, of `points` rays a side.
+    outside the grid for nothing lit. Of `points` rays a side, entries are good to about 1 / points^1.5.
 
     >>> camera_map(lambda u, v: (2 * u + 0.5, v), (1, 2), (1, 4)).toarray()  # twice as coarse
     array([[0.5, 0.5, 0. , 0. ],

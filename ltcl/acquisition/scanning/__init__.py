@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Scanning T: which pixels are lit when, and T from the pictures.
+"""Scanning T: which pixels are lit when (`columns`, `adaptive`), and T from their `pictures`.
 
-pictures (with checks): a calibrated rig as a camera on the pixels of the scan, and the log of its pictures;
-columns: batches of columns into a store; adaptive: cells lit together that do not conflict;
 plan, forecast, report: what a scan takes, the error of its T, what came of it
 """
 

@@ -33,8 +33,8 @@ def scan(
 ) -> None:
     """Photograph, decode and commit every block of columns that is not in the store.
 
-    `sigmas` is that of `significant`. `progress` is called with the number of patterns that were photographed
-    in earlier runs, then with 1 for each.
+    `sigmas` is that of `significant`. `progress` is called with the number of patterns of earlier runs, then
+    with 1 for each.
     """
     missing = sorted({block for _, block in store.missing()})
     spans = [store.layout.span(block, "columns") for block in range(store.layout.blocks("columns"))]
@@ -55,19 +55,12 @@ def scan(
             value, variance = np.stack([(image.value[c], image.variance[c]) for image in batch], axis=1)
             x, v = code.decode(value, variance, pictures.ambient[c])
             start, stop = spans[block]
-            store.write(c, block, *_sparse(x[: stop - start], v[: stop - start], pictures, sigmas))
-
-
-def _sparse(
-    x: np.ndarray, v: np.ndarray, pictures: Pictures, sigmas: float
-) -> tuple[scipy.sparse.csr_array, np.ndarray]:
-    """Significant entries of columns (k, M), and their variance; 0, and NaN, where nothing is known."""
-    keep = significant(x, v, pictures.grid, sigmas) & pictures.seen
-    ends = np.concatenate([[0], np.cumsum(np.count_nonzero(keep, axis=1))])
-    variance = v[keep]
-    values = np.where(variance < _KNOWN, x[keep], 0.0).astype(np.float32)
-    matrix = scipy.sparse.csr_array((values, np.nonzero(keep)[1].astype(np.int32), ends), shape=x.shape)
-    return matrix, np.where(variance < _KNOWN, variance, np.nan)
+            x, v = x[: stop - start], v[: stop - start]
+            keep = significant(x, v, pictures.grid, sigmas) & pictures.seen
+            known = v[keep] < _KNOWN
+            values = np.where(known, x[keep], 0.0).astype(np.float32)
+            matrix = scipy.sparse.csr_array((values, np.nonzero(keep)), shape=x.shape)
+            store.write(c, block, matrix, np.where(known, v[keep], np.nan))
 
 
 @dataclass(frozen=True)
@@ -111,10 +104,7 @@ class Pixels:
 
 def all_but_one(v: np.ndarray) -> np.ndarray:
     """Sums over the first axis without the entry itself, exact where that is larger than all others."""
-    none = np.zeros_like(v[:1])
-    before = np.cumsum(np.concatenate([none, v[:-1]]), axis=0)
-    behind = np.cumsum(np.concatenate([none, v[:0:-1]]), axis=0)[::-1]
-    return before + behind
+    return np.tensordot(1.0 - np.eye(len(v)), v, 1)
 
 
 @dataclass(frozen=True)
@@ -162,11 +152,7 @@ Code = Pixels | Hadamard
 
 
 def code_of(strategy: str, grid: tuple[int, int], order: int) -> Code:
-    """The code of a strategy, for two batches at least: no pattern is white, which is photographed already.
-
-    >>> code_of("hadamard", (64, 64), 63), code_of("pixel", (4, 4), 63)
-    (Hadamard(size=63), Pixels(size=8))
-    """
+    """The code of a strategy, for two batches at least: no pattern is white, which is photographed."""
     half = max(1, grid[0] * grid[1] // 2)
     if strategy == "hadamard":
         return Hadamard(min(order, max(1, (1 << (half.bit_length() - 1)) - 1)))
@@ -174,11 +160,7 @@ def code_of(strategy: str, grid: tuple[int, int], order: int) -> Code:
 
 
 def patterns(code: Code, n: int) -> int:
-    """Patterns for n pixels.
-
-    >>> patterns(Pixels(4), 10)
-    13
-    """
+    """Patterns for n pixels."""
     whole, rest = divmod(n, code.size)
     return whole * len(code.patterns(code.size)) + (len(code.patterns(rest)) if rest else 0)
 
@@ -210,32 +192,26 @@ def significant(
 
 def sums(store: BlockStore, channel: int) -> np.ndarray:
     """Row sums (M,) of the columns in a store, float64."""
-    total = np.zeros(store.layout.shape[0])
-    for block in range(store.layout.blocks("columns")):
-        matrix = store.block(channel, block).matrix
-        total += np.bincount(matrix.indices, matrix.data, minlength=len(total))
-    return total
+    blocks = range(store.layout.blocks("columns"))
+    return np.sum([store.block(channel, b).matrix.sum(axis=0, dtype=np.float64) for b in blocks], axis=0)
 
 
 def deviation(sums: np.ndarray, white: Picture) -> float:
     """Relative root mean square deviation of row sums (channels, N) from white, NaN without light."""
-    known = white.variance < _KNOWN
-    light = np.sum(white.value[known] ** 2, dtype=np.float64)
-    return float(np.sqrt(np.sum((sums - white.value)[known] ** 2) / light)) if light > 0 else float("nan")
+    light = np.sum(white.value[white.known] ** 2, dtype=np.float64)
+    difference = (sums - white.value)[white.known]
+    return float(np.sqrt(np.sum(difference**2) / light)) if light > 0 else float("nan")
 
 
 def check_row_sums(name: str, sums: np.ndarray, white: Picture) -> None:
-    """Raise ScanRefused where row sums (channels, N) mostly deviate from white by more than 30 %.
+    """Raise ScanRefused where row sums (channels, N) deviate from white by more than 30 %.
 
     They do of a camera of one exposure that changes it by itself; others are refused before a batch is kept.
     """
-    lit = (white.variance < _KNOWN) & (white.value > 0)
-    relative = np.median(np.abs(sums - white.value)[lit]) / np.median(white.value[lit]) if lit.any() else 0.0
-    if relative > _REFUSED:
+    if (relative := deviation(sums, white)) > _REFUSED:
         raise ScanRefused(
-            f"{name}: row sums of T mostly deviate by {100 * relative:.0f} % from the photograph under white "
-            f"(allowed: {100 * _REFUSED:.0f} %); the scene, the light or the exposure changed during the "
-            "scan: acquire into another store"
+            f"{name}: row sums of T deviate by {relative:.0%} from white (allowed: {_REFUSED:.0%}); "
+            "the scene, the light or the exposure changed during the scan: acquire into another store"
         )
 
 
@@ -263,7 +239,7 @@ def balance(
     median = [np.median(v) if len(v) else 0.0 for v in np.split(variance, matrix.indptr[1:-1])]
     stored, dropped = V.sum(axis=1), np.array(median) * (V.shape[1] - each)
     total = stored + dropped + white.variance
-    known = np.isfinite(total) & (white.variance < _KNOWN) & (stored > 0)
+    known = np.isfinite(total) & white.known & (stored > 0)
     stored, total = np.where(known, stored, 1.0), np.where(known, total, np.inf)
     move = np.where(known, (white.value - matrix.sum(axis=1)) * (1.0 + dropped / stored) / total, 0.0)
     spread = np.nan_to_num(variance)  # unknown ones are in rows that stay

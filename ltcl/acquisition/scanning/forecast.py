@@ -17,26 +17,23 @@ D = diag(E) F^-1 and X = S^-1 = F T^-1, the unit of light cancels:
     b_k = X l^(k),                            l^(k+1) = l^(k) - b_k
     db_k = X (dl^(k) - E F^-1 b_k) + D b_k,    dl^(k+1) = dl^(k) - db_k,    dl^(0) = 0
 
-Known limits: response, black offset, projector curve and ambient light are taken as exact, and light that
-cells leave smooth is too. Simulated scans deviate by 0.5 to 1.6 times the forecast; bounces by up to 1.8
-times it from 8 x 16 pixels one at a time, by up to 3.4 times it from cells and a camera almost without noise.
+Known limits: response, black offset, projector curve, ambient light and what cells leave smooth are taken as
+exact: errors are 0.5 to 1.6 times the forecast, of bounces up to 1.8 times (one of 8 x 16 pixels at a time),
+or 3.4 times (cells, a camera almost without noise).
 """
 
 from __future__ import annotations
 
 import os
-import textwrap
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
+from scipy.ndimage import correlate1d
 
 from ltcl import checks, layout
-from ltcl.acquisition.scanning import adaptive
-from ltcl.acquisition.scanning.adaptive import Cells
-from ltcl.acquisition.scanning.pictures import UNKNOWN, Seen
-from ltcl.acquisition.scanning.report import finished_scan, stored_rows
+from ltcl.acquisition.scanning.pictures import Seen
+from ltcl.acquisition.scanning.report import finished_scan, membership, stored_variances
 from ltcl.solvers import solve_each
 from ltcl.store import BlockStore, load
 
@@ -57,9 +54,8 @@ class Forecast:
     draws: int
 
     def __repr__(self) -> str:
-        errors = ", ".join(f"{value:.2g}" for value in self.rms)
-        line = f"<ltcl Forecast of {self.draws} draws: rms error of direct part and bounces {errors}"
-        return textwrap.shorten(line, 108, placeholder=" ...") + ">"
+        errors = ", ".join(f"{value:.2g}" for value in self.rms[:4]) + ", ..." * (len(self.rms) > 4)
+        return f"<ltcl Forecast of {self.draws} draws: rms errors of direct part and bounces {errors}>"
 
 
 def forecast_bounces(
@@ -111,14 +107,14 @@ def forecast_bounces(
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     normal = np.random.default_rng(seed).standard_normal((draws, *values.shape))
     *E, diagonal = np.einsum("cnkab,dcnkb->acndk", roots, normal)  # each (channels, N, draws, k)
-    dl, deviations = np.zeros(diagonal.shape), []
+    dl, all_deviations = np.zeros(diagonal.shape), []
     for b_n, e in zip(b, E, strict=True):
         db = X((dl - e).reshape(*F.shape, -1)).reshape(dl.shape) + diagonal * (inverse * b_n)[:, :, None]
         dl -= db
-        deviations.append(shape.pack(list(np.sqrt(np.mean(db**2, axis=2))), T.grid).astype(np.float32))
-    total = np.array([np.sqrt(np.mean(np.square(deviation, dtype=np.float64))) for deviation in deviations])
-    direct, others = deviations[0], np.array(deviations[1:], np.float32)
-    return Forecast(direct, others.reshape(bounces, *direct.shape), total, draws)
+        all_deviations.append(shape.pack(list(np.sqrt(np.mean(db**2, axis=2))), T.grid).astype(np.float32))
+    deviations = np.stack(all_deviations)
+    squares = np.square(deviations, dtype=np.float64).reshape(bounces + 1, -1)
+    return Forecast(deviations[0], deviations[1:], np.sqrt(np.mean(squares, axis=1)), draws)
 
 
 def forecast_picture(
@@ -126,8 +122,8 @@ def forecast_picture(
 ) -> np.ndarray:
     """Errors of T p caused by the noise of the scan and the blur of its camera; float32, as the pattern.
 
-    `pattern` is (h, w), (h, w, 3), or frames of these; with one found by `ltcl.compensate` it is the error of
-    the picture on the wall. The rest is as in `forecast_bounces`.
+    `pattern` is (h, w), (h, w, 3), or frames of these; with that of `ltcl.compensate` it is the error of the
+    picture on the wall. The rest is as in `forecast_bounces`.
     """
     scan = finished_scan(store)
     T = load(scan.path, on_dark="mask", device=device)
@@ -138,39 +134,47 @@ def forecast_picture(
     sharpness = Seen.of(scan).sharpness
     if sharpness is not None:
         for A, p, variance in zip(T.matrices, light, variances, strict=True):
-            shown, known = (A @ p).reshape(*T.grid, -1), ~T.masked.reshape(*T.grid, 1)
-            blur = sum(q * _detail(shown, known, axis) for axis, q in enumerate(sharpness.errors))
-            variance += np.reshape(blur, variance.shape) ** 2
+            q = np.array(replace(sharpness, leak=_leak(A, T.grid)).errors)
+            shown = (A @ p).reshape(*T.grid, -1)
+            detail = [correlate1d(shown, [-0.5, 1.0, -0.5], axis, mode="nearest") for axis in (0, 1)]
+            blur = np.einsum("a,a...", q / (1.0 - q), detail).reshape(variance.shape)
+            variance += np.where(T.masked[:, None], 0.0, blur**2)
     return shape.pack([np.sqrt(np.maximum(v, 0.0)) for v in variances], T.grid).astype(np.float32)
 
 
-def _detail(c: np.ndarray, known: np.ndarray, axis: int) -> Any:
-    """Pictures c (h, w, k) less the mean of the two neighbours along an axis, of those that are known.
+def _leak(A: Any, grid: tuple[int, int]) -> tuple[float, float]:
+    """q along y and x (`Sharpness`): the part of the light of a pixel and its neighbours that is theirs.
 
-    A camera that shows a part q of a pixel's light at its neighbours (`Sharpness.errors`) adds q of it.
+    A (N, N) shows patterns of every fifth pixel. Light of the scene is smooth: as much comes from pixels two
+    away, and is subtracted.
     """
-    total, count = (
-        scipy.ndimage.correlate1d(image, [1.0, 0.0, 1.0], axis, mode="constant")
-        for image in (np.where(known, c, 0.0), known.astype(float))
-    )
-    return np.where(known & (count > 0), c - total / np.maximum(count, 1.0), 0.0)
+    place, leak = np.indices(grid).reshape(2, -1), []
+    shown = np.asarray(A @ ([5, 1] @ (place % 5) == np.arange(25)[:, None]).T.astype(np.float32))
+    for axis, n in enumerate(grid):
+        inner = np.flatnonzero((place[axis] > 0) & (place[axis] < n - 1) & shown.any(axis=1))
+        steps = np.multiply.outer(np.arange(-2, 3), np.eye(2, dtype=int)[axis])[..., None]
+        far, before, own, after, other = shown[inner, [5, 1] @ ((place[:, inner] + steps) % 5)]
+        near = before + after - 2 * np.minimum(far, other)
+        q = near / np.maximum(near + own - np.minimum(far, other), 1e-30)
+        leak.append(float(np.clip(np.median(q), 0.0, 0.5)) if len(q) else 0.0)
+    return leak[0], leak[1]
 
 
-def _covariance(store: BlockStore, c: int, W: np.ndarray) -> np.ndarray:
-    """Covariances (N, k, n + 1, n + 1) of E W, and of diag(E) as the last, row by row; W is (N, k, n)."""
-    N, k, n = W.shape
-    sums = Cells(store.layout.grid).sums(np.concatenate([W, np.ones((N, k, 1))], axis=2).reshape(N, -1))
-    sums = sums.reshape(-1, k, n + 1)
+def _covariance(store: BlockStore, c: int, A: np.ndarray) -> np.ndarray:
+    """Covariances (N, k, n + 1, n + 1) of E A, and of diag(E) as the last, row by row; A is (N, k, n)."""
+    (N, k, n), cells, white = A.shape, membership(store), Seen.of(store).white
+    weights = cells.T @ np.concatenate([A, np.ones((N, k, 1))], axis=2).reshape(N, -1)
+    sums = weights.reshape(-1, k, n + 1)
     a, b = np.triu_indices(n + 1)
     pairs = (sums[..., a] * sums[..., b]).reshape(len(sums), -1)
-    q = np.zeros((N, k, n + 2, n + 2))  # of W, 1 and the diagonal
-    for rows, _, V, cells in stored_rows(store, c):
+    q = np.zeros((N, k, n + 2, n + 2))  # of A, 1 and the diagonal
+    for rows, V in stored_variances(store, c):
         V.data = np.nan_to_num(V.data)
-        q[rows, :, a, b] = q[rows, :, b, a] = (V @ pairs[: V.shape[1]]).reshape(-1, k, len(a))
-        own = adaptive.own_entries(V, cells)
-        q[rows, :, -1, :-1] = q[rows, :, :-1, -1] = np.einsum("ln,lnka->nka", own, sums[cells])
-        q[rows, :, -1, -1] = own.sum(axis=0)[:, None]
-    u, V = Seen.of(store).white.variance[c], np.maximum(q[:, 0, n, n], 1e-300)
-    factor = np.where(u < 1e-3 * UNKNOWN, (u / V - 1.0) / V, 0.0)[:, None, None, None]
+        own = V.multiply(cells[rows])
+        q[rows, :, a, b] = q[rows, :, b, a] = (V @ pairs).reshape(-1, k, len(a))
+        q[rows, :, -1, :-1] = q[rows, :, :-1, -1] = (own @ weights).reshape(-1, k, n + 1)
+        q[rows, :, -1, -1] = own.sum(axis=1)[:, None]
+    V = np.maximum(q[:, 0, n, n], 1e-100)
+    factor = np.where(white.known[c], (white.variance[c] / V - 1.0) / V, 0.0)[:, None, None, None]
     q += factor * q[:, :, n, :, None] * q[:, :, n, None, :]
     return np.delete(np.delete(q, n, axis=2), n, axis=3)

@@ -65,11 +65,9 @@ class Plan:
     error: float
 
     def __repr__(self) -> str:
-        time, pixels = timedelta(seconds=round(self.seconds)), "{} x {} pixels".format(*self.grid)
-        return (
-            f"<ltcl Plan {self.strategy}: {self.photographs} photographs, {self.calibration} to calibrate, "
-            f"{pixels}, {time}, error of T p {100 * self.error:.2g} %>"
-        )
+        (h, w), time = self.grid, timedelta(seconds=round(self.seconds))
+        each = f"{h} x {w} pixels, {self.photographs} photographs, {time}, error of T p {self.error:.2%}"
+        return f"<ltcl Plan {self.strategy}: {each}>"
 
 
 def plans(
@@ -92,8 +90,8 @@ def plans(
     guessed before the calibration, then `measured`; it takes `calibration` photographs, by default as
     `acquisition.calibrate` expects. The others are as in `ltcl.acquire`.
 
-    >>> found = plans((64, 64), (0.5, 8.0))
-    >>> found["pixel"].patterns, found["adaptive"].photographs < found["pixel"].photographs / 4
+    >>> strategies = plans((64, 64), (0.5, 8.0))
+    >>> strategies["pixel"].patterns, strategies["adaptive"].patterns < 1000
     (4160, True)
     """
     noise, light = noise or NoiseModel(), light or Light()

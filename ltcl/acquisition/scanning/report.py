@@ -8,13 +8,12 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl.acquisition.scanning import adaptive, columns
-from ltcl.acquisition.scanning.pictures import UNKNOWN, Seen
+from ltcl.acquisition.scanning.pictures import Seen
 from ltcl.errors import FileError
 from ltcl.store import BlockStore
 
@@ -25,22 +24,16 @@ class Report:
 
     Attributes
     ----------
-    patterns, photographs : int
-        Of the scan, without those of the calibration and the pattern of blocks after each batch.
-    coverage, doubtful, masked : float
-        Parts of the projector's pixels: seen by the camera; too dark next to bright ones, and so masked
-        (`acquisition.geometry.resample`); without a first bounce in some channel.
-    saturated : float
-        Part of the camera's pixels that saturate in all exposures (seconds) under white.
-    sharpness, blur : float
-        Part of the light at a pixel that is its own; relative error of a picture of noise by that
-        (`acquisition.geometry.sharpness`). NaN of an aligned camera.
-    entries, unknown : int, float
-        Stored, of all channels; part of them without a valid photograph, which are 0.
-    noise_direct, noise_sum : float
-        Median relative standard deviation of the first bounce, and of row sums.
-    sum_deviation : float
-        Relative deviation (rms) of the sums of the measured columns from white; NaN of an adaptive scan.
+    patterns, photographs : of the scan, without those of the calibration and of the blocks after each batch
+    exposures : seconds
+    coverage, doubtful, masked : parts of the projector's pixels
+        Seen by the camera; too dark next to bright ones, and so masked; without a first bounce.
+    saturated : part of the camera's pixels that saturate in all exposures under white
+    sharpness, blur : of light at a pixel, the part that is its own; relative error of a picture of noise
+        By `acquisition.geometry.sharpness`; NaN of an aligned camera.
+    entries, unknown : stored, of all channels; part of them without a valid photograph, which are 0
+    noise_direct, noise_sum : median relative standard deviation of the first bounce, and of row sums
+    sum_deviation : relative deviation (rms) of sums of measured columns from white; NaN of an adaptive scan
 
     Examples
     --------
@@ -78,12 +71,11 @@ class Report:
         scan = finished_scan(store)
         facts, seen, measured = scan.attributes, Seen.of(scan), scan.layout.kind != "compressed"
         calibration, F, white = seen.calibration, np.asarray(scan.extra("first_bounce")), seen.white
-        entries, unknown, variance = 0, 0, np.zeros(F.shape)
+        entries, unknown, variance, cells = 0, 0, np.zeros(F.shape), membership(scan)
         for c in range(len(F)):
-            for rows, T, V, cells in stored_rows(scan, c):
-                entries, unknown = entries + T.nnz, unknown + int(np.isnan(V.data).sum())
-                variance[c, rows] = np.nan_to_num(adaptive.own_entries(V, cells)).sum(axis=0)
-        known = (white.variance < 1e-3 * UNKNOWN) & (white.value > 0)
+            for rows, V in stored_variances(scan, c):
+                entries, unknown = entries + V.nnz, unknown + int(np.isnan(V.data).sum())
+                variance[c, rows] = np.nan_to_num(V.multiply(cells[rows]).sum(axis=1))
         return cls(
             strategy=facts["strategy"],
             why=facts["why"],
@@ -101,27 +93,22 @@ class Report:
             entries=entries,
             unknown=unknown / max(entries, 1),
             noise_direct=_noise(variance, F, F > 0),
-            noise_sum=_noise(white.variance, white.value, known),
+            noise_sum=_noise(white.variance, white.value, white.known & (white.value > 0)),
             sum_deviation=columns.deviation(scan.extra(columns.SUMS), white) if measured else math.nan,
         )
 
     def to_json(self) -> str:
         """One line of JSON; NaN as null."""
-        finite = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(self).items()}
-        return json.dumps(finite)
+        return json.dumps({k: None if v != v else v for k, v in asdict(self).items()})
 
     def __repr__(self) -> str:
-        pixels = "{} x {} pixels".format(*self.grid)
-        noise = f"{self.coverage:.1%} seen, noise of row sums {self.noise_sum:.2%}"
-        return f"<ltcl Report {self.strategy}, {pixels}, {self.photographs} photographs, {noise}>"
+        (h, w), noise = self.grid, f"noise of row sums {self.noise_sum:.2%}"
+        return f"<ltcl Report {self.strategy}, {h} x {w} pixels, {self.photographs} photographs, {noise}>"
 
     def __str__(self) -> str:
         h, w = self.grid
         times = ", ".join(f"{t:.3g} s" for t in self.exposures)
         masked = f"masked {self.masked:.2%} ({self.doubtful:.2%} too dark next to bright pixels)"
-        photographs = "patterns" if self.strategy == "hadamard" else f"single {self.strategy}s"
-        within = f"{100 * self.sum_deviation:.2g} % (good: below 0.5 %)"
-        own = f"{self.sharpness:.0%} of a pixel is its own light"
         lines = [
             f"{self.strategy} ({self.why}), {h} x {w} pixels, {self.channels} channel(s)",
             f"{self.photographs} photographs: {self.patterns} patterns at {times}",
@@ -130,8 +117,11 @@ class Report:
             f"noise of the first bounce {self.noise_direct:.2%}, of row sums {self.noise_sum:.2%}",
         ]
         if not math.isnan(self.sharpness):
+            own = f"{self.sharpness:.0%} of a pixel is its own light"
             lines.append(f"{own}: relative error of fine patterns {self.blur:.1%}")
         if not math.isnan(self.sum_deviation):
+            photographs = "patterns" if self.strategy == "hadamard" else f"single {self.strategy}s"
+            within = f"{100 * self.sum_deviation:.2g} % (good: below 0.5 %)"
             lines.append(f"photographs of {photographs} add up to white within {within}")
         return "\n".join(lines)
 
@@ -150,15 +140,21 @@ def finished_scan(store: str | os.PathLike[str] | BlockStore) -> BlockStore:
     return scan
 
 
-def stored_rows(store: BlockStore, c: int) -> Iterator[tuple[slice, Any, Any, np.ndarray]]:
-    """Blocks of rows of a channel: values, variances (NaN: unknown), the cells (levels, rows) of each pixel.
-
-    Columns of T are the cells of level 0.
-    """
-    cells = adaptive.Cells(store.layout.grid).of_pixels()
+def membership(store: BlockStore) -> scipy.sparse.csr_array:
+    """Which cells a pixel is in, (N, cells); columns of T are cells of one pixel."""
     if store.layout.kind == "compressed":
-        yield slice(0, cells.shape[1]), *adaptive.stored(store, c), cells
+        return adaptive.Cells(store.layout.grid).W.T.tocsr()
+    return scipy.sparse.csr_array(scipy.sparse.eye_array(store.layout.shape[1]))
+
+
+def stored_variances(store: BlockStore, c: int) -> Iterator[tuple[slice, scipy.sparse.csr_array]]:
+    """Variances of the entries of a channel, (rows, cells), by blocks of rows; NaN is unknown."""
+    if store.layout.kind == "compressed":
+        names = f"core_variance_{c}", f"system_{c}.R.core.indices", f"system_{c}.R.core.indptr"
+        arrays, shape = tuple(map(store.extra, names)), membership(store).shape
+        yield slice(None), scipy.sparse.csr_array(arrays, shape=shape)
         return
     for number in range(store.layout.blocks()):
-        rows, (T, variance) = slice(*store.layout.span(number)), store.block(c, number)
-        yield rows, T, scipy.sparse.csr_array((variance, T.indices, T.indptr), shape=T.shape), cells[:1, rows]
+        T, variance = store.block(c, number)
+        V = scipy.sparse.csr_array((variance, T.indices, T.indptr), shape=T.shape)
+        yield slice(*store.layout.span(number)), V

@@ -46,29 +46,30 @@ def test_lit_pixels_are_decoded_and_others_are_not(photographs, mapping, board):
     assert mapping.valid[lit < 5].mean() < 0.03
 
 
-@pytest.mark.parametrize("subpixel", [False, True])
-def test_the_board_is_a_plane(photographs, mapping, board, subpixel):
+@pytest.fixture(scope="module")
+def points(mapping, board) -> tuple[np.ndarray, np.ndarray]:
+    """(x, y) of the board's pixels in the camera, and of what they see in the projector."""
+    valid = board & mapping.valid
+    projector = np.stack([mapping.x[valid], mapping.y[valid]], axis=1)
+    return np.argwhere(valid)[:, ::-1].astype(np.float64), projector
+
+
+def test_the_board_is_a_plane(points):
     """But for distortion of the two lenses, a homography takes one picture of a plane to the other."""
-    decoded = mapping if subpixel else decode(photographs, GRID, subpixel=False)
-    chosen = board & decoded.valid
-    camera = np.stack(np.nonzero(chosen)[::-1], axis=1).astype(np.float64)
-    projector = np.stack([decoded.x[chosen], decoded.y[chosen]], axis=1).astype(np.float64)
+    camera, projector = points
     H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
     distance = np.linalg.norm(cv2.perspectiveTransform(camera[:, None], H)[:, 0] - projector, axis=1)
-    assert np.median(distance) < (0.15 if subpixel else 0.4)
-    assert np.sqrt(np.mean(distance**2)) < (0.25 if subpixel else 0.45)
-    assert np.mean(distance > 1.0) < (0.001 if subpixel else 0.005)
+    assert np.median(distance) < 0.15
+    assert np.sqrt(np.mean(distance**2)) < 0.25
+    assert np.mean(distance > 1.0) < 0.001
 
 
-def test_the_calibration_of_the_authors_agrees(shared_data, mapping, board):
+def test_the_calibration_of_the_authors_agrees(shared_data, points):
     """Points triangulated by it fall back on the pixels they came from, within its own residual of 0.86."""
     path = shared_data / "graycode-real" / "calibration_result.xml"
     file, names = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ), ("cam_int", "cam_dist", "proj_int")
     K, D, P, E, R, t = (file.getNode(name).mat() for name in (*names, "proj_dist", "roration", "translation"))
-    chosen = board & mapping.valid
-    v, u = np.nonzero(chosen)
-    camera = np.stack([u, v], axis=1)[::20].astype(np.float64)
-    projector = STEP * np.stack([mapping.x[chosen], mapping.y[chosen]], axis=1)[::20].astype(np.float64)
+    camera, projector = points[0][::20], STEP * points[1][::20].astype(np.float64)
     lenses = ((camera, K, D), (projector, P, E))
     rays = [cv2.undistortPoints(points[:, None], k, d)[:, 0].T for points, k, d in lenses]
     X = cv2.triangulatePoints(np.eye(3, 4), np.hstack([R, t.reshape(3, 1)]), *rays)

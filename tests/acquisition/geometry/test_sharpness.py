@@ -21,17 +21,18 @@ from ltcl.errors import AcquisitionError, FileError
 from ltcl.store import BlockStore
 
 from ..scanning.helpers import corner
-from .scenes import turned
+from .scenes import places, turned
 
 GRID = (8, 16)
 random = np.random.default_rng()
+MAP = places(*turned(GRID, 0.95, 0.06, (0.1, -0.1), 1.15))
 LINE = Response(np.array([[-0.004 / 0.996, 1.0]]))
 
 
 def shown(codes: np.ndarray, q: tuple[float, float]) -> np.ndarray:
     """Of a picture, with a part q of each pixel's light from its neighbours along y and x."""
-    for axis, part in enumerate(q):
-        kernel = np.array([part / 2, 1 - part, part / 2])
+    for axis, leak in enumerate(q):
+        kernel = np.array([leak / 2, 1 - leak, leak / 2])
         codes = scipy.ndimage.convolve1d(codes, kernel, axis=axis, mode="nearest")
     return codes
 
@@ -58,10 +59,8 @@ def view(size: float, blur: float = 0.0) -> tuple[scipy.sparse.csr_array, tuple[
     """What a camera of `size` pixels to one of the projector's sees, slightly turned, and out of focus."""
     place, (H, W) = turned(GRID, size, 0.06, (0.1, -0.1), 1.15)
     C = camera_map(place, (H, W), GRID).toarray().reshape(H, W, -1)
-    return scipy.sparse.csr_array(scipy.ndimage.gaussian_filter(C, (blur, blur, 0)).reshape(H * W, -1)), (
-        H,
-        W,
-    )
+    C = scipy.ndimage.gaussian_filter(C, (blur, blur, 0)).reshape(H * W, -1)
+    return scipy.sparse.csr_array(C), (H, W)
 
 
 def camera(size: float, blur: float = 0.0, T: Any = None, **options: Any) -> VirtualRig:
@@ -93,12 +92,14 @@ def test_reported_blur_is_the_error_of_pictures(size: float, blur: float, caplog
     assert not R.doubtful.any()
 
 
-def test_a_hopeless_camera_is_refused_before_the_scan() -> None:
+@pytest.mark.parametrize("geometry", ["graycode", Correspondence(*MAP, MAP[0] > -1, GRID)])
+def test_a_hopeless_camera_is_refused_before_the_scan(geometry: Any) -> None:
+    """Its blur is measured, or follows from the size of its pixels where a map is passed."""
     with pytest.raises(AcquisitionError, match=r"camera pixels are .* closer"):
-        acquire(camera(0.95), strategy="pixel", response=LINE)
+        acquire(camera(0.95), strategy="pixel", response=LINE, geometry=geometry)
 
 
-def test_it_is_stored_reported_and_forecast(tmp_path: Path) -> None:
+def test_it_is_stored_reported_and_forecast(tmp_path: Path, monkeypatch: Any) -> None:
     """Out of focus: the store has it, the report says it, and forecasts are as large as the error."""
     path = tmp_path / "T.zarr"
     T = acquire(camera(3.0, 1.0), strategy="hadamard", store=path, response=LINE)
@@ -112,6 +113,10 @@ def test_it_is_stored_reported_and_forecast(tmp_path: Path) -> None:
     forecast = forecast_picture(path, p).ravel()[~T.masked]
     assert error > 0.05
     assert 0.5 * error < np.linalg.norm(forecast) / np.linalg.norm(seen) < 1.5 * error
+    extras = [name for name in BlockStore.open(path).extras if not name.endswith("doubtful")]
+    monkeypatch.setattr(BlockStore, "extras", property(lambda store: extras))
+    with pytest.raises(FileError, match="earlier ltcl"):
+        Calibration.of(path)
 
 
 def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_path: Path) -> None:
@@ -136,14 +141,3 @@ def test_a_dark_patch_in_bright_walls_is_masked_where_it_is_not_resolved(tmp_pat
     assert (scale * white > 0.4 * exact).all()  # 0.44 to 0.79 at the rim, by the noise of the camera
     rows = np.asarray(T @ np.eye(len(rho), dtype=np.float32).reshape(-1, *GRID))
     assert scale * rows.min() > -0.015 * exact.max()  # errors of the map at bright walls: up to 0.012
-
-
-def test_a_store_of_an_earlier_ltcl_is_named(tmp_path: Path, monkeypatch: Any) -> None:
-    path = tmp_path / "T.zarr"
-    acquire(VirtualRig(0.5 * np.eye(32), (4, 8), bits=12), geometry="aligned", strategy="pixel", store=path)
-    assert Calibration.of(path).sharpness is None
-
-    extras = [name for name in BlockStore.open(path).extras if not name.endswith("doubtful")]
-    monkeypatch.setattr(BlockStore, "extras", property(lambda store: extras))
-    with pytest.raises(FileError, match="earlier ltcl"):
-        Calibration.of(path)

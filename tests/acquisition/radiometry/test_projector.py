@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ltcl.acquisition.radiometry import ProjectorResponse, Radiance, mixing, projector_response
+from ltcl.acquisition.radiometry import Radiance, mixing, projector_response
 from ltcl.errors import InputError
 from tests.acquisition.radiometry.cameras import CURVES, corner
 
@@ -21,19 +21,20 @@ def ramp(decode, sigma: float, scale: float = 1.0) -> list[Radiance]:
     ambient, share = 0.05 * corner(64), scale * corner(64)[::-1]
     ones = np.ones(share.shape)
     clean = [ambient + decode(c) * share for c in CODES]
-    return [Radiance(part + random.normal(0, sigma, ones.shape), sigma**2 * ones, ones > 0) for part in clean]
+    return [Radiance(L + random.normal(0, sigma, ones.shape), sigma**2 * ones, ones > 0) for L in clean]
 
 
 @pytest.mark.parametrize("curves", [["linear"], ["gamma2.2"], ["srgb", "linear", "film"]])
 def test_the_projectors_curve_is_estimated_of_each_channel(curves):
     decodes, codes = [CURVES[curve][1] for curve in curves], np.linspace(0, 1, 500)
-    response = projector_response(CODES, [ramp(decode, 0.005) for decode in decodes])
+    ramps = [ramp(decode, 0.005) for decode in decodes]
+    ramps[0][5].valid[:8], ramps[0][5].value[:8] = False, 0.0  # which must not count
+    response = projector_response(CODES, ramps)
     light, same = (
         np.stack([decode(codes) for decode in ds], axis=-1) for ds in (decodes, [np.array] * len(curves))
     )
     np.testing.assert_allclose(response.linear(same), light, atol=2e-3)
     np.testing.assert_allclose(response.linear(response.codes(same)), same, atol=1e-5)
-    assert isinstance(response, ProjectorResponse)
 
 
 def test_noise_in_black_and_white_is_no_bias():
@@ -53,19 +54,12 @@ def test_a_colour_that_the_channel_does_not_light_does_not_decide():
     np.testing.assert_allclose(projector_response(CODES, [pictures]).linear(CODES), CODES, atol=0.01)
 
 
-def test_invalid_pixels_do_not_count():
-    pictures = ramp(lambda c: c**2, 1e-4)
-    pictures[5].valid[:8] = False
-    pictures[5].value[:8] = 0.0
-    np.testing.assert_allclose(projector_response(CODES, [pictures]).linear(CODES), CODES**2, atol=1e-3)
-
-
 FLAT = Radiance(np.full((2, 2), 0.1), np.full((2, 2), 1e-6), np.full((2, 2), True))
 DARK = Radiance(np.zeros((2, 2)), np.full((2, 2), np.inf), np.full((2, 2), False))
 
 
 @pytest.mark.parametrize(
-    ("codes", "pictures", "part"),
+    ("codes", "pictures", "message"),
     [
         ([0.0, 0.5], [FLAT, FLAT], "codes is"),
         ([0.0, 1.0], [FLAT], r"channels\[0\] holds 1 .* 2"),
@@ -73,8 +67,8 @@ DARK = Radiance(np.zeros((2, 2)), np.full((2, 2), np.inf), np.full((2, 2), False
         ([0.0, 1.0], [FLAT, DARK], r"channels\[0\] have no pixel"),
     ],
 )
-def test_pictures_without_a_response_are_refused(codes, pictures, part):
-    with pytest.raises(InputError, match=part):
+def test_pictures_without_a_response_are_refused(codes, pictures, message):
+    with pytest.raises(InputError, match=message):
         projector_response(codes, [pictures])
 
 
@@ -99,29 +93,27 @@ def test_the_mixing_of_a_set_up_is_estimated_without_bias_less_black():
     np.testing.assert_array_equal(np.diagonal(estimates[0]), 1.0)
 
 
-@pytest.mark.parametrize(("condition", "refused"), [(0.9e6, False), (1.1e6, True)])
-def test_mixings_are_refused_from_a_condition_number_of_a_million(condition, refused):
+def test_mixings_are_refused_from_a_condition_number_of_a_million():
     """[[1, 1 - d], [1 - d, 1]] has the condition number (2 - d) / d."""
-    d = 2.0 / (condition + 1.0)
-    nearly = np.array([[1.0, 1.0 - d, 0.0], [1.0 - d, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    assert np.linalg.cond(nearly) == pytest.approx(condition, rel=1e-6)
-    pictures = lit(0.0, nearly)
-    if refused:
-        with pytest.raises(InputError, match=r"condition number 1\.1e\+06"):
-            mixing(pictures, BLACK)
-    else:
-        np.testing.assert_allclose(mixing(pictures, BLACK), nearly, atol=1e-12)
+    for condition in (0.9e6, 1.1e6):
+        nearly = np.eye(3)
+        nearly[0, 1] = nearly[1, 0] = 1.0 - 2.0 / (condition + 1.0)
+        pictures = lit(0.0, nearly)
+        if condition < 1e6:
+            np.testing.assert_allclose(mixing(pictures, BLACK), nearly, atol=1e-12)
+    with pytest.raises(InputError, match=r"condition number 1\.1e\+06"):
+        mixing(pictures, BLACK)
 
 
 def test_pictures_without_a_mixing_are_refused():
     good = lit(1e-3)
     dark, unknown = replace(good[0], value=0 * WALL), replace(good[0], valid=np.zeros(WALL.shape, bool))
     grey = replace(good[0], value=WALL[..., 0])
-    for pictures, part in (
+    for pictures, message in (
         (good[:2], "lit holds 2"),
         ([dark, dark, dark], r"lit\[0\]"),
         ([good[0], grey, good[2]], r"lit\[1\] has shape \(64, 64\)"),
         ([unknown, *good[1:]], "lit have no pixel"),
     ):
-        with pytest.raises(InputError, match=part):
+        with pytest.raises(InputError, match=message):
             mixing(pictures, BLACK)

@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files as cameras write them: JPEG, PNG and TIFF with EXIF, and a small uncompressed DNG."""
+"""Files as cameras write them: JPEG, PNG and TIFF with EXIF, a small uncompressed DNG; a shooting list."""
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
+
+
+def shooting_list(folder: Path) -> list[dict[str, str]]:
+    with (folder / "shots.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def write(path: Path, codes: np.ndarray, seconds: float | None = None) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -55,21 +54,15 @@ def capture(monkeypatch: pytest.MonkeyPatch) -> Open:
     return connect
 
 
-@pytest.mark.parametrize(
-    ("backend", "off", "seconds", "units"),
-    [("V4L2", 1.0, 1 / 60, 167), ("MSMF", 0.0, 1 / 64, -6), ("DSHOW", 0.0, 1 / 4, -2)],
-)
-def test_automatics_are_off_and_exposures_in_the_units_of_the_backend(
-    capture: Open, backend: str, off: float, seconds: float, units: float
-) -> None:
-    driver = capture(backend=backend)
+def test_automatics_are_off_and_exposures_in_the_units_of_v4l2(capture: Open) -> None:
+    driver = capture()
     with OpenCVCamera(0) as camera:
-        camera.expose(seconds)
-        assert (driver.values[AUTO], driver.values[WHITE], driver.values[EXPOSURE]) == (off, 0, units)
-        assert json.loads(json.dumps(camera.describe()))["backend"] == backend
+        camera.expose(1 / 60)
+        assert (driver.values[AUTO], driver.values[WHITE], driver.values[EXPOSURE]) == (1, 0, 167)
+        assert camera.describe()["backend"] == "V4L2"
     assert not driver.open
-    capture(backend=backend, stuck={AUTO: -1.0, WHITE: -1.0})  # nothing adapts
-    OpenCVCamera(0).expose(seconds)
+    capture(stuck={AUTO: -1.0, WHITE: -1.0})  # nothing adapts
+    OpenCVCamera(0).expose(1 / 60)
 
 
 @pytest.mark.parametrize(
@@ -81,11 +74,9 @@ def test_automatics_are_off_and_exposures_in_the_units_of_the_backend(
         ({"stuck": SIDES}, {"size": (720, 1280)}, 0.01, AcquisitionError, r"\(480, 640\); .*\(720, 1280\)"),
         ({}, {}, 1 / 6000, AcquisitionError, r"exposure 0\.0001667 s .* 0\.0002 s"),
         ({}, {"seconds": 0.02}, 0.04, InputError, r"seconds is 0\.04; .* 0\.02"),
-        ({"backend": "AVFOUNDATION"}, {}, 0.02, InputError, "seconds is None; .* of 0: AVFOUNDATION"),
+        ({"backend": "AVFOUNDATION"}, {}, 0.02, InputError, "seconds is None; .*AVFOUNDATION"),
         ({}, {"source": 1.5}, 0.01, InputTypeError, r"source is 1\.5"),
-        ({}, {"channels": 2}, 0.01, InputError, "channels is 2"),
-        ({}, {"seconds": 0.0}, 0.01, InputError, r"seconds is 0\.0"),
-        ({}, {"size": (0, 4)}, 0.01, InputError, "size is"),
+        *(({}, {name: 0.0}, 0.01, InputError, f"{name} is 0.0") for name in ("channels", "seconds", "size")),
     ],
 )
 def test_what_a_camera_does_not_do_is_refused(
@@ -106,30 +97,20 @@ def test_exposures_are_stated_or_where_the_driver_clips(capture: Open) -> None:
     assert OpenCVCamera(0).limits == (3e-4, 0.2047)
 
 
-def test_frames_are_rgb_or_green_or_grey(capture: Open) -> None:
+def test_frames_are_rgb_or_green_or_grey_or_missing(capture: Open, tmp_path: Path) -> None:
     driver = capture()
     np.testing.assert_array_equal(OpenCVCamera(0).frame(), PICTURE)
-    green = OpenCVCamera(0, channels=1)
+    green = OpenCVCamera(tmp_path / "stream.avi", channels=1)
+    assert green.describe()["source"] == "stream.avi"
     np.testing.assert_array_equal(green.frame(), PICTURE[..., 1])
     for grey in (PICTURE[..., 0], PICTURE[..., :1]):
         driver.image = grey
         np.testing.assert_array_equal(green.frame(), PICTURE[..., 0])
-
-
-def test_a_video_file_is_read_to_its_end(tmp_path: Path) -> None:
-    path = tmp_path / "steps.avi"
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (32, 16))
-    for level in (0, 80, 160):
-        video.write(np.full((16, 32, 3), level, np.uint8))
-    video.release()
-    with OpenCVCamera(path, channels=1, seconds=1 / 30) as camera:
-        assert not camera.stream
-        np.testing.assert_allclose([camera.frame().mean() for _ in range(3)], [0, 80, 160], atol=4)
-        with pytest.raises(AcquisitionError, match="stream has ended"):
-            camera.frame()
-        assert camera.describe()["source"] == "steps.avi"
-    with pytest.raises(AcquisitionError, match=r"OpenCV cannot open .*none\.avi"):
-        OpenCVCamera(tmp_path / "none.avi", seconds=1.0)
+    driver.image, driver.open = None, False
+    with pytest.raises(AcquisitionError, match="stream has ended"):
+        green.frame()
+    with pytest.raises(AcquisitionError, match="OpenCV cannot open 7"):
+        OpenCVCamera(7)
 
 
 class GPhoto2Error(Exception):
@@ -187,16 +168,15 @@ def test_a_tethered_camera_exposes_and_photographs(body: Body, name: str) -> Non
         assert body.settings[name] == "10/1250"
         np.testing.assert_allclose(camera.frame().mean(axis=(0, 1)), (90, 120, 150), atol=4)
         assert not body.path.exists()  # nothing is left on the camera
-        assert json.loads(json.dumps(camera.describe()))["iso"] == "100"
+        assert camera.describe()["iso"] == "100"
         with pytest.raises(InputError, match=r"seconds is 0\.5; .* 0\.25"):
             camera.expose(0.5)
     np.testing.assert_allclose(GPhoto2Camera(channels=1).frame(), np.full((16, 24), 120), atol=4)
 
 
-SETTINGS = ["autoexposuremode=AV", "expprogram=A", "iso=Auto", "isoauto=On", "whitebalance=Automatic"]
-
-
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize(
+    "setting", ["autoexposuremode=AV", "expprogram=A", "iso=Auto", "whitebalance=Automatic"]
+)
 def test_automatics_of_a_tethered_camera_are_refused(body: Body, setting: str) -> None:
     name, value = setting.split("=")
     body.settings[name] = value
@@ -212,10 +192,6 @@ def test_what_fails_on_the_cable_is_named(body: Body, monkeypatch: pytest.Monkey
         body.obedient = False
         with pytest.raises(AcquisitionError, match="shutterspeed at '1s'; '1/4'"):
             camera.expose(0.25)
-        broken = SimpleNamespace(save=lambda path: Path(path).write_bytes(b"no picture"))
-        monkeypatch.setattr(body, "file_get", lambda *_: broken)
-        with pytest.raises(AcquisitionError, match=r"file cannot be used: .*IMG_0001"):
-            camera.frame()
         body.connected = False
         with pytest.raises(AcquisitionError, match=r"photograph: \[-52\]"):
             camera.frame()

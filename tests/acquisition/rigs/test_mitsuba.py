@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -104,18 +103,15 @@ def test_one_bounce_is_that_of_quadrature() -> None:
 
 @pytest.mark.parametrize(("name", "walls"), [("dihedral", 2), ("trihedral", 3), ("box", 5)])
 def test_all_walls_of_a_scene_are_lit_and_seen(name: str, walls: int) -> None:
-    colours = np.eye(walls, 3) * 0.5 + 0.1 if walls <= 3 else np.full((walls, 3), 0.6)
+    colours = np.arange(3 * walls).reshape(walls, 3) % 5 / 5 + 0.1  # no two walls have the same hue
     grid, options = (24, 32), {"albedo": colours, "depth": 2, **LINEAR}
-    image = MitsubaRig(name, grid, **options).radiance(np.ones(grid))
-    lit = image.max(axis=-1) > 0
+    views = [MitsubaRig(name, grid, baseline=x, **options).radiance(np.ones(grid)) for x in (0.0, 1.0)]
+    lit, hues = views[0].max(axis=-1) > 0, colours / np.linalg.norm(colours, axis=1, keepdims=True)
     assert 0.3 < lit.mean() < 1  # walls fill the frame, with black around
-    if walls <= 3:
-        assert set(image.argmax(axis=-1)[lit].tolist()) == set(range(walls))
-    if name == "dihedral":
-        assert image[12, 10].argmax() == 0  # the first wall, red, is the left one
-        right = MitsubaRig(name, grid, baseline=1.0, **options).radiance(np.ones(grid))
-        red = [np.mean(view.argmax(axis=-1)[view.max(axis=-1) > 0] == 0) for view in (image, right)]
-        assert red[1] > red[0] + 0.03  # a camera to the right sees more of the left wall
+    nearest = [np.argmax(view[view.max(axis=-1) > 0] @ hues.T, axis=1) for view in views]
+    assert set(nearest[0]) == set(range(walls))
+    if name == "dihedral":  # a camera to the right sees more of the left wall
+        assert np.mean(nearest[1] == 0) > np.mean(nearest[0] == 0) + 0.03
 
 
 def test_it_is_a_rig_that_leaves_the_variant_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,7 +120,7 @@ def test_it_is_a_rig_that_leaves_the_variant_of_others(monkeypatch: pytest.Monke
     image = shots.photograph(np.ones(GRID), 1.0)
     assert (image.shape, shots.levels, shots.camera_grid) == ((5, 7, 3), 4096, (5, 7))
     assert mi.variant() == "scalar_spectral"
-    facts = json.loads(json.dumps(shots.describe()))["rig"]
+    facts = shots.describe()["rig"]
     assert (facts["kind"], facts["scene"], facts["variant"]) == ("mitsuba", "trihedral", "scalar_rgb")
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(AcquisitionError, match=r"mitsuba.*ltcl\[rig\]"):
@@ -146,11 +142,7 @@ ELSEWHERE = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "hei
         ({"sensor": ELSEWHERE}, InputError, "scene shows no light"),
         ({"scene": {"type": "scene"}, "albedo": 0.5}, InputError, "albedo is of dihedral, trihedral, box"),
         ({"albedo": 1.0}, InputError, "albedo .* 1 to 1"),
-        ({"baseline": 9.0}, InputError, r"baseline is 9\.0"),
-        ({"projector_grid": (0, 2)}, InputError, "projector_grid is"),
-        ({"channels": 2}, InputError, "channels is 2"),
-        ({"sensitivity": 0.0}, InputError, r"sensitivity is 0\.0"),
-        ({"variant": "scalar_mono"}, InputError, "variant is 'scalar_mono'; .*scalar_rgb"),
+        *(({name: -9.0}, InputError, f"{name} is -9") for name in ("baseline", "channels", "sensitivity")),
     ],
 )
 def test_bad_scenes_and_arguments_are_named(

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -30,13 +29,12 @@ def matrix(rows: int = N) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_grey_photographs_follow_the_equations(kind: Any) -> None:
-    T, x, seconds, ambient = matrix(), random.random(GRID), 0.75, random.random(N) / 10
-    settings = {**CLEAN, "black": 0.03, "projector_black": 0.02, "sensitivity": 0.9}
-    rig = VirtualRig(kind(T), GRID, **settings, ambient=ambient)
-    L = T @ (0.02 + 0.98 * from_srgb(x).ravel()) + ambient
+    T, C, x, ambient = matrix(20), random.random((30, 20)), random.random(GRID), random.random(20) / 10
+    settings = {**CLEAN, "black": 0.03, "projector_black": 0.02, "sensitivity": 0.09, "ambient": ambient}
+    rig = VirtualRig(kind(T), GRID, **settings, camera_grid=(5, 6), camera_map=C)
+    L = C @ (T @ (0.02 + 0.98 * from_srgb(x).ravel()) + ambient)
     np.testing.assert_allclose(rig.radiance(x).ravel(), L, rtol=1e-5)
-    expected = 0.03 + 0.97 * (0.9 * seconds * L)
-    np.testing.assert_allclose(rig.photograph(x, seconds).ravel(), expected, rtol=1e-5)
+    np.testing.assert_allclose(rig.photograph(x, 0.75).ravel(), 0.03 + 0.97 * 0.09 * 0.75 * L, rtol=1e-5)
 
 
 @pytest.mark.parametrize("as_transport", [False, True])
@@ -53,13 +51,6 @@ def test_colour_photographs_follow_the_equations(as_transport: bool) -> None:
     np.testing.assert_allclose(rig.photograph(x, 1.0).reshape(N, 3), expected, rtol=1e-5)
     grey = random.random(GRID)
     np.testing.assert_array_equal(rig.radiance(grey), rig.radiance(np.repeat(grey[..., None], 3, axis=-1)))
-
-
-def test_a_map_warps_a_column() -> None:
-    T, C, x = matrix(rows=20), random.random((30, 20)), np.zeros(GRID)
-    x[1, 2] = 1.0
-    warped = VirtualRig(T, GRID, camera_grid=(5, 6), camera_map=C, ambient=0.5, **CLEAN)
-    np.testing.assert_allclose(warped.radiance(x).ravel(), C @ (T[:, 6] + 0.5), rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["linear", "srgb", "gamma2.2", "film"])
@@ -99,25 +90,22 @@ def test_read_noise_is_normal_and_of_each_pixel() -> None:
 
 def test_saturation_offset_and_noise_below_zero() -> None:
     assert np.all(exposed(1e18, bits=8, gain=1000.0, read=0.01, response="srgb") == 255)
-    x = exposed(0.0, read=0.01, black=0.1)
-    assert abs(x.mean() - 0.1) < 4 * 0.009 / np.sqrt(PIXELS)
+    assert abs(exposed(0.0, read=0.01, black=0.1).mean() - 0.1) < 4 * 0.009 / np.sqrt(PIXELS)
     assert exposed(0.0, read=0.01, bits=16).min() == 0
 
 
 @pytest.mark.parametrize(("bits", "levels"), [(8, 256), (10, 1024), (16, 65536), ("float", None)])
 def test_levels(bits: Any, levels: int | None) -> None:
-    rig = VirtualRig(matrix(), GRID, **{**CLEAN, "bits": bits}, exposures=(0.25, 1.0))
-    shots, x = Shots(rig), random.random(GRID)
-    np.testing.assert_allclose(shots.photograph(x, 1.0), rig.radiance(x), atol=0.51 / ((levels or 1e6) - 1))
-    assert (shots.levels, shots.exposures) == (levels, (0.25, 1.0))
-    assert json.loads(json.dumps(shots.describe(), allow_nan=False))["rig"]["kind"] == "virtual"
+    rig, x = VirtualRig(matrix(), GRID, **{**CLEAN, "bits": bits}), random.random(GRID)
+    code = (shots := Shots(rig)).photograph(x, 1.0)
+    np.testing.assert_allclose(code, rig.radiance(x), atol=0.51 / ((levels or 1e6) - 1))
+    assert shots.levels == levels
 
 
 def test_a_resumed_run_sees_the_same_noise() -> None:
     T, x, y = matrix(), random.random(GRID), random.random(GRID)
     first, resumed = (VirtualRig(T, GRID, bits=12, gain=500.0, read=0.01, seed=4) for _ in range(2))
-    straight = [first.photograph(*shot) for shot in [(x, 1.0), (y, 1.0), (x, 1.0), (x, 0.5)]]
-    np.testing.assert_array_equal(resumed.photograph(x, 0.5), straight[3])
+    straight = [first.photograph(codes, 1.0) for codes in (x, y, x)]
     resumed.recall(x, 1.0, straight[0])
     np.testing.assert_array_equal(resumed.photograph(x, 1.0), straight[2])
     np.testing.assert_array_equal(resumed.photograph(y, 1.0), straight[1])
@@ -135,14 +123,11 @@ def test_noise_differs_with_codes_seconds_repeat_and_seed() -> None:
     ("change", "part"),
     [
         ({"grid": (3, 5)}, "grid is 3 x 5 = 15 pixels"),
-        ({"T": np.ones((20, N))}, "camera_grid is None; .* 20 camera pixels"),
+        ({"T": np.ones((20, N))}, "camera_grid is 3 x 4 = 12 pixels; .* 20"),
         ({"camera_grid": (2, 5)}, "camera_grid is 2 x 5"),
         ({"camera_map": np.ones((12, 7))}, r"camera_map has shape .*\(12, 7\)"),
-        ({"ambient": -0.1}, "ambient is as low as -0.1"),
         ({"ambient": [0.1, 0.2, 0.3]}, r"ambient has shape \(3,\)"),
-        ({"sensitivity": 0.0}, "sensitivity"),
-        ({"read": -1e-3}, "read"),
-        ({"bits": 7}, "bits is 7"),
+        *(({name: -1}, f"{name} is (as low as )?-1") for name in ("ambient", "sensitivity", "read", "bits")),
         ({"response": "sRGB"}, "response is 'sRGB'; .* linear, srgb, film, gamma2.2"),
     ],
 )

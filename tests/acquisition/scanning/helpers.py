@@ -21,7 +21,7 @@ def corner(n: int = 8, albedo: float = 0.6) -> np.ndarray:
 
 
 def rig(n: int = 8, **options: Any) -> VirtualRig:
-    """A camera on the projector's pixels, with 12 bits unless told."""
+    """A camera on the projector's pixels, by default with 12 bits."""
     return VirtualRig(corner(n), (n, 2 * n), **{"bits": 12, "ambient": 0.01, **options})
 
 
@@ -31,22 +31,21 @@ def dense(T: ltcl.Transport) -> np.ndarray:
     return (T @ np.eye(n).reshape(n, *T.grid)).reshape(n, n).T.astype(np.float64)
 
 
-def held(grid: tuple[int, int], count: int = 6) -> np.ndarray:
-    """Patterns that no scan has seen: noise, stripes, smooth ones; (N, count)."""
-    rng = np.random.default_rng(11)
+def unseen_patterns(grid: tuple[int, int]) -> np.ndarray:
+    """Patterns that no scan has seen: three smooth ones, three of noise; (N, 6)."""
     y, x = np.mgrid[: grid[0], : grid[1]] / max(grid)
-    smooth = [0.5 + 0.5 * np.sin(9 * x + k + 5 * y) for k in range(count // 2)]
-    return np.stack([*smooth, *rng.random((count - count // 2, *grid))]).reshape(count, -1).T
+    smooth = [0.5 + 0.5 * np.sin(9 * x + k + 5 * y) for k in range(3)]
+    return np.stack([*smooth, *np.random.default_rng(11).random((3, *grid))]).reshape(6, -1).T
 
 
-def unit(found: np.ndarray, truth: np.ndarray) -> float:
+def unit(measured: np.ndarray, truth: np.ndarray) -> float:
     """The camera's unit of light, which nothing but its last code fixes: least squares of row sums."""
-    ours, theirs = found.sum(axis=1), truth.sum(axis=1)
+    ours, theirs = measured.sum(axis=1), truth.sum(axis=1)
     return float(ours @ theirs / (ours @ ours))
 
 
-def off(found: np.ndarray, truth: np.ndarray, grid: tuple[int, int]) -> float:
-    """Largest relative error of T p over held patterns, in the camera's unit."""
-    P = held(grid)
-    ours, theirs = unit(found, truth) * (found @ P), truth @ P
+def relative_error(measured: np.ndarray, truth: np.ndarray, grid: tuple[int, int]) -> float:
+    """The largest of T p, in the camera's unit."""
+    P = unseen_patterns(grid)
+    ours, theirs = unit(measured, truth) * (measured @ P), truth @ P
     return float(np.max(np.linalg.norm(ours - theirs, axis=0) / np.linalg.norm(theirs, axis=0)))

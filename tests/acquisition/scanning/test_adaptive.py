@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Scans by cells: what is flat in cells comes back exactly, sums always do, and few patterns are needed.
-
-Also blocks of pixels, and the colours of cells that are lit together.
-"""
+"""Scans by cells: what is flat in cells comes back exactly, sums always do, and few patterns are needed."""
 
 from __future__ import annotations
 
@@ -14,11 +11,9 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition.geometry.resample import Blocks
 from ltcl.acquisition.scanning import adaptive
-from ltcl.acquisition.scanning.adaptive import Cells, colour
+from ltcl.acquisition.scanning.adaptive import Cells
 from ltcl.acquisition.scanning.pictures import Picture
-from ltcl.errors import InputError
 from ltcl.transport import from_arrays
 
 random = np.random.default_rng(0)
@@ -55,16 +50,15 @@ def scan(known: Any, threshold: float = 0.004) -> adaptive.Core:
 
 def dense(core: adaptive.Core) -> np.ndarray:
     """(channels, M, N)."""
-    return np.stack([sum(C.toarray()[:, of] for of in core.cells.of_pixels()) for C in core.matrices()])
+    return np.stack([C @ core.cells.W.toarray() for C in core.matrices()])
 
 
 def flat(grid: tuple[int, int], channels: int) -> np.ndarray:
     """A T whose rows are strong at their own pixel, and flat in every cell that it is not in."""
-    of, n = Cells(grid).of_pixels(), grid[0] * grid[1]
-    T = np.zeros((channels, n, n))
+    n = grid[0] * grid[1]
+    T, cells = np.tile(np.eye(n), (channels, 1, 1)), Cells(grid).W.T.tocsr().indices.reshape(n, -1)
     for i in range(n):
-        T[:, i, i] = 1.0
-        for finer, coarser in pairwise(of):
+        for finer, coarser in pairwise(cells.T):  # of each pixel
             for cell in np.unique(finer[(coarser == coarser[i]) & (finer != finer[i])]):
                 T[:, i, finer == cell] = 0.01 * random.random((channels, 1)) / np.sum(finer == cell)
     return T
@@ -116,14 +110,10 @@ def test_the_core_as_a_transport(device: Any, grid: tuple[int, int], channels: i
     expected = np.einsum("cij,cd,jd->ic", C, mixing, x)
     shown = np.asarray(T @ x.reshape(*grid, channels).squeeze())
     np.testing.assert_allclose(shown.reshape(n, -1), expected, rtol=1e-4)
-
-
-def test_the_core_is_inverted_from_products_with_it(device: Any) -> None:
-    core = scan(Known(flat((5, 7), 1) + 2.0 * np.eye(35), (5, 7)), threshold=0.03)
-    T = from_arrays(adaptive.arrays(core), device=device)
-    inverse = ltcl.invert(T, 1e-2, basis=("db2", "pixels"))
-    B = np.eye(35) - inverse.systems[0].R.to_dense()
-    assert np.linalg.norm(np.eye(35) - B @ (dense(core)[0] / T.first_bounce), 2) <= inverse.error <= 1e-2
+    if channels == 1 and n > 1:
+        inverse = ltcl.invert(T, 1e-2, basis=("db2", "pixels"))
+        B = np.eye(n) - inverse.systems[0].R.to_dense()
+        assert np.linalg.norm(np.eye(n) - B @ (C[0] / T.first_bounce), 2) <= inverse.error <= 1e-2
 
 
 def test_variance_of_light_that_stays_at_a_cell() -> None:
@@ -132,26 +122,3 @@ def test_variance_of_light_that_stays_at_a_cell() -> None:
     core = scan(Known(np.ones((1, 16, 16)), (4, 4), v**0.5), threshold=0.9)
     variance = core.matrices("variance")[0][:, slice(*core.cells.offsets[1:3])].toarray()
     np.testing.assert_allclose(variance, np.full((16, 4), 0.8 * v / 4**2))
-
-
-@pytest.mark.parametrize(("pixels", "side"), [((5, 7), 2), ((5, 7), 3), ((4, 4), 1), ((2, 9), 9)])
-def test_blocks(pixels: tuple[int, int], side: int) -> None:
-    blocks = Blocks(pixels, side)
-    x, picture = random.random(blocks.grid), random.random(pixels)
-    enlarged = np.kron(x, np.ones((side, side)))[: pixels[0], : pixels[1]]
-    np.testing.assert_array_equal(blocks.enlarged(x), enlarged)
-    assert np.vdot(blocks.sum(picture), x) == pytest.approx(np.vdot(picture, enlarged))
-    with pytest.raises(InputError, match=r"block.*0"):
-        Blocks(pixels, 0)
-
-
-@pytest.mark.parametrize("density", [0.08, 0.16, 0.32])
-def test_cells_of_one_colour_do_not_conflict(density: float) -> None:
-    active = random.random((40, 60)) < density
-    active[:2, 0] = True
-    starts = np.concatenate([[0], np.cumsum(active.sum(axis=1))])
-    colours = colour(starts, np.nonzero(active)[1], 60)
-    for number in range(colours.max() + 1):
-        assert active[colours == number].sum(axis=0).max() <= 1
-    conflicts = (active.astype(int) @ active.T > 0).sum(axis=1) - 1
-    assert active.sum(axis=0).max() <= colours.max() + 1 <= conflicts.max() + 1  # greedy is no worse

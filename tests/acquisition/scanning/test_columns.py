@@ -56,24 +56,19 @@ def test_other_sizes_are_refused(size: float) -> None:
 def test_a_weak_block_is_significant_though_no_entry_stands_out() -> None:
     value, block = 0.3 * random.standard_normal((200, M)), np.zeros(GRID, bool)
     block[4:12, 8:16] = True
-    value[:, block.ravel()] += 1.0
-    value = np.clip(value, -2.9, 2.9)  # below three standard deviations, all of them
+    value = np.clip(value + block.ravel(), -2.9, 2.9)  # below three standard deviations, all of them
     keep = significant(value, np.ones_like(value), GRID)
     assert keep[:, block.ravel()].mean() > 0.999
     assert np.sum(value[keep]) == pytest.approx(np.sum(value), rel=0.05)
 
 
-def test_noise_is_dropped_without_a_bias() -> None:
+def test_noise_is_dropped_without_a_bias_and_weak_light_is_not() -> None:
+    """0.4 standard deviations in all of a column; 0.1 in all columns, of which one is too little."""
     value = random.standard_normal((400, M))
     keep = np.concatenate([significant(x, np.ones_like(x), GRID) for x in np.split(value, 40)])
     assert keep.mean() < 0.05
     assert abs(np.sum(value[keep])) < 4 * np.sqrt(np.sum(value[keep] ** 2))
-
-
-def test_sums_show_weak_light() -> None:
-    """0.4 standard deviations in all of a column; 0.1 in all columns, of which one is too little."""
-    value = random.standard_normal((50, M)) + 0.4
-    assert significant(value, np.ones_like(value), GRID).mean() > 0.99
+    assert significant(value + 0.4, np.ones_like(value), GRID).mean() > 0.99
     weak = np.full((64, M), 0.1)
     assert not significant(weak[:1], np.ones((1, M)), GRID).any()
     assert significant(weak, np.ones((64, M)), GRID).all()
@@ -84,8 +79,6 @@ def test_strong_and_unknown_entries_stand_alone() -> None:
     value[0, 7], variance[0, 9] = 8.0, UNKNOWN
     np.testing.assert_array_equal(np.flatnonzero(significant(value, variance, GRID)), [7, 9])
     assert significant(value, variance, GRID, 0.0).all()
-    with pytest.raises(InputError, match="sigmas is -1"):
-        significant(value, variance, GRID, -1)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 7), (5, 1)])
@@ -107,8 +100,6 @@ def test_rows_of_which_something_is_not_known_stay() -> None:
     np.testing.assert_array_equal(rows.data[:4], 0.5)
     np.testing.assert_array_equal(variance[:4], v[:4])
     assert (rows.data[4:] > 0.5).all()
-    empty, _ = balance(scipy.sparse.csr_array((2, 3)), np.zeros(0), Picture(np.ones(2), np.zeros(2)))
-    assert empty.nnz == 0
 
 
 def test_the_part_of_dropped_entries_goes_to_the_others() -> None:

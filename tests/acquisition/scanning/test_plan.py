@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import VirtualRig, camera_map
+from ltcl.acquisition import camera_map
 from ltcl.acquisition.calibrate import photographs
 from ltcl.acquisition.radiometry import NoiseModel
 from ltcl.acquisition.scanning import Hadamard, Light, Pixels, plans
 from ltcl.acquisition.scanning.plan import choose
 
 from ..stopping import Unplugged
-from .helpers import corner
+from .helpers import corner, dense, relative_error, rig
 
 random = np.random.default_rng(0)
 GRID = (16, 16)
@@ -54,7 +54,6 @@ def test_errors_are_those_of_decoded_photographs(strategy: str, code: Any, camer
     [
         ("photons", GRID, (1.0,), 0.0, "pixel"),
         ("reading", GRID, (1.0,), 0.0, "hadamard"),
-        ("rounding", GRID, (1.0,), 0.0, "hadamard"),
         ("photons", GRID, (0.5, 1.0), 0.3, "hadamard"),  # of the ambient light only shot noise is left
         ("both", (16, 32), (0.5, 8.0), 0.01, "adaptive"),
         ("both", (64, 64), (0.5, 8.0), 0.01, "adaptive"),
@@ -64,51 +63,35 @@ def test_auto_weighs_the_noise(camera: str, grid: Any, exposures: Any, ambient: 
     assert choose(plans(grid, exposures, CAMERAS[camera], Light(0.5, 0.2, ambient)))[0] == strategy
 
 
-@pytest.mark.parametrize(("gain", "read", "ambient"), [(20000.0, 0.0005, 0.0), (1000.0, 0.003, 0.3)])
-def test_auto_takes_what_gives_the_better_picture(gain: float, read: float, ambient: float) -> None:
+def test_auto_takes_what_gives_the_better_picture() -> None:
     """T p of a dihedral, scanned in all three ways: none is far better than the one that auto takes."""
-    truth = ltcl.scenes.dihedral(8, albedo=0.6).transport()
-    p, white = random.random(truth.grid), np.ones(truth.grid)
     error = {}
     for strategy in ("pixel", "hadamard", "adaptive", "auto"):
-        rig = VirtualRig(truth, truth.grid, bits=12, gain=gain, read=read, ambient=ambient)
-        T = ltcl.acquire(rig, geometry="aligned", strategy=strategy)
-        unit = np.vdot(T @ white, truth @ white) / np.vdot(T @ white, T @ white)
-        error[strategy] = np.linalg.norm(unit * (T @ p) - truth @ p) / np.linalg.norm(truth @ p)
+        T = ltcl.acquire(rig(gain=1000.0, read=0.003, ambient=0.3), geometry="aligned", strategy=strategy)
+        error[strategy] = relative_error(dense(T), corner(), T.grid)
     assert error["auto"] <= 1.5 * min(error.values())
 
 
-@pytest.mark.parametrize(
-    ("by_hand", "geometry", "n", "channels", "strategy"),
-    [
-        (True, "graycode", 8, 1, "pixel"),
-        (True, "graycode", 8, 1, "hadamard"),
-        (False, "graycode", 4, 1, "pixel"),
-        (False, "aligned", 8, 3, "block"),
-    ],
-)
-def test_photographs_are_all_counted(
-    by_hand: bool, geometry: str, n: int, channels: int, strategy: str
-) -> None:
-    """Of the calibration and after each batch, too: correct to 2 %."""
-    T, camera, grid = [corner(n)] * channels if channels == 3 else corner(n), (4 * n, 8 * n), (n, 2 * n)
-    seen = {"camera_grid": camera, "camera_map": camera_map(lambda u, v: (u / 4, v / 4), camera, grid)}
-    rig = Unplugged(T, grid, **(seen if geometry == "graycode" else {}))
-    rig.keeps_photographs = by_hand
-    ltcl.acquire(rig, geometry=geometry, strategy=strategy, exposures=[0.1, 3.0])
-    count = photographs(grid, channels=channels, aligned=geometry == "aligned", by_hand=by_hand)
+@pytest.mark.parametrize("strategy", ["pixel", "hadamard", "block"])
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_photographs_are_all_counted(by_hand: bool, strategy: str) -> None:
+    """Of the calibration and after each batch, too: by hand, and of an aligned camera in colour."""
+    grid, size = (8, 16), (32, 64)
+    seen = {"camera_grid": size, "camera_map": camera_map(lambda u, v: (u / 4, v / 4), size, grid)}
+    camera = Unplugged(corner(), grid, **seen) if by_hand else Unplugged([corner()] * 3, grid)
+    camera.keeps_photographs = by_hand
+    geometry, channels = ("graycode", 1) if by_hand else ("aligned", 3)
+    ltcl.acquire(camera, geometry=geometry, strategy=strategy, exposures=[0.1, 3.0])
+    count = photographs(grid, channels=channels, aligned=not by_hand, by_hand=by_hand)
     plan = plans(grid, (0.1, 3.0), channels=channels, calibration=count)[strategy]
-    assert plan.photographs == pytest.approx(rig.count, rel=0.02)
+    assert plan.photographs == pytest.approx(camera.count, rel=0.02)
 
 
-def test_time_and_disk() -> None:
-    made = plans(GRID, (0.5, 8.0), block=4, overhead=0.25)
-    pixel, block = made["pixel"], made["block"]
+def test_time_disk_and_saturation() -> None:
+    strategies = plans(GRID, (0.5, 8.0), block=4, overhead=0.25)
+    pixel, block = strategies["pixel"], strategies["block"]
     assert pixel.photographs - block.photographs == 2 * (260 - 18) + 4 - 2
     assert pixel.seconds - block.seconds == pytest.approx((260 - 18) * (8.5 + 2 * 0.25) + 2 * (0.5 + 0.25))
     assert (block.grid, pixel.disk) == ((4, 4), 2 * 12 * 256**2)
-
-
-def test_a_scene_that_saturates_has_no_signal() -> None:
     saturated = plans(GRID, (8.0,), NoiseModel(), Light(direct=0.5))
-    assert saturated["pixel"].error == saturated["hadamard"].error == 1.0
+    assert saturated["pixel"].error == saturated["hadamard"].error == 1.0  # no signal
