@@ -27,7 +27,10 @@ from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.errors import AcquisitionError
 
 _SCALE, _FLOOR = 0.02, 0.001  # systematic errors: of light, of full scale
-_ELECTRONS = 3.0  # of light: error of the level of black
+_ELECTRONS, _DIM = (
+    3.0,
+    3.0,
+)  # of light: error of the level of black, common to pixels of less than 3 times that
 _BIAS = 0.2  # of the noise without light: common error of all pixels there
 _CLIP, _DEFECTS, _MEAN = 100.0, 2, 2.5
 _SINGLE = 25.0  # z^2 of each of a few pixels, which a single one has by noise once in a million
@@ -146,7 +149,8 @@ def _in_inverses(
 class _Light(NamedTuple):
     """Seconds (k, 1, 1) of photographs, linear values x above black (k, n, c) and their variance.
 
-    x is inf from `limit` (k, 1, c) on, where it is saturated; `bias`: common error of all pixels.
+    x is inf from `limit` (k, 1, c) on, where it is saturated; `bias`: common error of all pixels;
+    `few`: more of it, of pixels that have hardly more light.
     """
 
     seconds: np.ndarray
@@ -154,6 +158,7 @@ class _Light(NamedTuple):
     variance: np.ndarray
     limit: np.ndarray
     bias: np.ndarray
+    few: np.ndarray
 
     @classmethod
     def of(cls, samples: Sequence[np.ndarray], seconds: Any, sensor: Sensor, L: Any = None) -> _Light:
@@ -173,15 +178,15 @@ class _Light(NamedTuple):
         variance = noise.variance(t * L, response.derivative(curve).reshape(codes.shape))
         few = _ELECTRONS / noise.electrons
         variance = variance + (_SCALE * t * L) ** 2 + _FLOOR**2 + few**2
-        bias = np.full(limit.shape, np.hypot(_BIAS * np.sqrt(noise.variance(0.0)), few))
-        return cls(t, np.where(x < limit, x, np.inf), variance, limit, bias)
+        bias, few = (np.full(limit.shape, b) for b in (_BIAS * np.sqrt(noise.variance(0.0)), few))
+        return cls(t, np.where(x < limit, x, np.inf), variance, limit, bias, few)
 
     def with_known(self, value: np.ndarray, variance: np.ndarray) -> _Light:
         """One more, as the shortest photograph would show what is known."""
         t = self.seconds.min(axis=0, keepdims=True)
         x = t * value
         v = t**2 * variance + (_SCALE * x) ** 2 + _FLOOR**2
-        known = t, x, v, np.full((1, 1, x.shape[2]), np.inf), np.zeros((1, 1, x.shape[2]))
+        known = t, x, v, np.full((1, 1, x.shape[2]), np.inf), *np.zeros((2, 1, 1, x.shape[2]))
         return _Light(*(np.concatenate(pair) for pair in zip(self, known, strict=True)))
 
     def at(self, numbers: Sequence[int]) -> _Light:
@@ -195,7 +200,7 @@ class _Light(NamedTuple):
 
     def mean(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Radiance (n, c) by all photographs, its variance and bias, and where any shows it."""
-        t, x, variance, _, bias = self
+        t, x, variance, _, bias, _ = self
         usable = np.isfinite(x)
         weight = np.where(usable, t / variance, 0.0)
         total = np.sum(weight * t, axis=0)
@@ -208,7 +213,7 @@ class _Light(NamedTuple):
         """How far each photograph is from the others: it deviates above 1."""
         result = np.zeros(len(self.x))
         whole = np.maximum(self.mean()[0], 0.0)
-        for k, (t, x, v, limit, bias) in enumerate(zip(*self, strict=True)):
+        for k, (t, x, v, limit, bias, few) in enumerate(zip(*self, strict=True)):
             L, v_L, bias_L, known = self.without(k).mean()
             variance = v + t**2 * v_L
             z2 = np.minimum((x - t * L) ** 2 / variance, _CLIP)
@@ -217,7 +222,8 @@ class _Light(NamedTuple):
             count = np.count_nonzero(use)
             allowed = _MEAN * count + min(_DEFECTS * _CLIP, _SINGLE * count)
             near = use & (z2 < _CLIP)
-            w, d, s = ((t * whole)[near], (x - t * L)[near], (bias + t * bias_L)[near])
+            s = bias + t * bias_L + few * (t * whole < _DIM * few)
+            w, d, s = ((t * whole)[near], (x - t * L)[near], s[near])
             together = (w @ d) ** 2 / max(w**2 @ variance[near] + (_SCALE * w @ w) ** 2 + (w @ s) ** 2, 1e-30)
             result[k] = max(z2[use].sum() / max(allowed, 1.0), together / _SINGLE)
         return result

@@ -144,6 +144,8 @@ def compensate_frames(
     """
     start = time.perf_counter()
     checks.one_of("format", format, ("png", "exr"))
+    checks.flag("resume", resume)
+    checks.flag("appearance", appearance)
     fps = None if fps is None else checks.number("fps", fps, above=0.0)
     limit = None if frames is None else checks.count("frames", frames)
     bounds = _validate(T, gain, loss, {"codes": codes, "progress": progress}, options)

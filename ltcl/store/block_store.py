@@ -333,7 +333,7 @@ def write(path: Path, content: Record | Parts) -> None:
     if isinstance(content, Parts):
         layout, extras, state = _compressed(content)
     else:
-        T: Any = content.in_memory().matrices
+        T: Any = content.matrices
         dtype = np.result_type(*(M.dtype for M in T), np.float32).name
         layout = Layout(content.shape, content.grid, content.camera_grid, len(T), dtype=dtype)
         extras = {n: np.atleast_2d(a) for n, a in vars(content).items() if n in EXTRAS[2:] and a is not None}

@@ -92,7 +92,7 @@ def read_mat(path: Path, variable: str | None = None) -> Record:
     if b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:]):
         return read_hdf5(path, variable, *_OF_MATLAB)
     if not head.startswith(b"MATLAB 5.0 MAT-file") or head[126:128] != b"IM":
-        raise FileError("is neither MATLAB's version 5 nor 7.3; save it again with -v7 or -v7.3")
+        raise FileError("is neither version 5, little-endian, nor 7.3; save it again with -v7 or -v7.3")
     return _record(_version_5(path), variable, *_OF_MATLAB)
 
 

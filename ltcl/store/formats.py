@@ -48,7 +48,8 @@ def load(
     path
         A .npz file (SciPy's sparse layouts, or arrays: `T` (M, N) or (3, M, N), and perhaps `grid`,
         `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy, .mtx, .h5 or .mat file
-        (MATLAB's versions 5 and 7.3), or the folder of a store, whose blocks go to the device one by one.
+        (MATLAB's versions 5 and 7.3, `LTM` (M, N) or (M, N, 3)), or the folder of a store, whose blocks go to
+        the device one by one.
     variable
         Name of the matrix in a .npz, .h5 or .mat file; else T (in .mat LTM), or the only matrix.
     grid, camera_grid
@@ -80,6 +81,8 @@ def load(
         camera_grid = camera_grid or content.camera_grid
         if camera_grid is not None or M != N:
             camera_grid = checks.grid("camera_grid", camera_grid or _unknown("camera_grid", M, "camera"), M)
+        if isinstance(first_bounce, str) and first_bounce == "exact":
+            content = content.in_memory()  # which needs all entries at once
         if first_bounce is None and camera_grid in (None, grid):  # on another grid there is no S
             first_bounce = content.first_bounce
         T, F = content.matrices, "diagonal" if first_bounce is None else first_bounce
@@ -175,11 +178,12 @@ def write(path: str | os.PathLike[str], content: Record | Parts) -> None:
         if F is not None and not np.allclose(F, diagonals, rtol=1e-6, atol=0):
             logging.getLogger(__name__).warning("%s the first bounce; .npz does", lost)
     with about(path):
+        content = content.in_memory() if isinstance(content, Record) else content
         if suffix == ".zarr":
             block_store.write(path, content)
         else:
             with replace_file(path) as temporary:
-                FORMATS[suffix][1](temporary, content.in_memory() if isinstance(content, Record) else content)
+                FORMATS[suffix][1](temporary, content)
 
 
 def find(path: Path, *, inverse: bool = False) -> str:

@@ -154,8 +154,12 @@ class Record:
     stored = property(lambda self: isinstance(self.matrices[0], StoredRows), doc="Whether in a store.")
 
     def in_memory(self) -> Record:
-        """The same, of a store's blocks all loaded."""
-        return replace(self, matrices=tuple(T.tocsr() for T in self.matrices)) if self.stored else self
+        """The same, of a store's blocks all loaded; as arrays where every entry is stored."""
+        if not self.stored:
+            return self
+        every = all(T.nnz == math.prod(T.shape) for T in self.matrices)
+        matrices = (T.tocsr() for T in self.matrices)
+        return replace(self, matrices=tuple(T.toarray() if every else T for T in matrices))
 
     def arrays(self) -> dict[str, Any]:
         """Named arrays: `EXTRAS`, and T (M, N) or (3, M, N) where that is dense."""
@@ -187,7 +191,8 @@ def assemble(
         extras[grid] = checks.grid(f"array {grid!r}", load(grid).ravel().tolist())
     if isinstance(matrices[0], np.ndarray):
         if wrong := [T.shape for T in matrices if not _is_matrix(np.shape(T))]:
-            raise FileError(f"T has shape {wrong[0]}; it must be (M, N) or (3, M, N), not empty")
+            shape, order = (shapes[names[0]][::-1], "(M, N, 3)") if reverse else (wrong[0], "(3, M, N)")
+            raise FileError(f"{names[0]} has shape {shape}; it must be (M, N) or {order}, not empty")
         matrices = [floats("T", T) for T in matrices]
         matrices = list(matrices[0]) if matrices[0].ndim == 3 else matrices
     return Record(tuple(matrices), **extras)

@@ -70,8 +70,6 @@ def test_everything_comes_back(tmp_path: Path, extension: str, kind: str, channe
     formats.write(path, record)  # again, onto itself
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
     back = read(path).in_memory()
-    if extension == ".zarr":  # which has sparse rows
-        record = replace(record, matrices=tuple(map(scipy.sparse.csr_array, T)))
     if extension == ".mat" and square:  # MATLAB's sparse ones are of float64
         back = replace(back, matrices=tuple(scipy.sparse.csr_array(T, dtype=dtype) for T in back.matrices))
     same(back, record)

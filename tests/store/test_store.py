@@ -97,3 +97,13 @@ def test_paths_that_lead_nowhere(tmp_path):
                 work(path)  # pyright: ignore[reportArgumentType]
     with pytest.raises(FileError, match=r"\.xyz"):
         store.save(tmp_path / "T.xyz", T)
+
+
+def test_a_store_whose_every_entry_is_known_is_dense_elsewhere(tmp_path):
+    """As an array it can be written as .npy, and its first bounce can be exact."""
+    T = np.random.default_rng(0).uniform(0.1, 0.2, (3, 6, 6)) + np.eye(6)
+    store.save(tmp_path / "T.zarr", Transport(T, (2, 3)))
+    exact = store.load(tmp_path / "T.zarr", first_bounce="exact")
+    np.testing.assert_allclose(exact.first_bounce, [1 / np.diag(np.linalg.inv(M)) for M in T], rtol=1e-6)
+    store.formats.write(tmp_path / "T.npy", store.formats.read(tmp_path / "T.zarr"))
+    np.testing.assert_array_equal(np.load(tmp_path / "T.npy"), T)
