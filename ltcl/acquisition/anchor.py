@@ -27,9 +27,9 @@ _LEAST = 0.05  # s at least, so that d is finite
 
 
 def pattern(grid: tuple[int, int]) -> np.ndarray:
-    """Codes (h, w): blocks of 2 x 2 pixels, on or off at random."""
-    coarse = np.random.default_rng(0).random((-(-grid[0] // 2), -(-grid[1] // 2))) < 0.5
-    return np.kron(coarse, np.ones((2, 2)))[: grid[0], : grid[1]].astype(np.float32)
+    """Codes (h, w): blocks of 2 x 2 pixels from odd rows and columns on, on or off at random."""
+    coarse = np.random.default_rng(0).random((grid[0] // 2 + 1, grid[1] // 2 + 1)) < 0.5
+    return np.kron(coarse, np.ones((2, 2)))[1 : grid[0] + 1, 1 : grid[1] + 1].astype(np.float32)
 
 
 def marked(batch: Sequence[np.ndarray]) -> np.ndarray:

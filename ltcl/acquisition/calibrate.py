@@ -19,6 +19,7 @@ A colour that the scene hardly reflects is photographed for longer, so that its 
 from __future__ import annotations
 
 import logging
+import contextlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -59,6 +60,7 @@ _CAMERA_PIXELS = 9  # to one of the projector's, where a plan is made before the
 _LAMP, _CERTAIN = 0.01, 5.0  # of full scale, of black: T p moves by less than 1 %; standard deviations
 _SIGNIFICANT = 3.0  # standard deviations of noise that white must be above
 _UNEVEN = 0.1  # relative deviation of a projector's curve from pixel to pixel, which is allowed
+_ALIKE = 0.9  # correlation of a picture of blocks with their pattern: 0.98 and more in the right map
 _DIRECT = 0.5  # of what white shows at a pixel is its own light, at least, in most scenes
 
 
@@ -157,7 +159,7 @@ def measure(
     _check_geometry(shots, geometry)
     seconds = _response(session, effort, seconds, response)
     with session.naming_photographs():
-        R, sharpness = _resampling(session, geometry, seconds)
+        R, sharpness, stripes = _resampling(session, geometry, seconds)
     if sharpness is not None:
         sharpness.check(side)
     longest = _longest(session, seconds)
@@ -187,9 +189,12 @@ def measure(
         channels = [[ambient, *each] for each in pictures]
         projector = radiometry.projector_response([0.0, *effort.codes, 1.0], channels)
         M = None if shots.channels == 1 else radiometry.mixing([each[-1] for each in pictures], ambient)
+    blocks = session.merge([*before, *after])
+    _check_map(session, R, stripes, (blocks - ambient).value, white.value)
     R = R.ascertained(white.value, white.valid)
-    blocks = Anchor.of(session.merge([*before, *after]), R)
-    return Calibration(scan, *session.sensor, ambient, white, projector, M, R, sharpness, blocks)
+    return Calibration(
+        scan, *session.sensor, ambient, white, projector, M, R, sharpness, Anchor.of(blocks, R)
+    )
 
 
 def _offered(shots: Shots, seconds: Iterable[float]) -> tuple[float, ...]:
@@ -323,21 +328,48 @@ def _ramps(session: CaptureSession, effort: _Effort, seconds: float) -> tuple[Re
 
 def _resampling(
     session: CaptureSession, geometry: str | Correspondence, seconds: float
-) -> tuple[Resampling, Sharpness | None]:
+) -> tuple[Resampling, Sharpness | None, list[Photograph]]:
     black = np.zeros(session.shots.grid, np.float32)
     session.prepare([(black, seconds), (black, nearest(session.shots.exposures, _LONGER * seconds))])
     if geometry == "aligned":
-        return Resampling.aligned(session.shots.grid), None
-    light: list[np.ndarray] = []
+        return Resampling.aligned(session.shots.grid), None, []
+    stripes, light = [], []
     if isinstance(geometry, str):
         patterns = GrayCode(session.shots.grid).patterns()
-        photographs = session.take([[(codes, seconds) for codes in patterns]])[0]
+        stripes = session.take([[(codes, seconds) for codes in patterns]])[0]
         # Linear in light: a pixel that is half lit shows half of it.
-        light = [session.sensor.response.linear(photograph.image) for photograph in photographs]
+        light = [session.sensor.response.linear(photograph.image) for photograph in stripes]
         with acquisition_error("the geometry"):
             geometry = decode(light, session.shots.grid, levels=session.shots.levels)
     R = Resampling.of(geometry)
-    return R, Sharpness.of(geometry, R, light)
+    return R, Sharpness.of(geometry, R, light), stripes
+
+
+def _check_map(
+    session: CaptureSession, R: Resampling, stripes: list[Photograph], blocks: np.ndarray, white: np.ndarray
+) -> None:
+    """Refuse Gray code of which a pattern was exchanged with its inverse: its map is mirrored in part.
+
+    The picture of blocks tells: it is more like their pattern in the map that exchanging them back gives.
+    """
+    grid, levels, codes = R.grid, session.shots.levels, anchor.pattern(R.grid).ravel()
+
+    def likeness(R: Resampling) -> float:
+        lit, full = (R.apply(x).reshape(len(codes), -1).sum(axis=1) for x in (blocks, white))
+        seen = R.seen.ravel() & (full > 0)
+        with np.errstate(invalid="ignore", divide="ignore"):  # of no pixels, or all alike
+            return float(np.corrcoef(lit[seen] / full[seen], codes[seen])[0, 1])
+
+    if not stripes or (own := likeness(R)) > _ALIKE:
+        return
+    light = [session.sensor.response.linear(photograph.image) for photograph in stripes]
+    for k in range(0, len(stripes) - 2, 2):
+        exchanged = [*light[:k], light[k + 1], light[k], *light[k + 2 :]]
+        with contextlib.suppress(InputError):
+            if likeness(Resampling.of(decode(exchanged, grid, levels=levels))) > max(own, _ALIKE):
+                names = " and ".join(session.shots.name(each.number) for each in stripes[k : k + 2])
+                text = f"{names} are exchanged, a pattern and its inverse; {agreement.ADVICE}"
+                raise AcquisitionError(text)
 
 
 def _longest(session: CaptureSession, white: float) -> float:
@@ -400,7 +432,7 @@ def _check_uniform(
         y, v, valid = (agreement.sample(x, pixels) for x in (picture.value, picture.variance, picture.valid))
         total = max(float(np.sum(W[valid] ** 2)), 1e-30)
         g = float(np.sum(((y - black) * W)[valid])) / total
-        noise = float(np.sqrt(np.sum((W**2 * (v + dark_variance))[valid]))) / total
+        noise = float(np.sqrt(np.sum(W[valid] ** 2 * (v + dark_variance)[valid]))) / total
         expected = black + g * W, dark_variance + g**2 * variance + (_UNEVEN * g * W) ** 2
         image, name = [agreement.sample(photograph.image, pixels)], named(photograph.number)
         if agreement.find_deviation(image, [photograph.seconds], session.sensor, expected) is not None:

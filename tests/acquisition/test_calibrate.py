@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -12,6 +13,7 @@ import pytest
 import ltcl
 from ltcl.acquisition import Shots, VirtualRig, camera_map
 from ltcl.acquisition.calibrate import bracket, measure
+from ltcl.acquisition.geometry import GrayCode
 from ltcl.acquisition.radiometry import calibrate
 from ltcl.errors import AcquisitionError, InputError
 
@@ -125,3 +127,25 @@ def test_a_fault_in_uniform_codes_is_named(first: int, other: int | None, text: 
     camera.photograph = lambda codes, seconds: next(again)
     with pytest.raises(AcquisitionError, match=f"^{text}"):
         measure(Shots(camera), geometry="aligned", frames=2)
+
+
+@pytest.mark.parametrize("bit", range(7))
+def test_gray_code_that_is_exchanged_with_its_inverse_is_named(bit: int) -> None:
+    """Their map is mirrored in part, and as smooth as the right one."""
+    seen = {
+        "camera_grid": (27, 50),
+        "camera_map": camera_map(lambda u, v: (u / 3.3, v / 3.5), (27, 50), (8, 16)),
+    }
+    camera, numbers = Unplugged(corner(), (8, 16), **seen), []
+    stripes, real = GrayCode((8, 16)).patterns()[2 * bit : 2 * bit + 2], camera.photograph
+
+    def photograph(codes: np.ndarray, seconds: float) -> np.ndarray:
+        if any(np.array_equal(codes, stripe) for stripe in stripes):
+            codes = 1 - codes
+            numbers.append(camera.count + 1)
+        return real(codes, seconds)
+
+    camera.photograph = photograph
+    with pytest.raises(AcquisitionError, match="exchanged") as caught:
+        measure(Shots(camera), frames=2)
+    assert [int(n) for n in re.findall(r"photograph (\d+)", str(caught.value))] == numbers
