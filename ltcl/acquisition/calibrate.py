@@ -18,8 +18,8 @@ A colour that the scene hardly reflects is photographed for longer, so that its 
 
 from __future__ import annotations
 
-import logging
 import contextlib
+import logging
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -9,6 +9,7 @@ import scipy.sparse
 
 from ltcl import store
 from ltcl.errors import FileError, InputTypeError
+from ltcl.store import formats
 from ltcl.transport import Transport
 from tests.store.stores import dense
 
@@ -105,5 +106,5 @@ def test_a_store_whose_every_entry_is_known_is_dense_elsewhere(tmp_path):
     store.save(tmp_path / "T.zarr", Transport(T, (2, 3)))
     exact = store.load(tmp_path / "T.zarr", first_bounce="exact")
     np.testing.assert_allclose(exact.first_bounce, [1 / np.diag(np.linalg.inv(M)) for M in T], rtol=1e-6)
-    store.formats.write(tmp_path / "T.npy", store.formats.read(tmp_path / "T.zarr"))
+    formats.write(tmp_path / "T.npy", formats.read(tmp_path / "T.zarr"))
     np.testing.assert_array_equal(np.load(tmp_path / "T.npy"), T)

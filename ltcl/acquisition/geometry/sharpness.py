@@ -100,6 +100,7 @@ class Sharpness:
             f"fewer pixels, or scan with strategy='block' and block={2 * side}"
         )
         if here.blur > HOPELESS:
+            text += "; or photographs of the finest stripes are exchanged"
             raise AcquisitionError(f"the camera does not separate the projector's pixels: {text}")
         logger.warning("%s", text)
 
