@@ -195,7 +195,7 @@ def _write(
     panels = {
         "desired": pictures.panel(pictures.shades(desired, factor), f"{name}, desired"),
         "pattern": pictures.panel(pictures.shades(pattern, 1 / white), f"{name}, pattern"),
-        "appearance": pictures.panel(seen, f"{name}, as T predicts it, {100 * result.error:.2g} % relative error"),
+        "appearance": pictures.panel(seen, f"{name}, as predicted, error {100 * result.error:.2g} %"),
         "out_of_reach": pictures.panel(missing, "out of reach: orange too dark, blue too bright"),
     }
     images.write(folder / f"{name}_pattern.exr", pattern)

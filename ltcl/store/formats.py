@@ -48,8 +48,7 @@ def load(
     path
         A .npz file (SciPy's sparse layouts, or arrays: `T` (M, N) or (3, M, N), and perhaps `grid`,
         `camera_grid`, `first_bounce`, `mixing`, or a compressed transport), a .npy, .mtx, .h5 or .mat file
-        (MATLAB's versions 5 and 7.3, `LTM` (M, N) or (M, N, 3)), or the folder of a store, whose blocks go to
-        the device one by one.
+        (versions 5 and 7.3, `LTM` (M, N) or (M, N, 3)), or the folder of a store.
     variable
         Name of the matrix in a .npz, .h5 or .mat file; else T (in .mat LTM), or the only matrix.
     grid, camera_grid

@@ -155,10 +155,8 @@ class Record:
 
     def in_memory(self) -> Record:
         """The same, of a store's blocks all loaded; as arrays where every entry is stored."""
-        if not self.stored:
-            return self
-        every = all(T.nnz == math.prod(T.shape) for T in self.matrices)
-        matrices = (T.tocsr() for T in self.matrices)
+        every = self.stored and all(T.nnz == math.prod(T.shape) for T in self.matrices)
+        matrices = (T.tocsr() if self.stored else T for T in self.matrices)
         return replace(self, matrices=tuple(T.toarray() if every else T for T in matrices))
 
     def arrays(self) -> dict[str, Any]:
