@@ -27,10 +27,9 @@ from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.errors import AcquisitionError
 
 _SCALE, _FLOOR = 0.02, 0.001  # systematic errors: of light, of full scale
-_ELECTRONS, _DIM = (
-    3.0,
-    3.0,
-)  # of light: error of the level of black, common to pixels of less than 3 times that
+_ELECTRONS = 3.0  # of light: error of the level of black, of a camera of at least `_LEAST` at full scale
+_LEAST = 300.0  # fewer are measured only where photographs of one pattern differ
+_DIM = 3.0  # times that light: what pixels below have of this error, they have in common
 _BIAS = 0.2  # of the noise without light: common error of all pixels there
 _CLIP, _DEFECTS, _MEAN = 100.0, 2, 2.5
 _SINGLE = 25.0  # z^2 of each of a few pixels, which a single one has by noise once in a million
@@ -176,7 +175,7 @@ class _Light(NamedTuple):
             usable = x < limit
             L = np.sum(x * usable, axis=0) / np.maximum(np.sum(t * usable, axis=0), 1e-30)
         variance = noise.variance(t * L, response.derivative(curve).reshape(codes.shape))
-        few = _ELECTRONS / noise.electrons
+        few = _ELECTRONS / max(noise.electrons, _LEAST)
         variance = variance + (_SCALE * t * L) ** 2 + _FLOOR**2 + few**2
         bias, few = (np.full(limit.shape, b) for b in (_BIAS * np.sqrt(noise.variance(0.0)), few))
         return cls(t, np.where(x < limit, x, np.inf), variance, limit, bias, few)

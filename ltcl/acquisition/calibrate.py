@@ -58,6 +58,7 @@ _REPEATS = 2  # at least: two photographs determine noise
 _PROBES, _MOST_PROBES = 2, 10  # of the exposure: mostly, at most
 _CAMERA_PIXELS = 9  # to one of the projector's, where a plan is made before the first photograph
 _LAMP, _CERTAIN = 0.01, 5.0  # of full scale, of black: T p moves by less than 1 %; standard deviations
+_PATTERN = 0.1  # of full scale: what is brighter may be another pattern, as `agreement` tells
 _SIGNIFICANT = 3.0  # standard deviations of noise that white must be above
 _UNEVEN = 0.1  # relative deviation of a projector's curve from pixel to pixel, which is allowed
 _ALIKE = 0.9  # correlation of a picture of blocks with their pattern: 0.98 and more in the right map
@@ -393,8 +394,10 @@ def _check_black(session: CaptureSession, photographs: list[Photograph]) -> None
     light = np.stack([session.sensor.response.linear(p.image).ravel() for p in photographs])
     level = light.mean(axis=1)
     noise = float(np.std(light - light.mean(axis=0) - level[:, None])) / math.sqrt(light.shape[1])
-    if np.ptp(level) > _LAMP + _CERTAIN * noise:
-        name = session.shots.name(photographs[int(np.argmax(level))].number)
+    excess = level - level.min()
+    bright = (excess > _LAMP + _CERTAIN * noise) & (excess < _PATTERN)
+    if bright.any():
+        name = session.shots.name(photographs[int(np.argmax(bright))].number)
         raise AcquisitionError(f"{name}, of black, is too bright: another light was on; {agreement.ADVICE}")
 
 
