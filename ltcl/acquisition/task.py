@@ -194,7 +194,9 @@ def acquire(
     else:
         _check_begun(existing, shots, settings)
         session.remove_photographs(path)
-    if not existing.final:
+    if existing.final:
+        existing.finalize()  # removes what a process that was killed at the very end has left
+    else:
         scan(existing, shots, settings, progress)
     return load(path, on_dark="mask", device=device)
 
