@@ -42,6 +42,7 @@ _BINS = 64  # of pixels of equal number: the noise of a variance among their mea
 _ROUNDS = 5  # of reweighting: the line stands to 1e-5 after two (measured)
 _MOST_CLIPPED = 0.002  # share of a bin's samples at either end: a variance is then low by 0.4 %
 _MOST_ELECTRONS = 1e9  # more than any pixel holds, for codes without photon noise
+_FAR = 5.0  # standard deviations of a bin's variance above the line
 _HIDDEN = 0.2  # codes: noise that whole codes may hide
 
 
@@ -211,7 +212,9 @@ def estimate(
     least = 1e-3 * variance.mean() + 1e-30
     expected, gain, floor = np.maximum(variance, least), 0.0, 0.0
     for _ in range(_ROUNDS):
-        scale = np.sqrt(freedom) / expected
+        # Bins far above the line have edges of a scene that moved: by their own variance they hardly count.
+        far = variance > (1.0 + _FAR * np.sqrt(2.0 / freedom)) * expected
+        scale = np.sqrt(freedom) / np.where(far, variance, expected)
         unrounded = np.maximum(variance - rounding, 0.0)
         (gain, floor), _ = scipy.optimize.nnls(columns * scale[:, None], unrounded * scale)
         expected = np.maximum(columns @ (gain, floor) + rounding, least)

@@ -50,6 +50,15 @@ def test_read_noise_is_estimated_where_black_is_clipped_or_rounded_to_one_code(b
     assert abs(model.read - read) < max(0.5 * read, 0.29 / 255)  # what rounding alone adds
 
 
+def test_a_scene_that_moves_between_repeated_photographs_is_not_noise():
+    """Edges of a few pixels: were they noise, nothing that moves would deviate from it any more."""
+    camera = Camera("linear", 4096, 10000.0, 0.002, black=0.05)
+    light = np.where(np.arange(96) // 24 % 2, 0.7, 0.1) * np.linspace(0.8, 1.0, 64)[:, None]
+    bursts = [[camera.shoot(x, 1.0, random) for x in (light, np.roll(light, 1, axis=1))]]
+    model = estimate(bursts, response=camera.response, levels=4096)
+    assert model.electrons == pytest.approx(10000.0, rel=0.2)
+
+
 @pytest.mark.parametrize("levels", [4096, 0])
 def test_pixels_that_are_clipped_at_either_end_do_not_count(levels):
     camera, light = (

@@ -40,6 +40,16 @@ def test_it_is_generalised_least_squares(code: columns.Code) -> None:
     np.testing.assert_allclose(variance[:, 0], np.diag(C), rtol=1e-9)
 
 
+def test_errors_of_columns_nearly_cancel_in_the_sum_of_an_s_matrix() -> None:
+    code, v, a = Hadamard(31), np.full((31, 1), 0.4), np.array([0.3])
+    A = code.patterns(31).astype(float)
+    C = np.linalg.inv(A.T @ np.linalg.inv(np.diag(v[:, 0]) + a) @ A)
+    np.testing.assert_allclose(code.correlation(v, a), C[0, 1] / C[0, 0], rtol=1e-9)
+    far = np.full((31, M), 0.02)  # 13 standard deviations in the sum of all, 2.4 if columns were independent
+    assert significant(far, np.ones((31, M)), GRID, correlation=np.full(M, -1 / 31)).all()
+    assert not significant(far, np.ones((31, M)), GRID).any()
+
+
 def test_a_column_that_no_photograph_shows_comes_from_the_sum() -> None:
     x, v = np.array([0.3, 0.0, 0.1]), np.array([1e-6, UNKNOWN, 1e-6, 4e-6])
     decoded, variance = Pixels(3).decode(np.append(x, 0.9)[:, None], v[:, None], np.zeros(1))
