@@ -8,7 +8,7 @@ light (its last code; nothing else fixes it, so one scale a channel is not count
 
     T p             of patterns that no scan has seen
     compensated     a picture that is shown with the pattern that T says
-    bounces 1 to 3  of a picture, against what `forecast_bounces` says without the truth: root mean squares
+    bounces 1 to 3  of a picture, against their `std`, which is known without the truth: root mean squares
     far light       the sum of what a pixel gets from beyond its tile of n / 8 pixels and the tiles around it
 
 An adaptive scan has to need a fifth of the photographs of one pixel at a time at most. Smaller corners give
@@ -33,7 +33,7 @@ import ltcl
 from _acquired import Cost, draw
 from _figures import Claim
 from _harness import options
-from ltcl.acquisition import Report, VirtualRig, acquire, forecast_bounces
+from ltcl.acquisition import Report, VirtualRig, acquire
 from ltcl.device import Device
 from ltcl.store import BlockStore
 
@@ -41,12 +41,12 @@ ALBEDO = 0.6
 CAMERAS = {"srgb, 8 bits": ("srgb", 8), "film, 12 bits": ("film", 12)}
 STRATEGIES = ("adaptive", "hadamard", "pixel")
 COLOURS, MIXING = (0.7, 0.5, 0.3), [[0.9, 0.15, 0.0], [0.05, 0.8, 0.1], [0.0, 0.2, 0.9]]
-TILES, DRAWS = 8, 16
+TILES = 8
 
 
 @dataclass(frozen=True)
 class Found:
-    """One acquisition. `bounces`: error over forecast of bounces 0 to 3; `inside`: within 3 deviations.
+    """One acquisition. `bounces`: error over `std` of bounces 0 to 3; `inside`: within 3 deviations.
 
     `far` is the error of far light row by row, `weak` that of all of it, which noise hardly changes.
     """
@@ -118,7 +118,7 @@ def shown(T: ltcl.Transport, P: np.ndarray) -> np.ndarray:
     return np.moveaxis(seen.reshape(k, N, channels), 0, 1)
 
 
-def measured(truth: Truth, camera: str, strategy: str, device: Device, draws: int, name: str) -> Found:
+def measured(truth: Truth, camera: str, strategy: str, device: Device, name: str) -> Found:
     """Acquire and compare."""
     response, bits = CAMERAS[camera]
     grid, T_or = (truth.n, truth.n), truth.matrices if truth.channels == 3 else truth.matrices[0]
@@ -132,7 +132,7 @@ def measured(truth: Truth, camera: str, strategy: str, device: Device, draws: in
                     report.patterns * sum(report.exposures), seconds)  # fmt: skip
         unit, sums = rows(T, truth)
         P = np.repeat(held(truth.n)[..., None], truth.channels, axis=-1)
-        ratios, inside = of_bounces(path, T, truth, draws)
+        ratios, inside = of_bounces(T, truth)
         return Found(
             name, strategy, cost, apart(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
             *far(T, truth, unit), compensated(T, truth, unit), ratios, inside,
@@ -163,17 +163,16 @@ def far(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> tuple[float, float
     return apart(ours, theirs), float(np.max(np.abs(ours.sum(axis=0) / theirs.sum(axis=0) - 1)))
 
 
-def of_bounces(path: Path, T: ltcl.Transport, truth: Truth, draws: int) -> tuple[list[float], float]:
-    """Root mean square errors over their forecasts, of bounces 0 to 3; the part within three deviations."""
+def of_bounces(T: ltcl.Transport, truth: Truth) -> tuple[list[float], float]:
+    """Root mean square errors over their deviations, of bounces 0 to 3; the part within three of them."""
     p = np.repeat(held(truth.n)[:, 4][:, None, None], truth.channels, axis=-1)
     image = truth.seen(p)[:, 0]
     picture = image.reshape(*T.grid, truth.channels).astype(np.float32)
     picture = picture[..., 0] if truth.channels == 1 else picture
     found = ltcl.separate(T, picture, bounces=3, rtol=1e-4)
-    told = forecast_bounces(path, picture, 3, draws=draws)
     ours, deviation = (
         np.concatenate([part.direct[None], part.bounces]).reshape(4, -1, truth.channels)
-        for part in (found, told)
+        for part in (found, found.std)
     )
     error = ours - truth.bounces(image, 3)
     ratios = np.sqrt(np.mean(error**2, axis=(1, 2)) / np.mean(deviation.astype(np.float64) ** 2, axis=(1, 2)))
@@ -203,7 +202,7 @@ def claims(found: list[Found]) -> list[Claim]:
             Claim(f"{one.name}: far light, all", f"{one.weak:.2%} off", "at most 2 %", one.weak <= 0.02),
             Claim(f"{one.name}: compensated", f"{one.decibels:.1f} dB", "at least 30", one.decibels >= 30),
             Claim(
-                f"{one.name}: bounces 1 to 3, error over forecast",
+                f"{one.name}: bounces 1 to 3, error over std",
                 ", ".join(f"{ratio:.2f}" for ratio in one.bounces[1:]) + f"; {noisy}",
                 "at most 2",
                 worst <= 2,
@@ -230,8 +229,8 @@ def of_cost(costs: list[Cost], largest: int) -> list[Claim]:
 def main() -> None:
     """Run the bench."""
     given = options(__doc__ or "")
-    sides, draws = ([8, 16], 4) if given.smoke else ([16, 24, 32, 48, 64], DRAWS)
-    run = partial(measured, device=given.device, draws=draws)
+    sides = [8, 16] if given.smoke else [16, 24, 32, 48, 64]
+    run = partial(measured, device=given.device)
     truth = Truth([corner(sides[-1])])
     cameras = list(CAMERAS)[1:] if given.smoke else CAMERAS
     found = [run(truth, camera, k, name=f"{k}, {camera}") for camera in cameras for k in STRATEGIES]
@@ -247,7 +246,7 @@ def main() -> None:
         facts[f"{one.name}, seconds"] = one.cost.seconds
         facts[f"{one.name}, photographs"] = one.cost.photographs
         facts[f"{one.name}, far light row by row"] = one.far
-        facts[f"{one.name}, direct part, error over forecast"] = one.bounces[0]
+        facts[f"{one.name}, direct part, error over std"] = one.bounces[0]
         if one.strategy != "adaptive":
             facts[f"{one.name}, columns beside white before they added up to it"] = one.sum_deviation
     for cost in costs:

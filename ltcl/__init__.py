@@ -6,7 +6,7 @@ ltcl undoes the bounces with matrix-vector products only.
 
     T = ltcl.load("transport.npz")             # measured, or ltcl.scenes.box(40, sides=3).transport()
     T = ltcl.acquire(rig, store="scan.zarr")   # any projector and camera; stopped and resumed at will
-    T = ltcl.compress(T, rtol=1e-2)            # few numbers instead of N^2, solutions within 1 %
+    T = ltcl.compress(T, rtol=1e-2)            # few numbers instead of N^2, pictures within 1 %
     c = ltcl.compensate(T, desired)            # c.pattern makes the wall look like `desired`
     b = ltcl.separate(T, image)                # b.direct, b.bounces: each bounce as its own picture
 
@@ -23,6 +23,7 @@ from ltcl import errors
 from ltcl.analysis import Analysis, analyze
 from ltcl.compensation import Compensation, compensate
 from ltcl.compression import Compression, compress, invert
+from ltcl.denoising import denoise
 from ltcl.device import Device, list_devices, open_device
 from ltcl.relighting import relight
 from ltcl.separation import Separation, separate
@@ -51,6 +52,7 @@ __all__ = [
     "batch",
     "compensate",
     "compress",
+    "denoise",
     "errors",
     "images",
     "invert",

@@ -16,6 +16,7 @@ from ltcl.operators import IdentityPlus
 from ltcl.solvers.auto import survey
 from ltcl.theory.forecast import LEAST_RTOL
 from ltcl.transport import Transport, require
+from ltcl.verdict import Verdict, verdict
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class ChannelAnalysis:
 
 @dataclass(frozen=True, repr=False)
 class Analysis:
-    """Result of `ltcl.analyze`: one entry of `channels` per colour channel."""
+    """Result of `ltcl.analyze`: one entry of `channels` per colour channel, and what T is good for."""
 
     shape: tuple[int, int]
     grid: tuple[int, int]
@@ -73,6 +74,7 @@ class Analysis:
     nbytes: int
     masked: int
     channels: tuple[ChannelAnalysis, ...]
+    verdict: Verdict
 
     def __repr__(self) -> str:
         (h, w), radii = self.grid, ", ".join(f"{channel.spectral_radius:.3g}" for channel in self.channels)
@@ -108,17 +110,18 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     """
     require(T)
     rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
-    F = np.atleast_2d(T.first_bounce)
+    systems = zip(T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True)
+    channels = tuple(_channel(*system, rtol) for system in systems)
+    bounce = {"negative_bounce": max(T.negative_bounces)}
+    bounce["bounce_highest"] = max(channel.energy.bounce_highest for channel in channels)
     return Analysis(
         shape=T.shape,
         grid=T.grid,
         rtol=rtol,
         nbytes=T.nbytes,
         masked=int(T.masked.sum()),
-        channels=tuple(
-            _channel(matrix, f, S, negative, rtol)
-            for matrix, f, S, negative in zip(T.matrices, F, T.systems, T.negative_bounces, strict=True)
-        ),
+        channels=channels,
+        verdict=verdict(T, **bounce),
     )
 
 

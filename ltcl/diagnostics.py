@@ -86,7 +86,7 @@ def reciprocity_defect(T: Any, F: np.ndarray, *, entries: int = ALL, seed: int =
         R = _indirect(T[np.ix_(pixels, pixels)] if dense else T[pixels][:, pixels], F[pixels])
     else:
         return float("nan")
-    root = np.exp(_log_scale(R) / 2)
+    root = np.exp(log_scale(R) / 2)
     N = scipy.sparse.diags_array(1 / root) @ R @ scipy.sparse.diags_array(root)
     whole = scipy.sparse.linalg.norm(N)
     return float(scipy.sparse.linalg.norm(N - N.T) / (np.sqrt(2) * whole)) if whole > 0 else 0.0
@@ -108,7 +108,7 @@ def _indirect(T: Any, F: np.ndarray) -> Any:
     return R / (np.abs(R.data).max(initial=0.0) or 1.0)
 
 
-def _log_scale(R: Any) -> np.ndarray:
+def log_scale(R: Any) -> np.ndarray:
     """log d of the fit; 0 where a pixel shares no light with others in both directions."""
     light = R.maximum(0.0).tocsr()
     light.eliminate_zeros()

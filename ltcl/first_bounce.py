@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,15 @@ logger = logging.getLogger(__name__)
 _BYTES = 3 * 8  # of a dense inverse, per entry: the matrix, its inverse and what LAPACK works with
 _RTOL = 1e-5  # of the solves of an estimate: far below the scatter of any affordable number of probes
 _TOGETHER = 32  # probes in one solve
+_ENTRIES = np.ndarray, scipy.sparse.csr_array
+_SIGMAS = 5.0  # standard deviations that noise does not exceed, even in a million pixels
+_FAINT = 0.05  # times the median first bounce: noise is estimated only where some pixel is below
 
 
 def find(
-    matrices: Sequence[Any], requested: Any, device: Callable[[], Device], probes: int = 128, seed: int = 0
+    matrices: Sequence[Any], requested: Any, device: Any, probes: int = 128, seed: int = 0, dark: Any = None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """F of each channel, (channels, N) float64, and the standard error of an estimate; of any sign."""
+    """F (channels, N) float64 of any sign, diag(T) where that is `dark`; standard error of an estimate."""
     n: int = matrices[0].shape[0]
     checks.count("probes", probes, least=2)
     checks.count("seed", seed, least=0)
@@ -41,18 +44,22 @@ def find(
         F = checks.shape("first_bounce", F, (n,), (len(matrices), n))
         return np.broadcast_to(F, (len(matrices), n)), None
     checks.one_of("first_bounce", requested, ("diagonal", "exact", "estimate"))
+    if requested == "exact" and (bare := [type(T).__name__ for T in matrices if not isinstance(T, _ENTRIES)]):
+        raise InputTypeError(f"first_bounce is 'exact', but a {bare[0]} has no entries; give 'estimate' or F")
+    F = np.stack([_diagonal(T) for T in matrices])
     if requested == "diagonal":
-        F = np.stack([_diagonal(T) for T in matrices])
         if (brightest := float(np.max(F))) > float(np.finfo(np.float32).max):
             raise InputError(f"matrix reaches {brightest:.3g}, beyond float32; give it in other units")
         return F, None
+    lit = np.ones(F.shape, bool) if dark is None else ~dark(F)
     if requested == "exact":
         try:
             checks.fits_host(f"a dense inverse of {n} pixels", _BYTES * n**2)
-            return np.stack([_exact(T) for T in matrices]), None
+            return np.where(lit, [_exact(*each) for each in zip(matrices, lit, strict=True)], F), None
         except MemoryError:
             logger.warning("T of %d pixels is too large for a dense inverse; F is estimated", n)
-    return _estimate(matrices, device(), probes, seed)
+    estimate, error = _estimate(matrices, np.where(lit, np.maximum(F, 0.0), 0.0), device(), probes, seed)
+    return np.where(lit, estimate, F), error
 
 
 def _diagonal(matrix: Any) -> np.ndarray:
@@ -62,13 +69,10 @@ def _diagonal(matrix: Any) -> np.ndarray:
     return np.asarray(matrix.diagonal(), np.float64)
 
 
-def _exact(matrix: Any) -> np.ndarray:
+def _exact(matrix: Any, lit: np.ndarray) -> np.ndarray:
     """1 / diag(T^-1), by a dense inverse of the pixels that are lit."""
-    if not isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)):
-        kind = type(matrix).__name__
-        raise InputTypeError(f"first_bounce is 'exact', but a {kind} has no entries; give 'estimate' or F")
     dense = (matrix if isinstance(matrix, np.ndarray) else matrix.toarray()).astype(np.float64)
-    lit = dense.any(axis=0) & dense.any(axis=1)  # a dark pixel would make T singular; its F is 0
+    lit = lit & dense.any(axis=0) & dense.any(axis=1)  # a dark pixel would make T singular
     dense = dense[np.ix_(lit, lit)]
     try:
         with warnings.catch_warnings():
@@ -85,10 +89,9 @@ def _exact(matrix: Any) -> np.ndarray:
 
 
 def _estimate(
-    matrices: Sequence[Any], device: Device, probes: int, seed: int
+    matrices: Sequence[Any], F0: np.ndarray, device: Device, probes: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """F and its standard error, (channels, N) float64 each; F is 0 where diag(T) is not positive."""
-    F0 = np.maximum([_diagonal(T) for T in matrices], 0.0)
+    """F and its standard error, (channels, N) float64 each; F is 0 where `F0` is."""
     F, error = np.zeros_like(F0), np.zeros_like(F0)
     signs = np.random.default_rng(seed).choice(np.array([-1, 1], np.float32), (F0.shape[1], probes))
     together = np.split(signs, range(_TOGETHER, probes, _TOGETHER), axis=1)
@@ -108,19 +111,39 @@ def _estimate(
     return F, error
 
 
-def mask_dark(F: np.ndarray, grid: tuple[int, int], may_mask: bool) -> tuple[np.ndarray, np.ndarray]:
-    """F with 0, and True (N,), where some channel's is not positive; refused unless it may be masked."""
-    dark: np.ndarray = np.any(F <= 1e-300, axis=0)  # 0 as well, whose inverse is no number
-    pixels = np.flatnonzero(dark)
-    if len(pixels) == len(dark):
-        raise InputError("first_bounce is zero or negative at every pixel: check sign and black level of T")
+def dark(matrices: Sequence[Any], share: float, noise: Any, known: bool, F: np.ndarray) -> np.ndarray:
+    """Where F (channels, N) or diag(T) is not above 0, `share` of the median, and `noise()`.
+
+    What is not `known` but estimated counts up to the scatter of the pixel's column: dim light is not dark.
+    """
+    light, sigma = F, 0.0
+    if entries := all(isinstance(T, _ENTRIES) for T in matrices):
+        light = np.minimum(F, [_diagonal(T) for T in matrices])
+    median = np.array([[np.median(f[f > 0]) if np.any(f > 0) else 0.0] for f in light])
+    least = np.maximum(1e-300, share * median)  # 0 is dark as well, whose inverse is no number
+    faint = (light > least) & (light < _FAINT * median)
+    if known or (entries and faint.any()):
+        sigma = noise().diagonal(light)
+        for T, own, j in zip(matrices, sigma, faint, strict=True) if not known else ():
+            column = abs(T[:, j])
+            scatter = 1.25 * column.sum(axis=0, dtype=np.float64) / np.maximum((column != 0).sum(axis=0), 1)
+            own[:], own[j] = 0.0, np.minimum(own[j], scatter)  # 1.25 times the mean, as of normal noise
+    return light <= np.maximum(least, _SIGMAS * sigma)
+
+
+def mask_dark(F: np.ndarray, dark: np.ndarray, grid: tuple[int, int], may_mask: bool) -> tuple[Any, Any, str]:
+    """F with 0 and True (N,) where it is `dark` in some channel, and why; refused unless it may be masked."""
+    dark = np.logical_or.reduce(dark, axis=0)
+    pixels, zero = np.flatnonzero(dark), np.count_nonzero(dark & np.any(F <= 0.0, axis=0))
+    if dark.all():
+        raise InputError("first_bounce is zero or negative at every pixel, or noise: check black level of T")
+    why = f"zero or negative at {zero}, within its noise or below dark at {len(pixels) - zero}"
+    why = f"first_bounce is dark at {len(pixels)} of {len(dark)} pixels ({why})"
     if not len(pixels) or may_mask:
-        return np.where(dark, 0.0, F), dark
+        return np.where(dark, 0.0, F), dark, why
     first = ", ".join(f"({pixel // grid[1]}, {pixel % grid[1]})" for pixel in pixels[:8])
-    raise InputError(
-        f"first_bounce is zero or negative at {len(pixels)} of {len(dark)} pixels (row, column): {first}; "
-        "it must be positive; give on_dark='mask' to leave them unlit, which a LinearOperator cannot"
-    )
+    advice = "give on_dark='mask' to leave them unlit, which a LinearOperator cannot"
+    raise InputError(f"{why} at (row, column): {first}; {advice}")
 
 
 def certain(F: np.ndarray, variance: np.ndarray, sigmas: float) -> np.ndarray:

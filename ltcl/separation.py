@@ -13,16 +13,19 @@ the tolerance. With one camera they are exact of Lambertian scenes only (section
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks, layout
-from ltcl.errors import InputTypeError
+from ltcl.errors import InputError, InputTypeError
 from ltcl.solvers import Inverse, Solution, monte_carlo, solve_each
 from ltcl.solvers.solve import METHODS, SAMPLED
 from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
+from ltcl.uncertainty import SeparationStd, of_separation
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +33,9 @@ logger = logging.getLogger(__name__)
 LARGEST_DEFECT = 0.1
 LARGEST_NEGATIVE = 0.005
 RTOL = 1e-3
+_SIGMAS = 5.0  # of direct light beyond what it can be: no noise
+_UNKNOWN = 0.5  # of the image: direct light that is uncertain by more is no result
+_NEGATIVE = 0.01  # of the light of an image: what has more of negative light is no picture, and not judged
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -61,10 +67,18 @@ class Separation:
     bounces: np.ndarray
     rest: np.ndarray
     solutions: tuple[Solution | tuple[Solution, ...], ...]
-    reciprocity_defect: float = float("nan")
-    negative_bounce: float = float("nan")
-    warning: str = ""
-    transport_error: float = 0.0
+    reciprocity_defect: float
+    negative_bounce: float
+    warning: str
+    transport_error: float
+    _transports: tuple[Transport, Transport]  # that solves; whose noise it is
+    _inverse: Inverse | None
+
+    @cached_property
+    def std(self) -> SeparationStd:
+        """Standard deviations by the noise of T, `ltcl.uncertainty`, computed at the first call."""
+        T, true = self._transports
+        return of_separation(T, true.noise, [self.direct, *self.bounces], self._inverse)
 
     def __repr__(self) -> str:
         shape, error = " x ".join(map(str, self.direct.shape)), error_note(self.transport_error)
@@ -111,7 +125,8 @@ def separate(
     ------
     InputError
         A rectangular T, other shapes, a negative number of bounces, an `rtol` below the error of a compressed
-        T without `exact` or of `inverse`, or an inverse of another transport.
+        T without `exact` or of `inverse`, an inverse of another transport; or direct light of less than 0 or
+        more than all of a picture, by more than its uncertainty: F or T is wrong or noisy where it says.
     ConvergenceError
         A solve did not reach `rtol`.
 
@@ -153,6 +168,7 @@ def separate(
         rest = [l - b for l, b in zip(rest, b_k, strict=True)]
         if k == 0:
             indirect = rest
+            _refuse_impossible(true, columns, b_k, max(options["rtol"], *(s.residual for s in solutions[0])))
         pictures.append(picture(b_k))
     warning = _warning(true.reciprocity_defect, max(true.negative_bounces), true.error)
     if warning:
@@ -167,7 +183,41 @@ def separate(
         negative_bounce=max(true.negative_bounces),
         warning=warning,
         transport_error=true.error,
+        _transports=(T, true),
+        _inverse=inverse,
     )
+
+
+def _refuse_impossible(T: Transport, image: list[np.ndarray], direct: list[np.ndarray], rtol: float) -> None:
+    """InputError where the direct light of a frame and channel is not from 0 to all of its light.
+
+    Its variance is at most sum_j N (sigma_j b_j / F_j)^2, with the noise sigma_j of F_j for all of column j.
+    """
+    n, lit = len(image[0]), ~T.masked
+    for channel, (l, b) in enumerate(zip(image, direct, strict=True)):
+        light, share = l.sum(axis=0), b.sum(axis=0)
+        beyond = np.where(
+            np.minimum(l, 0.0).sum(axis=0) > -_NEGATIVE * light, np.maximum(-share, share - light), 0.0
+        )
+        if not (beyond > 0.0).any():
+            continue
+        F, margin = np.atleast_2d(T.first_bounce), _UNKNOWN * light
+        with suppress(InputError):  # of operators, whose noise is unknown
+            sigma = (T.noise.diagonal(F)[channel, lit] / F[channel, lit])[:, None]
+            noise = _SIGMAS * np.linalg.norm(sigma * b[lit], axis=0)
+            solved = 2.0 * (rtol + T.error) * np.linalg.norm(l, axis=0)
+            margin = np.minimum(np.sqrt(n) * (noise + solved), margin)
+        if not (beyond > margin).any():
+            continue
+        k = int(np.argmax(beyond - margin))
+        worst = np.argsort(np.minimum(b[:, k], l[:, k] - b[:, k]))[:8]
+        where = ", ".join(f"({j // T.grid[1]}, {j % T.grid[1]})" for j in worst)
+        part, uncertainty = share[k] / light[k], margin[k] / light[k]
+        raise InputError(
+            f"direct light is {part:.0%} of the image, uncertain to {uncertainty:.1%}; "
+            "it must be from 0 to 100 %: T or its first bounce is wrong or noisy, most of all at the pixels "
+            f"(row, column): {where}; mask dark ones by dark=, or measure T again"
+        )
 
 
 def _warning(defect: float, negative: float, error: float) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import weakref
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from ltcl import checks, diagnostics, layout
 from ltcl import first_bounce as _first_bounce
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError
+from ltcl.noise import Noise, estimate
 from ltcl.operators import Coupled, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
 from ltcl.operators import stored as stored_operators
 from ltcl.operators.interreflection import device_of, made_with, maskable, nbytes
@@ -48,10 +49,16 @@ class Transport:
         Of the camera where T is rectangular, M = h * w; S then does not exist: T relights and compensates.
     device : Device or str, optional
         As `open_device` takes it; opened at the first product. Operators have one already.
-    on_dark : "raise" or "mask"
-        Where F is not positive: refuse, or leave these pixels dark in compensations. Relighting stays exact.
+    on_dark : "mask" or "raise"
+        Pixels whose first bounce is 0 or within 5 standard deviations of its noise, estimated if need be:
+        leave them dark in compensations and warn of it, or refuse them. Relighting stays exact.
+    dark : float
+        First bounces below that many times the median one are dark, too.
     mixing : (3, 3), optional
         Of the projector's colours: channel c of T answers to mixing[c] @ (red, green, blue) of the pattern.
+    noise : Noise or Transport, optional
+        Standard deviations of the entries (`ltcl.noise.Noise`), or a second measurement of the same scene,
+        whose entries are compared at the first use of `noise`.
     probes, seed : int
         Of the estimate, at least 2 probes of about 20 products each; its error falls as 1 / sqrt(probes).
 
@@ -63,12 +70,13 @@ class Transport:
     is_compressed : bool
         Whether some channel is an operator S F; see `error` and `compression`, `ltcl.Compression` or None.
     masked : (N,) bool, projector pixels dropped by ``on_dark="mask"``, in any channel
+    dark : str, how many these are and why; empty where all of them are 0 in an array `first_bounce`
     first_bounce_error : array like first_bounce, or None, the standard error of an estimate
 
     Raises
     ------
     InputError
-        Wrong shapes, NaN, a first bounce that is not positive, a singular mixing.
+        Wrong shapes, NaN, a first bounce that is dark and cannot be masked, a singular mixing.
 
     Examples
     --------
@@ -86,8 +94,10 @@ class Transport:
         camera_grid: tuple[int, int] | None = None,
         device: Device | str | None = None,
         *,
-        on_dark: str = "raise",
+        on_dark: str = "mask",
+        dark: float = 0.0,
         mixing: Any = None,
+        noise: Any = None,
         probes: int = 128,
         seed: int = 0,
     ) -> None:
@@ -104,6 +114,7 @@ class Transport:
         self.camera_grid = self.grid if camera_grid is None else checks.grid("camera_grid", camera_grid, M)
         self.compression: Any = None
         self.masked: np.ndarray = np.zeros(N, bool)
+        self.dark = ""
         self.first_bounce_error: np.ndarray | None = None
         self._arrays: dict[str, np.ndarray] = {}  # of an unpickled compressed T
         self.is_compressed = self.is_square and any(made_with(T) is not None for T in self.matrices)
@@ -111,12 +122,19 @@ class Transport:
         self._requested_device = device
         if (own := device_of(self.blocks or [self.matrices], device)) is not None:
             self.device = own
+        self._noise = self._checked_noise(noise)
         self._F: np.ndarray | None = None  # (channels, N)
         checks.one_of("on_dark", on_dark, ("raise", "mask"))
+        share = checks.number("dark", dark, least=0.0, below=1.0)
         if self.is_square:
-            F, error = _first_bounce.find(self.matrices, first_bounce, lambda: self.device, probes, seed)
-            may_mask = on_dark == "mask" and all(map(maskable, self.matrices))
-            self._F, self.masked = _first_bounce.mask_dark(F, self.grid, may_mask)
+            known = noise is not None and getattr(noise, "source", "") != "estimated"
+            rule = partial(_first_bounce.dark, self.matrices, share, lambda: self.noise, known)
+            own, may_mask = lambda: self.device, on_dark == "mask" and all(map(maskable, self.matrices))
+            F, error = _first_bounce.find(self.matrices, first_bounce, own, probes, seed, rule)
+            self._F, self.masked, why = _first_bounce.mask_dark(F, rule(F), self.grid, may_mask)
+            if self.masked.any() and (isinstance(first_bounce, str) or np.any(self.masked & (F > 0))):
+                self.dark = why
+                logger.warning("%s; they stay unlit", why)
             if (other := diagnostics.other_grid(self.matrices[0], self.grid)) is not None:
                 logger.warning("grid is %s, but T is much smoother on a grid %s", self.grid, other)
             self.first_bounce_error = error[0] if error is not None and self.channels == 1 else error
@@ -170,6 +188,36 @@ class Transport:
         """As `__init__` sets them; those of an unpickled compressed T are uploaded at their first use."""
         return from_arrays(self._arrays, on_dark="mask", device=self.device).matrices
 
+    @cached_property
+    def noise(self) -> Noise:
+        """Standard deviations of the entries: as given or measured, else estimated from T at the first call.
+
+        InputError where T does not show its entries (compressed, or a LinearOperator) and none is given.
+        """
+        if isinstance(self._noise, Transport):
+            return Noise.measured_twice(self.matrices, self._noise.matrices)
+        return self._noise or estimate(self.matrices, self.grid, self.camera_grid)
+
+    @property
+    def measured_noise(self) -> Noise | None:
+        """`noise`, or None where it is an estimate from T alone."""
+        return None if self._noise is None else self.noise
+
+    def _checked_noise(self, noise: Any) -> Noise | Transport | None:
+        if isinstance(noise, Noise):
+            noise.require(self.channels, self.shape)
+        elif isinstance(noise, Transport):
+            for name in ("grid", "camera_grid", "channels"):
+                if getattr(noise, name) != getattr(self, name):
+                    text = f"noise is a T of {name} {getattr(noise, name)}"
+                    raise InputError(
+                        f"{text}; a second measurement has {name} {getattr(self, name)}, as matrix"
+                    )
+        elif noise is not None:
+            kind = type(noise).__name__
+            raise InputTypeError(f"noise is a {kind}; it must be a Noise, or a Transport measured once more")
+        return noise
+
     @property
     def is_square(self) -> bool:
         """Whether S exists: camera and projector have the same pixels, and colours no blocks between them."""
@@ -219,8 +267,16 @@ class Transport:
 
     @property
     def error(self) -> float:
-        """Bound on the relative error of solutions that compression leaves; rounding, 1e-7, comes on top."""
+        """Relative error of solutions that compression leaves, as its `norm` states it: of pictures, or all.
+
+        Rounding, 1e-7, comes on top.
+        """
         return max(S.solution_error for S in self.systems) if self.is_compressed else 0.0
+
+    @property
+    def error_bound(self) -> float:
+        """Bound on that error for every right-hand side, pictures or not."""
+        return max(S.error_bound for S in self.systems) if self.is_compressed else 0.0
 
     @cached_property
     def operators(self) -> tuple[Operator, ...]:
@@ -308,7 +364,8 @@ def default_rtol(least: float, T: Transport, exact: Any = None, inverse: Inverse
 def to_arrays(T: Transport) -> dict[str, np.ndarray]:
     """The arrays of a compressed T, S diag(d) in each channel, for files and pickles.
 
-    Those of `ltcl.operators.stored`, grid, first_bounce, mixing if any, columns_0, ... where d is another F.
+    Those of `ltcl.operators.stored`, grid, first_bounce, mixing and noise if any, columns_0, ... where d is
+    another F.
     """
     systems = [S for S in map(made_with, T.matrices) if S is not None]
     if not T.is_square or len(systems) < T.channels:
@@ -318,6 +375,8 @@ def to_arrays(T: Transport) -> dict[str, np.ndarray]:
     arrays = {"grid": np.array(T.grid), "first_bounce": F}
     if T.mixing is not None:
         arrays["mixing"] = T.mixing
+    if T.measured_noise is not None:
+        arrays |= T.measured_noise.to_arrays()
     for channel, (matrix, f) in enumerate(zip(T.matrices, F, strict=True)):
         if not np.array_equal(matrix.d, f):
             arrays[f"columns_{channel}"] = np.asarray(matrix.d, np.float64)
@@ -329,8 +388,10 @@ def from_arrays(
     *,
     grid: Any = None,
     first_bounce: Any = None,
-    on_dark: str = "raise",
+    on_dark: str = "mask",
+    dark: float = 0.0,
     device: Device | str | None = None,
+    noise: Any = None,
 ) -> Transport:
     """The transport of such arrays, on a device that is opened at once; `grid`, if any, must be theirs."""
     F, own = arrays["first_bounce"], checks.grid("grid", arrays["grid"].tolist())
@@ -341,7 +402,8 @@ def from_arrays(
         raise InputError(f"first_bounce has {len(F)} channels, but there are {len(systems)} operators")
     matrices = [ScaledColumns(S, arrays.get(f"columns_{c}", F[c])) for c, S in enumerate(systems)]
     first = F if first_bounce is None else first_bounce
-    return Transport(matrices, own, first, on_dark=on_dark, mixing=arrays.get("mixing"))
+    others: dict[str, Any] = {"mixing": arrays.get("mixing"), "noise": noise or Noise.from_arrays(arrays)}
+    return Transport(matrices, own, first, on_dark=on_dark, dark=dark, **others)
 
 
 def resolve_reference(T: Transport, exact: Any) -> tuple[Transport, tuple[IdentityPlus | None, ...]]:

@@ -23,25 +23,28 @@ from ltcl.cli.main import main as main_of_ltcl
 from ltcl.device import Device
 
 ROOT = Path(__file__).resolve().parents[1]
-CORE = 11_500
+CORE = 13_130
 
 _TASKS = [f"ltcl/{name}" for name in ("compensation", "separation.py", "relighting.py", "analysis.py")]
+_NOISE = ["ltcl/noise", *(f"ltcl/{name}.py" for name in ("uncertainty", "denoising", "verdict"))]
 # Lines at most, by the folders and modules that they are of: the Python of the core, and what belongs to it.
 BUDGETS: dict[str, tuple[int, list[str]]] = {
     "device": (900, ["ltcl/device"]),
     "operators": (2600, ["ltcl/operators"]),
     "solvers": (2800, ["ltcl/solvers"]),
     "theory and diagnostics": (1100, ["ltcl/theory", "ltcl/diagnostics.py"]),
-    "compression": (1500, ["ltcl/compression"]),
-    "compensation, separation, relighting, analysis": (1300, _TASKS),
-    "transport and the rest": (1300, ["ltcl/*.py"]),
+    "compression": (1760, ["ltcl/compression"]),
+    "compensation, separation, relighting, analysis": (1370, _TASKS),
+    # Noise is new, and other parts use it: together 1 800 of the 3 000 lines for noise, scale and viewer.
+    "noise": (1210, _NOISE),
+    "transport and the rest": (1390, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
 _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6500, "store": 1200, "images": 500, "batch": 500, "cli": 2000, "scenes": 3000}
+_OTHERS = {"acquisition": 6500, "store": 1215, "images": 500, "batch": 500, "cli": 2145, "scenes": 3000}
 _BENCHES = (
     "_boxes _coefficients _corner _harness _peers _ways claims csr dense4k launches products relax "
     "resolution131k solve video walk"
@@ -49,11 +52,12 @@ _BENCHES = (
 BESIDE: dict[str, tuple[int, list[str]]] = {
     "kernels": (2000, ["kernels"]),
     "tests of the core": (
-        9000,
+        9100,
         [f"tests/{name}" for name in _FOLDERS]
         + [f"tests/test_{name}.py" for name in _TESTS.split()]
         + [f"tests/{name}.py" for name in ("bases", "conftest", "gallery", "house", "problems", "reference")],
     ),
+    "tests of noise": (1300, ["tests/noise"]),
     "benches of the core": (2000, [f"bench/{name}.py" for name in _BENCHES.split()]),
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),

@@ -62,7 +62,7 @@ def test_masked_pixels_stay_dark(device):
     f = np.where(np.arange(N) % 5 == 0, 0.0, F[1])
     matrix, _, _ = one_channel(device, f=f)
     with pytest.raises(InputError, match="on_dark"):
-        ltcl.Transport(matrix, GRID, first_bounce=f)
+        ltcl.Transport(matrix, GRID, first_bounce=f, on_dark="raise")
     T = ltcl.Transport(matrix, GRID, first_bounce=f, on_dark="mask")
     assert T.systems == (matrix.A,)
     found = ltcl.compensate(T, T @ np.full(GRID, 0.5), rtol=T.error)

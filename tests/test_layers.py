@@ -29,9 +29,10 @@ LAYERS: list[set[str]] = [
     {"operators", "layout"},
     {"theory"},
     {"solvers"},
-    {"diagnostics", "first_bounce"},
+    {"diagnostics", "first_bounce", "noise"},
     {"transport"},
-    {"compensation", "compression", "separation", "relighting", "analysis"}
+    {"uncertainty", "verdict"},
+    {"compensation", "compression", "separation", "relighting", "analysis", "denoising"}
     | {"scenes", "store", "acquisition", "report"},
     {"plots"},
     {"batch", "demo"},

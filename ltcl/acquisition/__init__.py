@@ -3,7 +3,7 @@
 
 task         acquire and finalize, by a `rig`: virtual, rendered, photographed by a person, on a cable (rigs/)
 calibrate    what is measured once (`session`, radiometry/, geometry/); its record, `calibration`
-scanning/    which pixels are lit when, and T from the pictures; plan before, report and forecast after
+scanning/    which pixels are lit when, and T from the pictures; plan before, report after
 agreement    photographs that deviate from what others show are refused by number; `anchor`: did it move?
 project      an acquisition as a folder with an acquisition.toml
 
@@ -26,10 +26,9 @@ from ltcl.acquisition.rigs import (
     VirtualRig,
     camera_map,
 )
-from ltcl.acquisition.scanning.forecast import Forecast, forecast_bounces, forecast_picture
 from ltcl.acquisition.scanning.report import Report
 from ltcl.acquisition.task import acquire, finalize
 
-__all__ = ["Calibration", "Correspondence", "Forecast", "Project", "Report", "Rig", "Setup", "Shots"]
+__all__ = ["Calibration", "Correspondence", "Project", "Report", "Rig", "Setup", "Shots"]
 __all__ += ["Display", "FolderRig", "GPhoto2Camera", "LiveRig", "MitsubaRig", "OpenCVCamera", "VirtualRig"]
-__all__ += ["acquire", "camera_map", "finalize", "forecast_bounces", "forecast_picture"]
+__all__ += ["acquire", "camera_map", "finalize"]

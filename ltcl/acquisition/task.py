@@ -13,6 +13,7 @@ import math
 import os
 import tempfile
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -184,7 +185,8 @@ def acquire(
             if not isinstance(T.matrices[0], StoredRows):
                 return T
             matrices = [rows.tocsr() for rows in T.matrices]
-            return Transport(matrices, T.grid, T.first_bounce, device=device, on_dark="mask", mixing=T.mixing)
+            others: Any = {"device": device, "mixing": T.mixing, "noise": T.measured_noise}
+            return Transport(matrices, T.grid, T.first_bounce, on_dark="mask", **others)
     path = as_path(store, "store")
     existing = _open(path, resume)
     if existing is None:
@@ -308,7 +310,8 @@ def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress
         store.update(patterns=log.done)
         for c, V in enumerate(core.matrices("variance")):
             store.extra(f"core_variance_{c}", V.data)
-        store.finalize(compressed=Parts(adaptive.arrays(core, calibration.mixing, settings.sigmas)))
+        arrays = adaptive.arrays(core, calibration.mixing, settings.sigmas) | pictures.noise(core.variances)
+        store.finalize(compressed=Parts(arrays))
         progress("scan", log.done, log.done)
         return
     code, done = columns.code_of(strategy, pictures.grid, settings.order), 0
@@ -324,6 +327,8 @@ def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress
     columns.check_row_sums(str(store.path), sums, white)
     store.extra(columns.SUMS, sums)
     store.update(patterns=total)
+    for name, array in pictures.noise(partial(columns.variances, store)).items():
+        store.extra(name, array)
 
     def add_up(c: int, first: int, matrix: Any, variance: Any) -> tuple[Any, Any]:
         rows = slice(first, first + matrix.shape[0])

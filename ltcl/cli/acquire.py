@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ltcl import checks, store
-from ltcl.cli import options
+from ltcl.cli import options, transports
 from ltcl.cli.command import WAITING, Answer, Context, command, percent, table
 from ltcl.device import open_device
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing, ScanRefused
+from ltcl.verdict import verdict
 
 if TYPE_CHECKING:
     from ltcl.acquisition import Project
@@ -196,14 +197,17 @@ def _report(context: Context, project: Project, device: Any) -> Answer:
     facts = Report.of(project.store)
     data = {"folder": project.folder, "store": project.store, **json.loads(facts.to_json())}
     lines = [str(facts)]
+    T = store.load(project.store, on_dark="mask", device=device)
+    judged = verdict(T, sum_deviation=facts.sum_deviation, saturation=facts.saturated)
+    data["verdict"] = judged
     if project.kind == "virtual":
         context.progress("relative error of T p")
-        T = store.load(project.store, on_dark="mask", device=device)
         with project.rig(aligned=True) as rig:
             data["error"] = errors = Setup.of(project.store).relative_error(rig, T)
         each = ", ".join(f"{error:.2%}" for error in errors)
         lines.append(f"relative error of T p, for patterns p that were not scanned: {each}")
-    return Answer(data, [*lines, f"transport in {project.store}"])
+    end = transports.verdicts({str(project.store): judged})
+    return Answer(data, [*lines, f"transport in {project.store}", *end])
 
 
 @command()

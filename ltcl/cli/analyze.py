@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from ltcl.analysis import ChannelAnalysis
-from ltcl.cli import options, transports
+from ltcl.cli import options, pictures, transports
 from ltcl.cli.command import Answer, Context, command, percent, table
 
 COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
@@ -29,16 +29,19 @@ def analyze(
     context: Context,
     files: options.Matrices,
     rtol: Annotated[float, options.option("Relative residual at which a solve ends.")] = 1e-2,
+    show_dark: options.ShowDark = None,
     plot: Annotated[Path | None, options.file(_PLOT, callback=_plot)] = None,
 ) -> Answer:
     """Spectrum of R, products each method needs to the tolerance, and whether T is physically possible."""
     from ltcl.analysis import analyze
 
-    analyses, entries, spectra, forecasts = {}, [], [], []
+    analyses, entries, spectra, forecasts, lights, verdicts = {}, [], [], [], {}, {}
     for file in context.progress.each(files):
         T = transports.load(context, file)
+        lights[file.name] = T.first_bounce, T.grid
         context.progress("analyzing")
         analyses[file.name] = analysis = analyze(T, rtol=rtol)
+        verdicts[str(file)] = analysis.verdict
         entries.append({"file": str(file), "device": T.device.name, **analysis.to_dict()})
         for colour, channel in zip(COLOURS[T.channels], analysis.channels, strict=True):
             label = {"file": str(file), "channel": colour}
@@ -48,6 +51,8 @@ def analyze(
         from ltcl import plots
 
         plots.save(plots.analysis(analyses), plot)
+    if show_dark is not None:
+        pictures.write_first_bounces(show_dark, lights)
     lines = [
         "Spectrum of R, bounds on that of S, and checks of the measurement",
         table([*spectra[0]], [row.values() for row in spectra]),
@@ -55,6 +60,7 @@ def analyze(
         "  light passed on: share of each pixel's light, by one bounce; must be at least 0 and below 1",
         f"\nProducts with S to a relative residual of {rtol:g}, two more by sweeps; -: no forecast",
         table([*forecasts[0]], [row.values() for row in forecasts]),
+        *transports.verdicts(verdicts),
     ]
     return Answer(entries, lines)
 

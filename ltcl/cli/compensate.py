@@ -85,7 +85,8 @@ def compensate(
     Writes for each picture the pattern, how the scene will look under it and what is out of the projector's
     reach, exactly as .exr and as .png; all in compensate.png, and compensate.json. The .png of a pattern has
     the codes for the projector, pixel for pixel: those of the measured response with a TRANSPORT of 'ltcl
-    acquire', else sRGB. The others are for the eye, at one exposure, which compensate.json names.
+    acquire', else sRGB. The others are for the eye, at one exposure, which compensate.json names. Standard
+    deviations by the noise of TRANSPORT, where that is known, are NAME_pattern_std and NAME_appearance_std.
 
     The ambient light of a TRANSPORT of 'ltcl acquire' is the background, and the gain is auto.
 
@@ -160,9 +161,8 @@ def _compensate_pictures(
             except LtclError as error:
                 error.args = (f"{error} (compensating {files[name]})",)
                 raise
-            written, panels = _write(
-                folder, name, desired[name], result, factor, settings["bounds"][1], setup
-            )
+            high, noisy = settings["bounds"][1], transports.shows_noise(T, settings)
+            written, panels = _write(folder, name, desired[name], result, factor, high, setup, noisy)
             sheet.append(panels)
             facts = {key: getattr(result, key) for key in _RESULTS}
             facts |= {"too_dark": float(np.mean(result.out_of_reach > 0))}
@@ -180,7 +180,14 @@ def _compensate_pictures(
 
 
 def _write(
-    folder: Path, name: str, desired: np.ndarray, result: Compensation, factor: float, high: float, setup: Any
+    folder: Path,
+    name: str,
+    desired: np.ndarray,
+    result: Compensation,
+    factor: float,
+    high: float,
+    setup: Any,
+    noisy: bool,
 ) -> tuple[dict[str, Any], list[Any]]:
     """Files of one picture, and its row of the contact sheet.
 
@@ -201,9 +208,14 @@ def _write(
     images.write(folder / f"{name}_pattern.exr", pattern)
     codes, encoding = (pattern / white, "srgb") if setup is None else (setup.codes(pattern), "linear")
     images.write(folder / f"{name}_pattern.png", codes, encoding=encoding)
-    written = {"pattern": {suffix: f"{name}_pattern.{suffix}" for suffix in ("exr", "png")}}
+    written: dict[str, Any] = {"pattern": {suffix: f"{name}_pattern.{suffix}" for suffix in ("exr", "png")}}
     for key in ("appearance", "out_of_reach"):
         written[key] = pictures.write(folder, f"{name}_{key}", getattr(result, key), panels[key])
+    for key, unit in {"pattern": 1 / white, "appearance": scale}.items() if noisy else ():
+        files, panels[f"{key}_std"] = pictures.deviation(
+            folder, f"{name}_{key}", getattr(result.std, key), unit
+        )
+        written[key]["std"] = files
     return written, list(panels.values())
 
 

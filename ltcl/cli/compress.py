@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -29,11 +29,19 @@ def _bytes(text: str) -> int:
 
 
 _BUDGET = "Bytes that the numbers of R may take, such as 50MB."
+_Norm = Annotated[Literal["pictures", "worst"], options.option("Whose error: of pictures, or any light.")]
 _BASIS = "pixels or a wavelet (haar, db2, ...; compress: 'db2 rows', too); more than once: the best of them."
 
 
+def _rtol(text: str) -> float | str:
+    return text if text == "noise" else float(text)
+
+
+_RTOL = "Relative error that solutions may have; compress: or noise, which keeps what stands out of it."
+
+
 def _accuracy_options(
-    rtol: Annotated[float, options.option("Relative error that a solution may have.")] = 1e-2,
+    rtol: Annotated[Any, options.option(_RTOL, parser=_rtol, metavar="FLOAT")] = 1e-2,
     basis: Annotated[list[str] | None, options.option(_BASIS)] = None,
 ) -> None:
     """How accurate the solutions are, and in which basis R is written."""
@@ -48,6 +56,7 @@ def compress(
     file: options.Matrix,
     out: Annotated[Path, options.out("The compressed transport: .npz or .zarr.")],
     budget: Annotated[int | None, options.option(_BUDGET, parser=_bytes, metavar="SIZE")] = None,
+    norm: _Norm = "pictures",
 ) -> Answer:
     """Write R in a basis where it is sparse; basis, threshold and precision are chosen by measurement."""
     from ltcl import store
@@ -62,13 +71,13 @@ def compress(
         error = f"with an error of {T.error:.2g}"
         raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
     rtol, basis = context.options["rtol"], context.options["basis"] or None
-    C = compress(T, rtol, budget, basis=basis, progress=partial(context.progress, total=1.0))
+    C = compress(T, rtol, budget, norm=norm, basis=basis, progress=partial(context.progress, total=1.0))
     store.save(out, C)
     transports.note_lost(file, out)
     facts: Any = C.compression
     data = transports.heading(context, file, T) | {"out": out, "bytes": facts.uncompressed}
     data |= {"bytes_compressed": C.nbytes, "bytes_on_disk": transports.on_disk(out)}
-    data |= {"solution_error": C.error, "compression": facts}
+    data |= {"solution_error": C.error, "error_bound": C.error_bound, "compression": facts}
     before, after, disk = (checks.size(data[f"bytes{name}"]) for name in ("", "_compressed", "_on_disk"))
     columns = ("channel", "basis", "core", "numbers a row", "bytes", "error of R, 2-norm")
     rows = []
@@ -76,6 +85,7 @@ def compress(
         core = f"{channel.format} 1 x {channel.width} {channel.precision}"
         rows.append((colour, channel.basis, core, channel.kept, checks.size(channel.nbytes), channel.error))
     within = f"solutions within {checks.upwards(C.error)}, {disk} on disk, in {facts.seconds:.3g} s"
+    within += f", or {checks.upwards(C.error_bound)} for light that is no picture" * (norm == "pictures")
     return Answer(
         data, [table(columns, rows), f"\n{out}: {before} to {after} with the first bounce, {within}"]
     )

@@ -9,22 +9,32 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ltcl import checks
-from ltcl.cli import options, transports
+from ltcl import checks, first_bounce
+from ltcl.cli import options, pictures, transports
 from ltcl.cli.command import FAILED, Answer, Context, command, note, print_error, table
 from ltcl.errors import InputError, LtclError
+from ltcl.noise import estimate
 from ltcl.store import BlockStore, Parts, Record, formats
 from ltcl.store.record import about
+from ltcl.transport import Transport
+from ltcl.verdict import Verdict, verdict
+
+_JUDGED = 1 << 28  # bytes of a transport at most
 
 
 @command()
-def info(context: Context, files: options.Matrices, variable: options.Variable = None) -> Answer:
+def info(
+    context: Context,
+    files: options.Matrices,
+    variable: options.Variable = None,
+    show_dark: options.ShowDark = None,
+) -> Answer:
     """Size, channels, grid, entries and first bounce of transport files and of inverses. Needs no device.
 
     All bytes of a .zarr are compared with their checksums. A bad file does not keep the others from being
-    shown; the exit code is then 1.
+    shown; the exit code is then 1. Transports of more than 256 MiB are judged by 'ltcl analyze' only.
     """
-    entries, rows = [], []
+    entries, rows, lights, verdicts = [], [], {}, {}
     for file in context.progress.each(files):
         context.progress("reading")
         try:
@@ -32,14 +42,18 @@ def info(context: Context, files: options.Matrices, variable: options.Variable =
             with about(file):
                 if file.is_dir():
                     BlockStore.open(file).verify()
-                facts = _describe(file, record)
-            entries.append(facts)
+                facts, F = _describe(file, record)
+            lights |= {} if F is None else {file.name: (F, record.grid or (1, record.shape[1]))}
+            verdicts[str(file)] = judged = _verdict(record, facts["nbytes"])
+            entries.append(facts | {"verdict": judged})
             rows.append(_row(facts))
         except LtclError as error:
             entries.append({"file": str(file), **print_error(error)})
+    if show_dark is not None and lights:
+        pictures.write_first_bounces(show_dark, lights)
     columns = ("file", "shape", "channels", "grid", "camera grid", "stored", "entries", "memory")
     lines = [table((*columns, "first bounce", "dark pixels"), rows)] if rows else []
-    return Answer(entries, lines, FAILED if len(rows) < len(files) else 0)
+    return Answer(entries, lines + transports.verdicts(verdicts), FAILED if len(rows) < len(files) else 0)
 
 
 @command(options.file_options)
@@ -63,7 +77,7 @@ def convert(
             raise InputError(
                 f"grid is {next(iter(sizes.values()))}; this transport is compressed on {h} x {w}"
             )
-        facts = _describe(target, record)  # refuses what could not be loaded again
+        facts, _ = _describe(target, record)  # refuses what could not be loaded again
     context.progress(f"writing {target}")
     formats.write(target, record)
     transports.note_lost(source, target)
@@ -76,8 +90,8 @@ def convert(
     return Answer({"source": source, **facts}, [f"{target}: {facts['stored']}, {size} on disk"])
 
 
-def _describe(file: Path, record: Record | Parts) -> dict[str, Any]:
-    """Facts about a transport in plain types; refuses what could not be loaded again."""
+def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Facts about a transport in plain types, and F; refuses what could not be loaded again."""
     if isinstance(record, Parts):  # whose operators are not made: that takes a device
         F, kinds = record.first_bounce, ", ".join(record.kinds)
         facts: dict[str, Any] = {"channels": len(F), "entries": record.entries}
@@ -86,17 +100,18 @@ def _describe(file: Path, record: Record | Parts) -> dict[str, Any]:
         facts["solution_error"] = record.error
     else:
         F, facts = _describe_record(record)
-    return {
+    facts = {
         "file": str(file),
         **{name: getattr(record, name) for name in ("shape", "grid", "camera_grid", "mixing")},
         **facts,
         "first_bounce": None if F is None else (float(F.min()), float(F.max())),
         "dark_pixels": None if F is None else int(np.count_nonzero((F <= 0).any(axis=0))),
     }
+    return facts, F
 
 
 def _describe_record(record: Record) -> tuple[np.ndarray | None, dict[str, Any]]:
-    """F (channels, N), which a rectangular T has not, and facts about the matrices."""
+    """F (channels, N), 0 where dark, which a rectangular T has not, and facts about the matrices."""
     (rows, columns), F, matrices = record.shape, record.first_bounce, list[Any](record.matrices)
     for name, pixels in (("grid", columns), ("camera_grid", rows)):
         if getattr(record, name) is not None:
@@ -108,7 +123,11 @@ def _describe_record(record: Record) -> tuple[np.ndarray | None, dict[str, Any]]
     for T in () if record.stored else matrices:  # blocks of a store have been checked
         checks.finite("T", T if record.dense else T.data)
     layouts = [[T] if record.dense or record.stored else [T.data, T.indices, T.indptr] for T in matrices]
-    return None if F is None else np.atleast_2d(checks.finite("first_bounce", F)), {
+    if F is not None:
+        F, grid = np.atleast_2d(checks.finite("first_bounce", F)), record.grid or (1, columns)
+        noise = lambda: record.noise or estimate(matrices, grid, record.camera_grid or grid)  # noqa: E731
+        F = np.where(first_bounce.dark(matrices, 0.0, noise, record.noise is not None, F), 0.0, F)
+    return F, {
         "channels": len(matrices),
         "stored": "dense" if record.dense else "row blocks" if record.stored else "sparse",
         "dtype": str(matrices[0].dtype),
@@ -117,6 +136,17 @@ def _describe_record(record: Record) -> tuple[np.ndarray | None, dict[str, Any]]
         "first_bounce_from": "diagonal" if record.first_bounce is None else "file",
         "solution_error": 0.0,
     }
+
+
+def _verdict(record: Record | Parts, nbytes: int) -> Verdict:
+    if isinstance(record, Parts) or record.grid is None or nbytes > _JUDGED:
+        return Verdict("Unknown without a grid, of compressed or large transports: ask ltcl analyze.")
+    names = ("first_bounce", "camera_grid", "mixing", "noise")
+    settings = {n: value for n in names if (value := getattr(record, n)) is not None}
+    try:
+        return verdict(Transport(record.matrices, record.grid, **settings))
+    except InputError as error:  # dark all over
+        return Verdict(f"Good for nothing: {error}.", False, False)
 
 
 def _row(entry: dict[str, Any]) -> tuple:

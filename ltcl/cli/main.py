@@ -17,6 +17,7 @@ from ltcl.cli.analyze import analyze
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
 from ltcl.cli.compensate import compensate
 from ltcl.cli.compress import compress, invert
+from ltcl.cli.denoise import denoise
 from ltcl.cli.doctor import devices, doctor
 from ltcl.cli.files import convert, info
 from ltcl.cli.separate import relight, separate
@@ -35,7 +36,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_FILES = (info, analyze, convert, compress, invert)
+_FILES = (info, analyze, convert, compress, invert, denoise)
 for _command in (devices, doctor, demo, simulate, *_FILES, compensate, separate, relight, show):
     app.command()(_command)
 app.add_typer(acquire, name="acquire")

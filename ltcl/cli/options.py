@@ -89,14 +89,18 @@ _RTOL = "Relative residual that ends a solve. Default: 0.01 (separate: 0.001), o
 _EXACT = "What TRANSPORT was compressed from: corrects solves to any RTOL; errors are those with it."
 _SAMPLES = "Random walks from each pixel (monte_carlo, 256), or columns of a row (hybrid, 32)."
 _FIRST = "Direct light: the diagonal of T, or 1 / diag(T^-1), dense or estimated. Default: as in the file."
-_DARK = "Projector pixels without direct light: refuse or leave unlit; auto: unlit if 'ltcl acquire' made T."
+_NOISE = "A second measurement of the same scene, of which the noise of TRANSPORT follows; else estimated."
+_ON_DARK = "Projector pixels whose direct light is 0 or within its noise: leave unlit, or refuse."
+_SHOW_DARK = "Picture, a PNG, of direct light; pixels without it are orange."
+_DARK = "Direct light below DARK times its median is dark, too."
 Matrix = Annotated[Path, argument("TRANSPORT", FORMATS)]
 Matrices = Annotated[list[Path], argument("FILE...", FORMATS)]
 Pictures = Annotated[list[Path], argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")]
 Out = Annotated[Path, out("Folder for the results; filled only on success.", writable_folder, "DIR")]
 Acquisition = Annotated[Path, argument("DIR", "Folder with an acquisition.toml; 'ltcl simulate' makes one.")]
 Device = Annotated[str | None, option(_DEVICE)]
-OnDark = Annotated[Literal["auto", "raise", "mask"], option(_DARK)]
+OnDark = Annotated[Literal["mask", "raise"], option(_ON_DARK)]
+ShowDark = Annotated[Path | None, file(_SHOW_DARK, callback=writable_file)]
 Variable = Annotated[str | None, option("Name of the matrix in a .mat, .h5 or .npz file.", metavar="NAME")]
 
 
@@ -110,7 +114,9 @@ def file_options(
 
 def transport_options(
     first_bounce: Annotated[Literal["diagonal", "exact", "estimate"] | None, option(_FIRST)] = None,
-    on_dark: OnDark = "auto",
+    on_dark: OnDark = "mask",
+    dark: Annotated[float, option(_DARK)] = 0.0,
+    noise: Annotated[Path | None, file(_NOISE)] = None,
     device: Device = None,
 ) -> None:
     """How a transport is loaded; with those of `file_options`."""

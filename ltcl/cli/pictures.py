@@ -126,6 +126,13 @@ def panel(codes: np.ndarray, label: str) -> Any:
     return sheet
 
 
+def deviation(folder: Path, name: str, std: np.ndarray, factor: float) -> tuple[dict[str, str], Any]:
+    """Files of standard deviations, which are amplified by a power of two to be seen; and their panel."""
+    times = 2 ** int(np.log2(max(exposure(std) / factor, 1.0)))
+    shown = panel(shades(std, factor * times), f"{name.split('/')[-1]}_std, {times} times as bright")
+    return write(folder, f"{name}_std", std, shown), shown
+
+
 def contact_sheet(rows: Sequence[Sequence[Any]]) -> Any:
     """Panels in rows, as one picture."""
     from PIL import Image
@@ -139,6 +146,16 @@ def contact_sheet(rows: Sequence[Sequence[Any]]) -> Any:
             sheet.paste(each, (left, top))
             left += each.width + _MARGIN
     return sheet
+
+
+def write_first_bounces(place: Path, lights: Mapping[str, tuple[np.ndarray, tuple[int, int]]]) -> None:
+    """First bounces (N,) or (3, N) on their grids as one PNG; pixels where one is 0 are orange."""
+    rows = []
+    for name, (F, grid) in lights.items():
+        dark = np.any(np.atleast_2d(F) <= 0.0, axis=0)
+        codes = mark(shades(F.T.reshape(*grid, *F.shape[:-1]), exposure(F)), 1.0 * dark)
+        rows.append([panel(codes, f"{name}: {np.count_nonzero(dark)} of {dark.size} pixels are dark")])
+    contact_sheet(rows).save(place, "PNG")
 
 
 def amplified(components: Mapping[str, np.ndarray], factor: float) -> list[Any]:

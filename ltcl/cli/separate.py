@@ -25,14 +25,15 @@ def separate(
 
     Writes direct, indirect, bounce_1, bounce_2, ... and the rest exactly as .exr (measured ones may be a
     little negative), and for the eye as .png, all at one exposure, which separate.json names; and
-    separate.png with all of them. Several pictures get a folder each.
+    separate.png with all of them. Several pictures get a folder each. Standard deviations by the noise of
+    TRANSPORT, where that is known, are direct_std, bounce_1_std, ... and in separate.png.
     """
     from ltcl.separation import RTOL, separate
 
     T = transports.load(context, transport)
     settings = transports.solving(context, T, RTOL)
     images = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
-    files = dict(zip(images, picture, strict=True))
+    files, noisy = dict(zip(images, picture, strict=True)), transports.shows_noise(T, settings)
     factor, entries, sheet, rows, errors = pictures.exposure(*images.values()), [], [], [], []
     text = transports.heading(context, transport, T, rtol=settings["rtol"])
     text |= {"exposure": factor, "pictures": entries}
@@ -44,7 +45,9 @@ def separate(
             light |= {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)} | {
                 "rest": result.rest
             }
-            solutions = iter(result.solutions)
+            solutions, deviations = iter(result.solutions), []
+            known = [result.std.direct, *result.std.bounces] if noisy else []
+            known = dict(zip(["direct", *list(light)[2:-1]], known, strict=False))
             panels, facts = [pictures.panel(pictures.shades(images[name], factor), name)], []
             for component, picture_of in light.items():
                 panels.append(pictures.panel(pictures.shades(picture_of, factor), component))
@@ -56,6 +59,9 @@ def separate(
                     {"part": component, **written, "share": share, "lowest": float(picture_of.min())}
                 )
                 facts[-1]["channels"] = solves
+                if component in known:
+                    facts[-1]["std"], shown = pictures.deviation(folder, place, known[component], factor)
+                    deviations.append(shown)
                 errors += [solve["error"] for solve in solves if solve["error"] is not None]
                 residual = max((each["residual"] for each in solves if each["error"] is None), default=None)
                 products = sum(each["products"] for each in solves) or None
@@ -63,7 +69,7 @@ def separate(
             entries.append(
                 {"file": str(files[name]), "transport_error": result.transport_error, "parts": facts}
             )
-            sheet += [panels[:3], panels[3:], pictures.amplified(light, factor)]
+            sheet += [panels[:3], panels[3:], pictures.amplified(light, factor), deviations]
         pictures.contact_sheet([row for row in sheet if row]).save(folder / "separate.png")
     lines: list[Any] = [table(("picture", "part", "share of light", "products", "residual"), rows)]
     lines.append(f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}")
@@ -86,7 +92,7 @@ def relight(
     transport: options.Matrix,
     pattern: Annotated[list[Path], options.argument("PATTERN...", "Pictures of patterns.")],
     out: options.Out,
-    on_dark: options.OnDark = "auto",
+    on_dark: options.OnDark = "mask",
     device: options.Device = None,
 ) -> Answer:
     """Show what the camera will see when PATTERN is projected.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -10,26 +11,29 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks, report, store
-from ltcl.cli.command import Context, note
+from ltcl.cli.command import Context, note, table
 from ltcl.device import open_device
 from ltcl.errors import InputError
 from ltcl.solvers.solve import SAMPLED
 from ltcl.transport import Transport, default_rtol, resolve_reference
+from ltcl.verdict import Verdict
 
 _ROUNDING = 1e-5  # of float32, in a picture
 
 
 def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
     """Open the device, then load: a mistyped device does not wait for a large file."""
-    device, on_dark = open_device(context.options["device"]), context.options["on_dark"]
+    device = open_device(context.options["device"])
     context.progress(f"reading {path}")
-    if on_dark == "auto":
-        on_dark = "mask" if is_measured(path) else "raise"
-    names = ("variable", "grid", "camera_grid", "first_bounce")
+    names = ("variable", "grid", "camera_grid", "first_bounce", "on_dark", "dark")
     settings = {name: context.options[name] for name in names if context.options.get(name)}
-    T = store.load(path, device=device, on_dark=on_dark, **settings)
+    if noise := context.options.get("noise"):
+        context.progress(f"reading {noise}")
+        second = {name: settings[name] for name in names[:3] if name in settings}
+        settings["noise"] = store.load(noise, device=device, **second)
+    T = store.load(path, device=device, **settings)
     dark = int(T.masked.sum())
-    if dark and dark_note:
+    if dark and dark_note and not T.dark:  # which was logged
         note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
     return T
 
@@ -58,6 +62,12 @@ def solving(context: Context, T: Transport, rtol: float) -> dict[str, Any]:
     return {"method": asked["method"], "rtol": rtol, "inverse": inverse, "exact": exact, **sampling}
 
 
+def shows_noise(T: Transport, settings: dict[str, Any]) -> bool:
+    """Whether its results have standard deviations: noise of T was measured, or T shows its entries."""
+    judged = settings["exact"] or T
+    return not judged.is_compressed or judged.measured_noise is not None
+
+
 def callback(context: Context, T: Transport, settings: dict[str, Any], solves: int = 1) -> Any:
     """Progress of so many solves of all channels, of a method that samples one for all."""
     channels = 1 if settings["method"] in SAMPLED else T.channels
@@ -79,6 +89,14 @@ def _load_exact(path: Path, T: Transport, variable: str | None) -> Transport:
     return exact
 
 
+def verdicts(files: Mapping[str, Verdict]) -> list[Any]:
+    """The end of a report: numbers of each file, and what follows from them."""
+    names = dict.fromkeys(name for v in files.values() for name in v.numbers)
+    rows = ([name, *(v.numbers.get(name) for v in files.values())] for name in names)
+    lines = [f"{file}: {v.text}" if files.keys() - {file} else v.text for file, v in files.items()]
+    return ["", table(["verdict", *files], rows), *lines] if names else lines
+
+
 def refuse_same(out: Path, file: Path) -> None:
     """Refuse to replace a transport by what is made of it."""
     if out.exists() and file.exists() and out.samefile(file):
@@ -91,7 +109,7 @@ def caveat(what: str, T: Transport, exact: Path | None = None) -> str | None:
         return None
     if exact is not None:
         return f"{what} of {exact}, by which solutions were corrected"
-    bound = f"{100 * float(checks.upwards(T.error)):.2g} %"
+    bound = f"{100 * float(checks.upwards(T.error)):.2g} %" + " for pictures" * (T.error < T.error_bound)
     return f"{what} of the compressed transport, whose own relative error is at most {bound}"
 
 

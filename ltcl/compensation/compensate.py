@@ -25,6 +25,7 @@ from ltcl.compensation.problem import Columns, Limits, Problem, join, systems
 from ltcl.errors import ConvergenceError, InputError
 from ltcl.solvers import Bounded, Inverse, Solution, Status, solve_each
 from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
+from ltcl.uncertainty import CompensationStd, of_compensation
 
 RTOL = 1e-2
 _COARSE = 1e-5  # rtol from which on the rounding of a pattern does not count beside the residual
@@ -83,6 +84,9 @@ class Compensation:
     _seen: Columns | None  # the appearance, where that is what was computed
     _weights: Columns | None
     _explained: list[np.ndarray] | None  # (k,), of what is missing, by the tolerance; None: all of it
+    _transports: tuple[Transport, Transport]  # that solves; whose noise it is
+    _inverse: Inverse | None
+    _bounds: tuple[float, float]
 
     @cached_property
     def appearance(self) -> np.ndarray:
@@ -90,6 +94,13 @@ class Compensation:
         if self._seen is not None:
             return self._picture(self._seen)
         return self._picture([d - r for d, r in zip(self._target, self._missing, strict=True)])
+
+    @cached_property
+    def std(self) -> CompensationStd:
+        """Standard deviations by the noise of T, `ltcl.uncertainty`, computed at the first call."""
+        (T, true), own = self._transports, systems(self._transports[0]) if self.limited else ()
+        bounds = self._bounds if self.clipped else (-np.inf, np.inf)
+        return of_compensation(T, true.noise, self.pattern, bounds, self._inverse, own, self._weights)
 
     @cached_property
     def target(self) -> np.ndarray:
@@ -236,7 +247,7 @@ def compensate(
     start = _start(T, problem, undo, requested, loss, exactly=weights is None)
     problems.check_range(problem, start.gain)
     within = _within(problem, start, shape.frames or 1, options.get("throw", True), clamp)
-    c = _result(true, problem, shape, start, *within, transport_error=error)
+    c = _result((T, true), inverse, problem, shape, start, *within, transport_error=error)
     if requested is not None and c.clipped > 0.0 and np.asarray(desired).dtype.kind == "f":
         problems.warn_of_units(c._target, c._seen or [])
     return c
@@ -329,7 +340,8 @@ def _within(
 
 
 def _result(
-    T: Transport,
+    transports: tuple[Transport, Transport],
+    inverse: Inverse | None,
     problem: Problem,
     shape: layout.Layout,
     start: _Start,
@@ -338,7 +350,7 @@ def _result(
     frame_clipped: np.ndarray,
     transport_error: float,
 ) -> Compensation:
-    target, frames = problem.scaled(start.gain), len(frame_clipped)
+    T, target, frames = transports[1], problem.scaled(start.gain), len(frame_clipped)
     clipped = float(np.mean(frame_clipped))
     missing, seen = [solution.rest for solution in start.solutions if solution.rest is not None], None
     if clipped or limited or len(missing) < T.channels or problem.limits.masked.any():
@@ -378,6 +390,9 @@ def _result(
         _seen=seen,
         _weights=problem.weights,
         _explained=explained if clipped else None,
+        _transports=transports,
+        _inverse=inverse,
+        _bounds=(problem.limits.low, problem.limits.high),
     )
 
 

@@ -32,6 +32,7 @@ from ltcl.operators.wavelets import filters
 
 PIXELS, ROWS = "pixels", " rows"
 INVERSE_NAMES = ("db2", "haar", "db4", PIXELS)  # compared where none is named, in this order
+_SIGNS = 32  # pictures of random signs
 _TRANSFORM = 4  # launches of a wavelet transform, all levels
 
 
@@ -89,12 +90,22 @@ class Bases:
         """R~ on the device, of a known `error` and with the `diagonal` (N,) of R."""
         return Compressed(Tiles(device, core), self.out, self.into, error, diagonal=diagonal)
 
-    def gather(
-        self, R: Rows, drop: float, most: float = math.inf, progress: Progress = lambda share: None
-    ) -> Coefficients:
-        """All of R but at most the Frobenius norm `drop`, or `most` numbers."""
+    def gather(self, R: Rows, progress: Progress = lambda share: None, **limits: Any) -> Coefficients:
+        """The numbers of R within the `limits` of `coefficients`."""
         out, into = (None if W is None else partial(_on_host, W) for W in (self.out, self.into))
-        return coefficients(R, out, into, drop=drop, most=most, progress=progress)
+        return coefficients(R, out, into, progress=progress, **limits)
+
+    def noise(self, variances: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Standard deviations of rows and columns of coefficients, of random signs: each within 13 %."""
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (variances.shape[1], _SIGNS))
+        sides = zip((self.out, self.into), variances, strict=True)
+        rows, columns = (np.sqrt(energies(W, np.sqrt(each)[:, None] * signs)) for W, each in sides)
+        return rows, columns
+
+
+def energies(W: Basis | None, x: np.ndarray) -> np.ndarray:
+    """Mean squares of the coefficients of light x (N, k), k a multiple of `COLUMNS`; None is pixels."""
+    return np.mean(np.square(x if W is None else _on_host(W, x.astype(np.float32)), dtype=np.float64), axis=1)
 
 
 def _on_host(W: Basis, x: np.ndarray) -> np.ndarray:

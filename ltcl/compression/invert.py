@@ -21,7 +21,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.compression.bases import INVERSE_NAMES, PIXELS, quantize, validate_names
-from ltcl.compression.compress import compress_inputs, validate_progress, validate_rtol
+from ltcl.compression.compress import Goal, compress_inputs, validate_progress, validate_rtol
 from ltcl.compression.norms import MISS, Starts, fresh_starts
 from ltcl.compression.sources import memory_errors, of_transport
 from ltcl.compression.sparse_inverse import invert_coefficients, residual_norm
@@ -121,7 +121,7 @@ def _in_one_basis(
     share = _SHARE * (rtol - T.error) / (1.0 + T.error)
     starts = fresh_starts("rewrite" if T.error else "compress")
     try:
-        systems = compress_inputs(of_transport(T), names, share, starts, progress)[0].systems
+        systems = compress_inputs(of_transport(T), names, Goal("worst", share), starts, progress)[0].systems
     except ToleranceError as error:
         raise ToleranceError(str(error), T.error + error.least * (1.0 + T.error) / _SHARE) from None
     before = [S.solution_error for S in T.systems] if T.is_compressed else [0.0] * T.channels

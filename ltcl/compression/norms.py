@@ -24,21 +24,21 @@ from ltcl.solvers import solve
 from ltcl.theory.norms import CONFIDENCE, TwoNorm, two_norm
 
 MISS = 2e-6  # the chance that some bound of a compression, or of an inverse, fails
-_PURPOSES = ("compress", "rewrite", "sparse inverse", "invert")
+_PURPOSES = ("compress", "rewrite", "sparse inverse", "invert", "pictures")
 _RTOL, _MAXITER = 1e-3, 400  # of the solves behind ||S^-1||
 _STEPS = 8  # of the power iteration
 
 Starts = Iterator[dict[str, Any]]
 
 
-def fresh_starts(purpose: str) -> Starts:
+def fresh_starts(purpose: str, miss: float = MISS) -> Starts:
     """`seed` and `confidence` of one bound after the other, as keywords of `two_norm`.
 
     What builds on each other takes starts of different `purpose`.
     """
     first = (1 + _PURPOSES.index(purpose)) << 32
     for k in itertools.count(1):
-        yield {"seed": first + k, "confidence": 1.0 - MISS / (k * (k + 1))}
+        yield {"seed": first + k, "confidence": 1.0 - miss / (k * (k + 1))}
 
 
 def inverse_norm(
@@ -62,7 +62,7 @@ def inverse_norm(
     """
     operator: Any = scipy.sparse.linalg.LinearOperator
     core = S.R.core if isinstance(S.R, Compressed) and S.R.two_sided else S.R
-    times, transposed = (functools.partial(_solve, IdentityPlus(A, S.sign)) for A in (core, core.T))
+    times, transposed = (functools.partial(solve_columns, IdentityPlus(A, S.sign)) for A in (core, core.T))
     inverse = operator(core.shape, times, transposed, times, dtype=np.float64, rmatmat=transposed)
     norm = two_norm(Host(core.device, inverse), confidence=confidence, factor=factor, seed=seed)
     upper = norm.upper / (1.0 - _RTOL * math.sqrt(norm.products))
@@ -71,9 +71,10 @@ def inverse_norm(
     return dataclasses.replace(norm, estimate=max(norm.estimate, least), upper=max(upper, least))
 
 
-def _solve(S: IdentityPlus, X: np.ndarray) -> np.ndarray:
+def solve_columns(S: IdentityPlus, X: np.ndarray, rtol: float = _RTOL) -> np.ndarray:
+    """S^-1 X in float64, or a ConvergenceError."""
     try:
-        return np.asarray(solve(S, X, "gmres", rtol=_RTOL, maxiter=_MAXITER).x, np.float64)
+        return np.asarray(solve(S, X, "gmres", rtol=rtol, maxiter=_MAXITER).x, np.float64)
     except ConvergenceError as error:
         raise ConvergenceError(
             "S is singular, or nearly so: a solve for the norm of its inverse left "

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from ltcl import checks
 from ltcl import first_bounce as _first_bounce
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
+from ltcl.noise import Noise
 from ltcl.operators import Dense, Host, Operator
 from ltcl.transport import Transport, require
 
@@ -106,11 +107,13 @@ def interreflection(T: Rows, F: np.ndarray) -> Rows:
 
 @dataclass(frozen=True)
 class Problem:
-    """R (N, N) of a channel, on a grid: its rows, and products with it on a device."""
+    """R (N, N) of a channel, on a grid: rows, products, F (N,), and noise: variances of rows and columns."""
 
     R: Rows
     operator: Operator
     grid: tuple[int, int]
+    F: np.ndarray
+    noise: np.ndarray | None = None
 
     def window(self) -> Problem:
         """R between the pixels in the middle of the picture; itself where these are all."""
@@ -121,7 +124,8 @@ class Problem:
         firsts = np.arange(top, top + h) * self.grid[1] + left  # of each row of the window
         pixels = np.add.outer(firsts, np.arange(w)).ravel()
         R = np.concatenate([self.R.rows(first, first + w)[:, pixels] for first in firsts.tolist()])
-        return Problem(source("R", R, self.R.memory), Dense(self.operator.device, R), (h, w))
+        rows, noise = source("R", R, self.R.memory), None if self.noise is None else self.noise[:, pixels]
+        return Problem(rows, Dense(self.operator.device, R), (h, w), self.F[pixels], noise)
 
 
 def window_of(grid: tuple[int, int]) -> tuple[int, int]:
@@ -147,6 +151,7 @@ def validate_inputs(
     first_bounce: Any = None,
     device: Device | str | None = None,
     memory: int | None = None,
+    noise: Noise | None = None,
 ) -> Inputs:
     """Whatever `compress` takes, checked: a Transport, operators, or rows."""
     if isinstance(T, Transport):
@@ -156,7 +161,7 @@ def validate_inputs(
         require(T)
         if T.error > 0.0:
             raise InputError(f"T is compressed already, with an error of {T.error:.2g}; compress its origin")
-        return of_transport(T, memory)
+        return of_transport(T, memory, noise)
     matrices = list(T) if isinstance(T, (list, tuple)) else [T]
     if len(matrices) not in (1, 3):
         raise InputError(f"T has {len(matrices)} channels; it must be one, or three for RGB")
@@ -175,12 +180,13 @@ def validate_inputs(
     if isinstance(first_bounce, str):
         raise InputError(f"first_bounce is {first_bounce!r}, but T is rows; give an array (N,), or None")
     F, _ = _first_bounce.find(rows, "diagonal" if first_bounce is None else first_bounce, lambda: device)
-    F, _ = _first_bounce.mask_dark(F, grid, may_mask=False)
+    F, *_ = _first_bounce.mask_dark(F, F <= 0.0, grid, may_mask=False)
     R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
-    return Inputs([Problem(r, Host(device, r), grid) for r in R], F, grid, _dense_nbytes(F))
+    problems = [Problem(r, Host(device, r), grid, f) for r, f in zip(R, F, strict=True)]
+    return Inputs(problems, F, grid, _dense_nbytes(F))
 
 
-def of_transport(T: Transport, memory: int | None = None) -> Inputs:
+def of_transport(T: Transport, memory: int | None = None, noise: Noise | None = None) -> Inputs:
     """Rows of R of a square transport: read from T, or products where it is compressed."""
     F = np.atleast_2d(T.first_bounce)
     if T.is_compressed:
@@ -191,8 +197,19 @@ def of_transport(T: Transport, memory: int | None = None) -> Inputs:
         operators, nbytes = [S.R for S in T.systems], T.nbytes or _dense_nbytes(F)
     except MemoryError:  # of the device, or of the host
         operators, nbytes = [Host(T.device, rows) for rows in R], _dense_nbytes(F)
-    problems = [Problem(rows, product, T.grid) for rows, product in zip(R, operators, strict=True)]
+    problems = [Problem(r, product, T.grid, f) for r, product, f in zip(R, operators, F, strict=True)]
+    if noise is not None:
+        problems = [replace(p, noise=_noise_of(p, noise, c)) for c, p in enumerate(problems)]
     return Inputs(problems, F, T.grid, nbytes, bool(T.masked.any()), T.mixing)
+
+
+def _noise_of(problem: Problem, noise: Noise, channel: int) -> np.ndarray:
+    """Factors of the variance of R = T F^-1 - I; of photons, that of the mean entry of a column."""
+    F, ones = problem.F, problem.operator.device.upload(np.ones(len(problem.F), np.float32))
+    sums = problem.operator.apply_transpose(ones).get().astype(np.float64)
+    light = noise.photons[channel] * F * np.maximum(sums, 0.0) / len(F) + noise.floor[channel] ** 2
+    columns = np.divide(noise.columns[channel] * light, F**2, out=np.zeros(len(F)), where=F > 0)
+    return np.stack([noise.rows[channel], columns])
 
 
 def _dense_nbytes(F: np.ndarray) -> int:

@@ -55,15 +55,13 @@ class Operator(scipy.sparse.linalg.LinearOperator):
     ----------
     error : float
         Bound on the 2-norm of what a compressed operator dropped; 0 for exact ones.
-    solution_error : float
-        Bound on ``||x~ - x|| / ||x||`` for every right-hand side, x~ the solution with this operator, x with
-        the one that it was compressed from; 0 for exact ones.
+    solution_error, error_bound : float
+        What compression changes solutions by, ``||x~ - x|| / ||x||``: as its norm states, and at most.
     weights : (N,) float64 or None
         Of an inner product <x, y> = sum_i w_i x_i y_i in which it should be self-adjoint, where one is known.
     """
 
-    error = 0.0
-    solution_error = 0.0
+    error = solution_error = error_bound = 0.0
     weights: np.ndarray | None = None
 
     def __init__(self, device: Device, shape: tuple[int, int], *parts: Operator | Array | None) -> None:
@@ -268,7 +266,7 @@ class Transposed(Operator):
     def __init__(self, base: Operator) -> None:
         super().__init__(base.device, base.shape[::-1], base)
         self.base = base
-        self.error, self.solution_error = base.error, base.solution_error
+        self.error, self.solution_error, self.error_bound = base.error, base.error_bound, base.error_bound
 
     def diagonal(self) -> np.ndarray:
         """That of A."""

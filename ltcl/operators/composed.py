@@ -30,7 +30,7 @@ class IdentityPlus(Operator):
     sign : 1 or -1
     weights : (N,), optional, all positive, see `Operator`
     solution_error : float
-        ``||S^-1|| ||E||`` with E what was dropped; infinite where nothing is known.
+        ``||S^-1|| ||E||`` with E what was dropped; infinite where nothing is known. Also the `error_bound`.
 
     Examples
     --------
@@ -52,6 +52,7 @@ class IdentityPlus(Operator):
             raise InputError(f"solution_error is {solution_error!r}; it must be a number of at least 0")
         super().__init__(R.device, R.shape, R)
         self.R, self.sign, self.error, self.solution_error = R, float(sign), R.error, float(solution_error)
+        self.error_bound = self.solution_error
         self.weights = None if weights is None else checks.shape("weights", weights, R.shape[:1])
 
     def diagonal(self) -> np.ndarray:
@@ -93,7 +94,8 @@ class ScaledColumns(Operator):
         super().__init__(A.device, A.shape, A, self._d, self._shift)
         self.error = A.error * float(np.max(np.abs(self.d), initial=0.0))
         if not self.shift.any():
-            self.solution_error = A.solution_error and A.solution_error * spread(self.d)
+            errors = (A.solution_error, A.error_bound)
+            self.solution_error, self.error_bound = (error and error * spread(self.d) for error in errors)
 
     def diagonal(self) -> np.ndarray:
         """diag(A) d - shift, (min(M, N),) float64."""

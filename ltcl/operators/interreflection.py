@@ -45,10 +45,11 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
             continue
         R = _interreflection(matrix, f, device, pattern)
         pattern = R.pattern if isinstance(R, CSR) else None
-        weights, error = 1.0 / f if np.all(f > 0) else None, 0.0
-        if S is not None and S.solution_error:  # norms change by max(d / f) / min(d / f) at most
-            error = S.solution_error * spread(matrix.d[f > 0] / f[f > 0])
-        systems.append(IdentityPlus(R, weights=weights, solution_error=error))
+        system = IdentityPlus(R, weights=1.0 / f if np.all(f > 0) else None)
+        if S is not None and S.error_bound:  # norms change by max(d / f) / min(d / f) at most
+            ratio = spread(matrix.d[f > 0] / f[f > 0])
+            system.solution_error, system.error_bound = ratio * S.solution_error, ratio * S.error_bound
+        systems.append(system)
     return tuple(systems)
 
 

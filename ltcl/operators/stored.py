@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Bases by name; operators S = I + R and bases as plain arrays, which files hold, and made of such again.
 
-    system_0.sign, .solution_error, .weights    of each channel; weights where S has them
+    system_0.sign, .solution_error, .weights    of each channel, .error_bound; weights where S has them
     system_0.R.kind, .error                     "csr", "dense", "tiles" or "compressed"; of what was dropped
     system_0.R.core.kind, ...                   of "compressed", with .out and .into: bases, -1 of pixels
     basis_0.name, ...                           as `Basis.to_arrays` has it; one that is shared is there once
@@ -37,7 +37,7 @@ def to_arrays(systems: Sequence[IdentityPlus]) -> Arrays:
     bases: dict[Basis, int] = {}
     arrays: Arrays = {}
     for number, S in enumerate(systems):
-        own = {"sign": np.array(S.sign), "solution_error": np.array(S.solution_error)}
+        own = {name: np.array(getattr(S, name)) for name in ("sign", "solution_error", "error_bound")}
         if S.weights is not None:
             own["weights"] = np.asarray(S.weights, np.float64)
         arrays |= _named(f"system_{number}", own | _named("R", _compressed(S.R, bases)))
@@ -60,6 +60,7 @@ def from_arrays(device: Device, arrays: Mapping[str, np.ndarray]) -> tuple[Ident
             if weights is not None and not np.all(checks.finite("weights", weights) > 0.0):
                 raise InputError("weights of a stored S are not all positive; they must be")
             systems.append(IdentityPlus(R, float(own["sign"]), weights, solution_error=error))
+            systems[-1].error_bound = max(error, float(own.get("error_bound", error)))
         return tuple(systems)
     except LtclError:
         raise

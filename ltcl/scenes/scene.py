@@ -145,7 +145,7 @@ class Scene:
         first_bounce: Any = "diagonal",
         device: Device | str | None = None,
         *,
-        on_dark: str = "raise",
+        on_dark: str = "mask",
     ) -> Transport:
         """The scene's `ltcl.Transport`, ready to compensate, separate and relight.
 
@@ -155,8 +155,8 @@ class Scene:
             What `Transport` takes as F; `scene.first_bounce` is the truth.
         device : Device or str, optional
             The device that `Transport` computes on; the best one if omitted.
-        on_dark : "raise" or "mask"
-            What `Transport` does about patches of albedo 0: refuse, or never light them.
+        on_dark : "mask" or "raise"
+            What `Transport` does about patches of albedo 0: never light them, or refuse.
 
         Examples
         --------

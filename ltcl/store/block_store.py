@@ -30,6 +30,7 @@ import scipy.sparse
 from ltcl import checks, first_bounce
 from ltcl.errors import FileError, InputError
 from ltcl.files import as_path, fill_folder, flush_tree, input_file, locked, replace_file, restore, sweep
+from ltcl.noise import Noise
 from ltcl.store.record import CSR, EXTRAS, Parts, Record, StoredRows, about, declared, sparse
 
 _START, _UNSEALED = b'{"attributes": {"checksum": "', b"0" * 64
@@ -323,7 +324,8 @@ def read(path: Path) -> Record | Parts:
     F, mixing = (store.extra(n) if n in store.extras else None for n in ("first_bounce", "mixing"))
     matrices = tuple(StoredRows(store, channel) for channel in range(store.layout.channels))
     F = F[0] if F is not None and len(F) == 1 else F
-    return Record(matrices, store.layout.grid, store.layout.camera_grid, F, mixing)
+    noise = Noise.from_arrays({n: store.extra(n) for n in store.extras if n.startswith("noise_")})
+    return Record(matrices, store.layout.grid, store.layout.camera_grid, F, mixing, noise)
 
 
 def write(path: Path, content: Record | Parts) -> None:
@@ -337,6 +339,7 @@ def write(path: Path, content: Record | Parts) -> None:
         dtype = np.result_type(*(M.dtype for M in T), np.float32).name
         layout = Layout(content.shape, content.grid, content.camera_grid, len(T), dtype=dtype)
         extras = {n: np.atleast_2d(a) for n, a in vars(content).items() if n in EXTRAS[2:] and a is not None}
+        extras |= {} if content.noise is None else content.noise.to_arrays()
         every = itertools.product(range(len(T)), range(layout.blocks()))
         rows = ((c, k, Block(scipy.sparse.csr_array(T[c][slice(*layout.span(k))]), None)) for c, k in every)
     with fill_folder(path, replace=True) as folder:

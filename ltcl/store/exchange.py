@@ -30,7 +30,7 @@ import scipy.sparse
 
 from ltcl import checks
 from ltcl.errors import FileError, InputError
-from ltcl.store.record import CHANNELS, EXPANSION, Record, assemble, declared, floats, sparse
+from ltcl.store.record import CHANNELS, EXPANSION, EXTRAS, Record, assemble, declared, floats, sparse
 
 _HEAD = rb"([^\n]*+\n(?:\s*+%[^\n]*+\n)*+\s*+[^\n]*+\n\s*+)"  # comments and the line of sizes
 _GRID = re.compile(rb"^%+\s*ltcl grid (\d+) x (\d+)(?:, camera grid (\d+) x (\d+))?\s*$", re.M)
@@ -74,7 +74,7 @@ def write_mtx(path: Path, record: Record) -> None:
 def write_mat(path: Path, record: Record) -> None:
     """Write LTM, and grids, first bounce and mixing where they are known, as version 5."""
     T: Any = record.matrices
-    variables: Any = {n: np.array(a, float, ndmin=2) for n, a in record.arrays().items() if n != "T"}
+    variables: Any = {n: np.array(a, float, ndmin=2) for n, a in record.arrays().items() if n in EXTRAS}
     if "first_bounce" in variables:
         variables["first_bounce"] = variables["first_bounce"].T
     stacked: Any = (np.dstack(T),) if record.dense and len(T) == 3 else T

@@ -38,8 +38,10 @@ def load(
     grid: tuple[int, int] | None = None,
     camera_grid: tuple[int, int] | None = None,
     first_bounce: str | np.ndarray | None = None,
-    on_dark: str = "raise",
+    on_dark: str = "mask",
+    dark: float = 0.0,
     device: Any = None,
+    noise: Any = None,
 ) -> Transport:
     """Load a transport, `picture = T @ pattern`.
 
@@ -53,8 +55,8 @@ def load(
         Name of the matrix in a .npz, .h5 or .mat file; else T (in .mat LTM), or the only matrix.
     grid, camera_grid
         (h, w) of projector and camera; needed where they are not in the file, and preferred to its own.
-    first_bounce, on_dark, device
-        As in `Transport`; a first bounce of None takes the file's, or else "diagonal".
+    first_bounce, on_dark, dark, device, noise
+        As in `Transport`; None takes what is in the file, or else the diagonal, and noise is estimated.
 
     Values of up to 16 bits and float32 become float32, all others float64; compressed ones keep their bits.
     HDF5, .mtx and .mat keep no checksums: a flipped bit may be another number. FileError for a file that is
@@ -73,8 +75,9 @@ def load(
         if isinstance(content, Parts):
             if content.format == INVERSE:
                 raise FileError("is an inverse, for ltcl.load_inverse; it must be a transport")
-            options: dict[str, Any] = {"grid": grid or camera_grid, "first_bounce": first_bounce}
-            return from_arrays(content.arrays, **options, on_dark=on_dark, device=device)
+            options: dict[str, Any] = {"first_bounce": first_bounce, "noise": noise, "dark": dark}
+            options |= {"grid": grid or camera_grid, "on_dark": on_dark, "device": device}
+            return from_arrays(content.arrays, **options)
         M, N = content.shape
         grid = checks.grid("grid", grid or content.grid or _unknown("grid", N, "projector"), N)
         camera_grid = camera_grid or content.camera_grid
@@ -85,7 +88,8 @@ def load(
         if first_bounce is None and camera_grid in (None, grid):  # on another grid there is no S
             first_bounce = content.first_bounce
         T, F = content.matrices, "diagonal" if first_bounce is None else first_bounce
-        return Transport(T, grid, F, camera_grid, device, on_dark=on_dark, mixing=content.mixing)
+        others: dict[str, Any] = {"mixing": content.mixing, "noise": noise or content.noise, "dark": dark}
+        return Transport(T, grid, F, camera_grid, device, on_dark=on_dark, **others)
 
 
 def _unknown(name: str, pixels: int, whose: str) -> tuple[int, int]:
@@ -97,9 +101,9 @@ def _unknown(name: str, pixels: int, whose: str) -> tuple[int, int]:
 def save(path: str | os.PathLike[str], T: Transport) -> None:
     """Save a transport; an earlier file at `path` is replaced whole or not at all.
 
-    .npz and .zarr keep everything, and they alone compressed operators; .h5 and .mat (version 5, less than
-    4 GiB a variable) all else; .npy (dense only) the matrix; .mtx (one channel) matrix and grids. Pixels
-    dropped by ``on_dark="mask"`` are saved with a first bounce of 0; loading needs the same again.
+    .npz and .zarr keep everything, and they alone compressed operators; .h5 all else, and .mat (version 5,
+    less than 4 GiB a variable), but for noise; .npy (dense only) the matrix; .mtx (one channel) matrix and
+    grids. An estimate of noise is not saved, and of pixels dropped by ``on_dark="mask"`` a first bounce of 0.
 
     FileError where the extension is unknown, the format cannot hold this transport, or the file cannot be
     written; InputTypeError for 3 x 3 blocks, or operators that are no compressed S F.
@@ -121,7 +125,7 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
         return
     matrices = [record.floats("T", M) if isinstance(M, np.ndarray) else M for M in T.matrices]
     F = T.first_bounce if T.is_square else None
-    write(path, Record(tuple(matrices), T.grid, T.camera_grid, F, T.mixing))
+    write(path, Record(tuple(matrices), T.grid, T.camera_grid, F, T.mixing, T.measured_noise))
 
 
 def save_inverse(path: str | os.PathLike[str], inverse: Inverse) -> None:

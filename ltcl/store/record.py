@@ -20,10 +20,12 @@ import scipy.sparse.linalg
 
 from ltcl import checks, layout
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError, MemoryLimitError
+from ltcl.noise import Noise
 
 EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
 CSR = ("data", "indices", "indptr")
 CHANNELS = ("T_0", "T_1", "T_2")
+_MAYBE_INFINITE = (".solution_error", ".error_bound", "noise_white")  # where they are unknown
 EXPANSION = 1032  # what deflate can reach, the only compression that is read
 
 
@@ -136,6 +138,7 @@ class Record:
     camera_grid: tuple[int, int] | None = None
     first_bounce: np.ndarray | None = None
     mixing: np.ndarray | None = None
+    noise: Noise | None = None
 
     def __post_init__(self) -> None:
         types, shapes = {type(T) for T in self.matrices}, {tuple(T.shape or ()) for T in self.matrices}
@@ -160,10 +163,11 @@ class Record:
         return replace(self, matrices=tuple(T.toarray() if every else T for T in matrices))
 
     def arrays(self) -> dict[str, Any]:
-        """Named arrays: `EXTRAS`, and T (M, N) or (3, M, N) where that is dense."""
+        """Named arrays: `EXTRAS`, those of noise, and T (M, N) or (3, M, N) where that is dense."""
         T = self.matrices
         values = {"T": (T[0] if len(T) == 1 else np.stack(T)) if self.dense else None}
         values |= {name: getattr(self, name) for name in EXTRAS}
+        values |= self.noise.to_arrays() if self.noise else {}
         return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 
@@ -173,7 +177,7 @@ def assemble(
     """A record of what a file holds by name: T is `variable`, else `name`, `channels`, or the only matrix."""
     if variable not in (None, *shapes):
         raise FileError(f"variable {variable!r} is missing; it holds {', '.join(shapes) or 'none':.200}")
-    others = {other: shape for other, shape in shapes.items() if other not in EXTRAS}
+    others = {o: shape for o, shape in shapes.items() if o not in EXTRAS and not o.startswith("noise_")}
     names: Sequence[str] = [variable or name]
     if variable is None and name not in shapes:
         names = [other for other, shape in others.items() if _is_matrix(shape)]
@@ -187,6 +191,7 @@ def assemble(
     extras: dict[str, Any] = {n: floats(n, load(n)) for n in ("first_bounce", "mixing") if n in shapes}
     for grid in {"grid", "camera_grid"} & set(shapes):
         extras[grid] = checks.grid(f"array {grid!r}", load(grid).ravel().tolist())
+    extras["noise"] = Noise.from_arrays({n: load(n) for n in shapes if n.startswith("noise_")})
     if isinstance(matrices[0], np.ndarray):
         if wrong := [T.shape for T in matrices if not _is_matrix(np.shape(T))]:
             shape, order = (shapes[names[0]][::-1], "(M, N, 3)") if reverse else (wrong[0], "(3, M, N)")
@@ -218,7 +223,7 @@ class Parts:
         checks.shape("first_bounce", F, *((channels, *F.shape[1:2]) for channels in (1, 3)))
         checks.grid("grid", checks.shape("grid", self.arrays["grid"], (2,)).tolist(), F.shape[1])
         for name, array in self.arrays.items():
-            if array.dtype.kind == "f" and not name.endswith(".solution_error"):  # infinite where unknown
+            if array.dtype.kind == "f" and not name.endswith(_MAYBE_INFINITE):
                 checks.finite(f"array {name!r}", array)
         if self.mixing is not None:
             layout.mixing(self.mixing, len(F), None)
@@ -233,7 +238,7 @@ class Parts:
 
     @property
     def error(self) -> float:
-        """Bound on the relative error of solutions, the largest of all channels."""
+        """Relative error of solutions, as a compression states it; the largest of all channels."""
         errors = self._ending(".solution_error", "errors")
         return max((float(np.max(a, initial=0.0)) for a in errors if a.dtype.kind in "fiu"), default=0.0)
 

@@ -178,7 +178,7 @@ def test_pixels_that_every_exposure_saturates(tmp_path: Path) -> None:
     assert np.flatnonzero(measured.masked).tolist() == bright
     np.testing.assert_allclose(np.delete(measured.first_bounce, bright), 0.02, rtol=0.1)
     with pytest.raises(FileError, match=r"first_bounce.* 3 of 32"):
-        ltcl.load(path)
+        ltcl.load(path, on_dark="raise")
     report = Report.of(path)
     assert (report.saturated, report.masked, report.coverage) == (3 / 32, 3 / 32, 1.0)
     assert 3 / report.entries <= report.unknown < 0.5  # their own, and those of the sums of their batches

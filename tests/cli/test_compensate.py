@@ -52,6 +52,13 @@ def written_by(command: str, result: Any) -> dict[str, np.ndarray]:
     return parts | {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
 
 
+def deviations_of(command: str, std: Any) -> dict[str, np.ndarray]:
+    """What is in files of standard deviations, by their names."""
+    if command == "compensate":
+        return {"sky_pattern": std.pattern, "sky_appearance": std.appearance}
+    return {"direct": std.direct} | {f"bounce_{k}": bounce for k, bounce in enumerate(std.bounces, 1)}
+
+
 @pytest.mark.parametrize(("line", "arguments", "printed"), CALLS)
 def test_a_command_does_what_the_library_does(
     program, transport, compressed, inverse, picture, tmp_path, line, arguments, printed
@@ -67,6 +74,10 @@ def test_a_command_does_what_the_library_does(
     result = getattr(ltcl, command)(T, images.read(picture), **arguments)
     for name, light in written_by(command, result).items():
         np.testing.assert_allclose(images.read(out / f"{name}.exr"), light, rtol=1e-6, atol=1e-7)
+    if path == str(transport) and command != "relight":
+        for name, deviation in deviations_of(command, result.std).items():
+            seen = images.read(out / f"{name}_std.exr")
+            np.testing.assert_allclose(seen, deviation, rtol=1e-3, atol=1e-3 * deviation.max())
     for name in ("gain", "error", "clipped", "gap", "transport_error"):
         if hasattr(result, name):
             assert report["pictures"][0][name] == pytest.approx(getattr(result, name), rel=1e-5, abs=1e-7)

@@ -23,8 +23,8 @@ from ltcl.solvers import METHODS
 from .conftest import Program
 
 COMMANDS = [
-    *("devices", "doctor", "demo", "simulate", "info", "analyze", "convert", "compress", "invert"),
-    *("compensate", "separate", "relight", "show", "acquire plan", "acquire run", "acquire report"),
+    *("devices", "doctor", "demo", "simulate", "info", "analyze", "convert", "compress", "denoise"),
+    *("invert", "compensate", "separate", "relight", "show", "acquire plan", "acquire run", "acquire report"),
 ]
 DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "cli.md").read_text(encoding="utf-8")
 

@@ -81,9 +81,25 @@ def test_a_compressed_file_is_smaller_and_solves(program, colour_transport, tmp_
     T, C, pattern = ltcl.load(colour_transport), ltcl.load(out), random.random((4, 12, 3))
     assert 0.05 >= C.error == pytest.approx(report["solution_error"])
     assert np.linalg.norm(C @ pattern - T @ pattern) <= 0.1 * np.linalg.norm(T @ pattern)
-    printed = program("compress", colour_transport, *arguments, tmp_path / "C.zarr").out
+    assert C.error < C.error_bound == pytest.approx(report["error_bound"])
+    printed = program("compress", colour_transport, *arguments, tmp_path / "C.zarr", "--norm", "worst").out
     within = checks.upwards(ltcl.load(tmp_path / "C.zarr").error)  # enough to ask for
     assert all(word in printed for word in ("red", "green", "blue", "haar", f"solutions within {within}, "))
+    noise = program(
+        "compress", colour_transport, "--rtol", "noise", "--out", tmp_path / "N.npz", "--json"
+    ).json
+    assert noise["compression"]["rtol"] == "noise"
+
+
+def test_a_transport_with_less_noise(program, colour_transport, tmp_path):
+    noisy, out = tmp_path / "noisy.npz", tmp_path / "D.zarr"
+    T = ltcl.load(colour_transport)
+    entries = T.to_numpy() + 1e-3 * random.standard_normal((3, 48, 48))
+    ltcl.save(noisy, ltcl.Transport(entries, T.grid, T.first_bounce))
+    report = program("denoise", noisy, "--out", out, "--json").json
+    noise = report["noise"]
+    assert all(a < b for a, b in zip(noise["after"], noise["before"], strict=True))
+    assert np.linalg.norm(ltcl.load(out).to_numpy() - T.to_numpy()) < np.linalg.norm(entries - T.to_numpy())
 
 
 def test_an_inverse_is_made_and_kept(program, transport, tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.acquisition import Report, VirtualRig, forecast_bounces
+from ltcl.acquisition import Report, VirtualRig
 from ltcl.acquisition.scanning import plans
 from ltcl.images.pictures import thumbnails
 
@@ -44,8 +44,7 @@ def results() -> dict[str, Any]:
 def test_text_is_one_line(results: dict[str, Any], tmp_path: Path) -> None:
     T, store = ltcl.scenes.dihedral(4).transport(), tmp_path / "T.zarr"
     ltcl.acquire(VirtualRig(T, T.grid), geometry="aligned", strategy="pixel", store=store)
-    forecast = forecast_bounces(store, np.ones(T.grid), 30, draws=2)
-    for name, result in {**results, "Report": Report.of(store), "Forecast": forecast}.items():
+    for name, result in {**results, "Report": Report.of(store)}.items():
         text = repr(result)
         assert (name in text, "\n" in text, len(text) <= 110) == (True, False, True)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Scanning T: which pixels are lit when (`columns`, `adaptive`), and T from their `pictures`.
 
-plan, forecast, report: what a scan takes, the error of its T, what came of it
+plan, report: what a scan takes, what came of it
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ Known limit: light that stays at a cell is smooth there; details below the thres
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -112,6 +113,13 @@ class Core(NamedTuple):
         row, column = (np.concatenate([getattr(e, name) for e in self.entries]) for name in ("pixel", "cell"))
         data = np.concatenate([getattr(entries, values) for entries in self.entries], axis=1)
         return [scipy.sparse.csr_array((x, (row, column)), shape=self.cells.W.T.shape) for x in data]
+
+    def variances(self, channel: int) -> Iterator[tuple[np.ndarray, ...]]:
+        """Rows, columns in the middle of cells, light, and variances whose sums over cells are right."""
+        C, V = (self.matrices(name)[channel].tocoo() for name in ("energy", "variance"))
+        W, known = self.cells.W, (V.data > 0.0) & (V.data < 1e-3 * UNKNOWN)
+        middle, area = W.indices[(W.indptr[:-1] + W.indptr[1:]) // 2], W.sum(axis=1)
+        yield tuple(x[known] for x in (V.row, middle[V.col], C.data, V.data * area[V.col]))
 
 
 def most_patterns(cells: Cells) -> int:

@@ -221,6 +221,14 @@ def significant(
     return np.where(together, mean, value), keep
 
 
+def variances(store: BlockStore, channel: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """Rows, columns, entries of T and their variances, of all columns in a store that are known."""
+    for block in range(store.layout.blocks("columns")):
+        C, V = store.block(channel, block)
+        j = np.repeat(np.arange(C.shape[0]), np.diff(C.indptr)) + store.layout.span(block, "columns")[0]
+        yield tuple(x[np.isfinite(V)] for x in (C.indices, j, C.data, V))
+
+
 def sums(store: BlockStore, channel: int) -> np.ndarray:
     """Row sums (M,) of the columns in a store, float64."""
     blocks = range(store.layout.blocks("columns"))

@@ -27,6 +27,7 @@ from ltcl.acquisition.radiometry import Radiance, merge
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.session import acquisition_error
 from ltcl.errors import AcquisitionError
+from ltcl.noise import Noise
 from ltcl.store import BlockStore
 
 UNKNOWN = np.float32(1e12)
@@ -80,6 +81,12 @@ class Seen:
         """Of a store that `ltcl.acquire` made."""
         setup = Setup.of(store)
         return cls(setup.calibration, setup.blocks.side)
+
+    def noise(self, samples: Callable[[int], Any]) -> dict[str, np.ndarray]:
+        """The noise of T for its store, by samples of a channel as `Noise.fit` takes them."""
+        white = np.where(self.white.known, self.white.variance, np.inf)
+        N, channels = len(self.seen), list(map(samples, range(self.channels)))
+        return Noise.fit((N, N), channels, "acquired", white).to_arrays()
 
     def _on_grid(self, light: Radiance) -> Picture:
         """Means over the blocks of the scan, as far as they are seen and valid."""

@@ -152,7 +152,7 @@ class GlossyScene:
         first_bounce: Any = "diagonal",
         device: Device | str | None = None,
         *,
-        on_dark: str = "raise",
+        on_dark: str = "mask",
     ) -> Transport:
         """The scene's `ltcl.Transport`, as one camera and one projector measure it.
 

@@ -12,7 +12,7 @@ import pytest
 import scipy.ndimage
 import scipy.sparse
 
-from ltcl.acquisition import Calibration, Report, VirtualRig, acquire, camera_map, forecast_picture
+from ltcl.acquisition import Calibration, Report, VirtualRig, acquire, camera_map
 from ltcl.acquisition.calibrate import measure as calibrate
 from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, Sharpness
 from ltcl.acquisition.radiometry import Response
@@ -99,8 +99,8 @@ def test_a_hopeless_camera_is_refused_before_the_scan(geometry: Any) -> None:
         acquire(camera(0.95), strategy="pixel", response=LINE, geometry=geometry)
 
 
-def test_it_is_stored_reported_and_forecast(tmp_path: Path, monkeypatch: Any) -> None:
-    """Out of focus: the store has it, the report says it, and forecasts are as large as the error."""
+def test_it_is_stored_and_reported(tmp_path: Path, monkeypatch: Any) -> None:
+    """Out of focus: the store has it, and the report says it."""
     path = tmp_path / "T.zarr"
     T = acquire(camera(3.0, 1.0), strategy="hadamard", store=path, response=LINE)
     stored, report = Calibration.of(path).sharpness, Report.of(path)
@@ -110,9 +110,7 @@ def test_it_is_stored_reported_and_forecast(tmp_path: Path, monkeypatch: Any) ->
     seen, truth = np.asarray(T @ p).ravel()[~T.masked], (corner() @ p.ravel())[~T.masked]
     scale = (seen @ truth) / (seen @ seen)
     error = np.linalg.norm(scale * seen - truth) / np.linalg.norm(truth)
-    forecast = forecast_picture(path, p).ravel()[~T.masked]
     assert error > 0.05
-    assert 0.5 * error < np.linalg.norm(forecast) / np.linalg.norm(seen) < 1.5 * error
     extras = [name for name in BlockStore.open(path).extras if not name.endswith("doubtful")]
     monkeypatch.setattr(BlockStore, "extras", property(lambda store: extras))
     with pytest.raises(FileError, match="earlier ltcl"):

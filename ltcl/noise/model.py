@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Standard deviations of the entries of a measured T, by a few numbers a row and a column.
+
+    variance of T_c[i, j] = rows_c[i] columns_c[j] (photons_c max(T_c[i, j], 0) + floor_c^2)
+
+for channel c, independent from entry to entry; but where the rows of T were made to add up to a measured
+white, whose variance is `white`, errors of a row are those that add up to it (`covariance` in
+`ltcl.uncertainty`).
+
+Known limits: pictures of a scan by S-matrices share their noise, so that all entries of a batch are as noisy
+as its brightest; the model spreads that over the row. First bounce and sums are right, errors of smooth
+pictures up to 2.4 times smaller. Cells of an adaptive scan count as one pixel with the noise of all; errors
+of pictures are 0.9 to 1.2 times those of the model, as of a scan by pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+import scipy.optimize
+import scipy.sparse
+
+from ltcl import checks
+from ltcl.errors import InputError
+
+SOURCES = ("given", "acquired", "measured twice", "estimated")
+Samples = Iterable[Sequence[np.ndarray]]
+_PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; samples of a row, about
+_CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
+_AT_ONCE = 1 << 22  # samples
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Noise:
+    """Noise of a transport (M, N) of 1 or 3 channels.
+
+    Attributes
+    ----------
+    photons, floor : (channels,) float64
+        Variance for each unit of light, and standard deviation without light; in the units of T.
+    rows, columns : (channels, M), (channels, N) float64
+        Factors of the variance, about 1.
+    white : (channels, M) float64
+        Variance of row sums, infinite where rows were not made to add up to a measured white.
+    source : str
+        "acquired", "measured twice", "given", or "estimated" from T alone.
+
+    InputError for other shapes, NaN, and negative numbers.
+
+    Examples
+    --------
+    >>> noise = Noise.uniform((4, 4), floor=0.01)
+    >>> noise.variance(np.zeros((4, 4)))[0, 0].round(6)
+    np.float64(0.0001)
+    """
+
+    photons: np.ndarray
+    floor: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+    white: np.ndarray
+    source: str = "given"
+
+    def __post_init__(self) -> None:
+        n = np.size(self.photons)
+        checks.one_of("noise.source", self.source, SOURCES)
+        for name, ndim in (("photons", 1), ("floor", 1), ("rows", 2), ("columns", 2), ("white", 2)):
+            value = checks.real(f"noise.{name}", getattr(self, name)).astype(np.float64)
+            largest = np.inf if name == "white" else np.finfo(float).max
+            if value.ndim != ndim or len(value) != n or not np.all((value >= 0) & (value <= largest)):
+                text = f"noise.{name} has shape {value.shape}; it must be {ndim}-dimensional, channels first"
+                raise InputError(f"{text}, without negative numbers, NaN or infinite ones")
+            object.__setattr__(self, name, value)
+        checks.shape("noise.white", self.white, self.rows.shape)
+
+    @classmethod
+    def uniform(cls, shape: tuple[int, int], floor: Any, photons: Any = 0.0, source: str = "given") -> Self:
+        """The same for all entries of a T (M, N); `floor` and `photons` are floats, or one a channel."""
+        f, p = np.broadcast_arrays(np.atleast_1d(floor), np.atleast_1d(photons))
+        M, N = shape
+        n = len(f)
+        return cls(p, f, np.ones((n, M)), np.ones((n, N)), np.full((n, M), np.inf), source)
+
+    def __repr__(self) -> str:
+        floor = ", ".join(f"{value:.2g}" for value in self.floor)
+        return f"<ltcl Noise {self.source}, floor {floor}, {self.rows.shape[1]} x {self.columns.shape[1]}>"
+
+    def variance(self, entries: Any, channel: int = 0) -> np.ndarray:
+        """Of the entries (M, N) of a channel, float64."""
+        light = self.photons[channel] * np.maximum(entries, 0.0) + self.floor[channel] ** 2
+        return self.rows[channel][:, None] * self.columns[channel] * light
+
+    def diagonal(self, F: Any) -> np.ndarray:
+        """Standard deviation (channels, N) of the diagonal F (channels, N) or (N,) of a square T."""
+        light = self.photons[:, None] * np.maximum(np.atleast_2d(F), 0.0) + self.floor[:, None] ** 2
+        return np.sqrt(self.rows * self.columns * light)
+
+    @classmethod
+    def fit(
+        cls, shape: tuple[int, int], samples: Sequence[Samples], source: str, white: Any = np.inf
+    ) -> Self:
+        """The noise of a T (M, N) by samples of its variance: rows, columns, light, and squares (n,).
+
+        Each channel has an iterable of parts of them; of a large T some on each row and column count. Where T
+        was acquired the squares are variances, and sums over rows and columns are kept: errors of pictures
+        are right, whatever the model misses. Else they are squares of errors, which count up to 9 variances.
+        """
+        values = [_fit(shape, each, exact=source == "acquired") for each in samples]
+        photons, floor, rows, columns = (np.stack(v) for v in zip(*values, strict=True))
+        return cls(photons, floor, rows, columns, np.broadcast_to(white, rows.shape), source)
+
+    @classmethod
+    def measured_twice(cls, matrices: Sequence[Any], others: Sequence[Any]) -> Self:
+        """Of a T (M, N) and of a second measurement, equally noisy: (T_1 - T_2)^2 / 2 has its variance.
+
+        What changed smoothly between both, as a lamp does, counts as noise. InputError where entries are the
+        same, or do not show; entries that are 0 in both do not count.
+        """
+        pairs = list(zip(matrices, others, strict=True))
+        for T in (T for pair in pairs for T in pair if not hasattr(T, "rows")):
+            if not isinstance(T, np.ndarray) and not scipy.sparse.issparse(T):
+                raise InputError(f"noise is a second T, but one is made of {type(T).__name__}; give entries")
+        noise = cls.fit(matrices[0].shape, [_differences(*pair) for pair in pairs], "measured twice")
+        if not np.any(noise.floor + noise.photons):
+            raise InputError("noise has the same entries as matrix; it must be a second measurement")
+        return noise
+
+    def require(self, channels: int, shape: tuple[int, int]) -> None:
+        """InputError where this is the noise of a T of other channels or another shape (M, N)."""
+        own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
+        if own != (channels, shape):
+            raise InputError(f"noise is of {own[0]} channel(s) {own[1]}; T has {channels} {shape}")
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Numbers for files, by names that begin with ``noise_``."""
+        arrays = {f"noise_{f.name}": np.asarray(getattr(self, f.name)) for f in fields(self)}
+        return arrays | {"noise_source": np.array(SOURCES.index(self.source))}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
+        """What `to_arrays` gave; None where it is not there."""
+        if "noise_floor" not in arrays:
+            return None
+        if missing := [f.name for f in fields(cls) if f"noise_{f.name}" not in arrays]:
+            raise InputError(f"noise_{missing[0]} is missing; noise has six arrays")
+        values = {f.name: arrays[f"noise_{f.name}"] for f in fields(cls)}
+        return cls(**{**values, "source": SOURCES[int(values["source"]) % len(SOURCES)]})
+
+
+def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ...]:
+    """Photons, floor, rows (M,) and columns (N,) of a channel: means in octaves of light, and factors."""
+    stride = max(1, min(shape) // _ENTRIES)
+    parts = [[x[(part[0] - part[1]) % stride == 0] for x in part] for part in samples]
+    i, j, light, square = map(np.concatenate, zip(*parts, strict=True))
+    factors, photons = [np.ones(n) for n in shape], 0.0
+    top, floor2, scale = light.max(initial=0.0) or 1.0, float(square.mean()) if len(square) else 0.0, 1.0
+    octave = np.clip(_LIGHTS - 2 + np.frexp(light / top)[1], 1, _LIGHTS - 2)
+    for step in range(_PASSES if floor2 > 0 else 0):
+        model = photons * np.maximum(light, 0.0) + floor2
+        expected = factors[0][i] * factors[1][j] * model
+        z = square / expected if exact else np.minimum(square / expected, _CLIPPED) / _MEAN
+        w = expected if exact else np.ones(len(z))
+        scale = float(w @ z / w.sum())
+        for factor, at in zip(factors, (i, j), strict=True):
+            own, due = np.bincount(at, w * z, len(factor)), np.bincount(at, w, len(factor))
+            factor *= np.where(due > 0, own, scale) / np.where(due > 0, due, 1.0)
+            factor /= factor.mean()
+        if step == _PASSES - 1:
+            break
+        k = np.where(light**2 < _CLIPPED * floor2, 0, octave)  # 0: only the mean of this light is known
+        k[(i == j) & exact] = _LIGHTS - 1
+        counts = np.bincount(k, minlength=_LIGHTS)
+        count = counts[seen := counts > 0].astype(float)
+        mean, lights = (np.bincount(k, x, _LIGHTS)[seen] / count for x in (z * model, light))
+        A = np.stack([np.maximum(lights, 0.0) / top, np.ones(len(count))], axis=1)
+        root, x = np.sqrt(count), np.array([photons * top, floor2])
+        root[-1] = np.sqrt(len(z)) if exact else root[-1]  # all say the same of the first bounce
+        for _ in range(_PASSES):  # by relative errors
+            weight = root / np.maximum(A @ x, 1e-6 * mean.max())
+            x = scipy.optimize.nnls(A * weight[:, None], mean * weight)[0]
+        photons, floor2 = x[0] / top, max(x[1], 1e-6 * mean.max())
+    return scale * photons, (scale * floor2) ** 0.5, *factors
+
+
+def _differences(first: Any, second: Any) -> Iterator[tuple[np.ndarray, ...]]:
+    """Rows, columns, light and half of the squared difference of the entries of two T (M, N)."""
+    M, N = first.shape
+    for start in range(0, M, step := max(1, _AT_ONCE // N)):
+        stop = min(start + step, M)
+        A, B = (_rows(T, start, stop) for T in (first, second))
+        i, j = np.nonzero((A != 0) | (B != 0))
+        a, b = A[i, j].astype(np.float64), B[i, j].astype(np.float64)
+        yield i + start, j, (a + b) / 2, (a - b) ** 2 / 2
+
+
+def _rows(T: Any, start: int, stop: int) -> np.ndarray:
+    if hasattr(T, "rows"):
+        return T.rows(start, stop)
+    return T[start:stop].toarray() if scipy.sparse.issparse(T) else T[start:stop]

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Standard deviations of patterns and bounces that the noise of T causes, pixel by pixel.
+
+A measured T is the true one and an error E, whose entries have the variances v_ij of `T.noise`. Errors E a
+and E b of pixel i have the covariance
+
+    q_ab = sum_j v_ij a_j b_j = rows_i (photons T (columns a b) + floor^2 columns . (a b))_i
+
+or q_ab + (u / V - 1) q_a1 q_b1 / V, V = q_11, where the row adds up to a measured white of variance u. To
+first order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k = F^-1 b_k and the bounces of eq. 27:
+
+    T p:    E p
+    p:      -F^-1 X E p
+    b_k:    db_k = X (dl^(k) - E p_k) + D p_k,    dl^(k+1) = dl^(k) - db_k,    dl^(0) = 0
+
+X = I - R X. What I makes of it is noise of the pixel's own row of T, -F^-1 E p, of bounces
+(D - E) (p_k - p_(k-1)): in closed form, by products. What R X makes of it is noise of other rows: the mean
+of many, and small, except where gloss lights a pixel by few others. Its mean square over some random errors,
+drawn row by row with the covariances above and solved together, is enough; less what the noise of R itself
+adds, which the first order counts twice. Light that returns to its pixel correlates both, and is left out.
+
+Where a pattern is clipped, errors are those of the least squares problem of its free pixels; E^T times the
+residual is left out. Known limits: F is taken to have the errors of diag(T). What is no noise is not
+contained: compression, a tolerance, response, blur, and changes of the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ltcl import layout
+from ltcl.noise import Noise
+from ltcl.operators import Operator
+from ltcl.solvers import Inverse, solve
+from ltcl.solvers.bounded import minimise
+from ltcl.transport import Transport, default_rtol
+
+_DRAWS, _FRAME_DRAWS = 8, 4  # of one picture, and of each of several
+_WHOLE_DRAWS = 16  # of errors that have no part in closed form
+_TOGETHER = 8  # pictures whose draws are solved at once
+_RTOL = 0.05  # of solves, whose solutions are the smaller part
+_FAR = 100.0  # times the largest error: bounds of free pixels
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class SeparationStd:
+    """Standard deviations of the result of `ltcl.separate`, in the units of the image, float32.
+
+    `direct` is like the image, `bounces` (bounces, ...): of errors against what the true T makes of the same
+    image. Noise of the image itself is not contained: s a pixel adds about s to the direct part. At masked
+    pixels they are those of the light that T leaves unexplained.
+    """
+
+    direct: np.ndarray
+    bounces: np.ndarray
+
+    def __repr__(self) -> str:
+        return f"<ltcl standard deviations, rms of direct and bounces {_rms(self.direct, *self.bounces)}>"
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class CompensationStd:
+    """Standard deviations of the result of `ltcl.compensate`, float32.
+
+    `pattern` at this gain, in light of the projector: 0 where it is masked, or at a bound and clipped.
+    `appearance`: of what the camera will see under this pattern, against what T says.
+    """
+
+    pattern: np.ndarray
+    appearance: np.ndarray
+
+    def __repr__(self) -> str:
+        return (
+            f"<ltcl standard deviations, rms of pattern and appearance {_rms(self.pattern, self.appearance)}>"
+        )
+
+
+def _rms(*pictures: np.ndarray) -> str:
+    values = (np.sqrt(np.mean(np.square(picture, dtype=np.float64))) for picture in pictures)
+    return ", ".join(f"{value:.2g}" for value in values)
+
+
+def of_separation(
+    T: Transport, noise: Noise, pictures: Sequence[np.ndarray], inverse: Inverse | None = None
+) -> SeparationStd:
+    """Of `pictures`: the direct part and the bounces."""
+    columns = [layout.unpack("bounces", picture, T.grid, T.channels) for picture in pictures]
+    shape, n = columns[0][1], len(pictures)
+    random, deviations = np.random.default_rng(0), []
+    for c, f in enumerate(np.atleast_2d(T.first_bounce)):
+        b = np.stack([each[c] for each, _ in columns], axis=-1).astype(np.float64)  # (N, k, bounces)
+        whole = _ratio(b, f[:, None, None])
+        variances = np.empty(b.shape)
+        for start in range(0, b.shape[1], _TOGETHER):
+            p = whole[:, start : start + _TOGETHER]
+            q = covariance(T, noise, c, p, diagonal=True)
+            # (D - E) (p_k - p_(k-1)) as weights of E p_0, E p_1, ... and D: (N, k, bounces, bounces + 1)
+            difference = np.broadcast_to(np.eye(n, k=-1) - np.eye(n), (*p.shape, n))
+            weights = np.concatenate([difference, np.diff(p, prepend=0.0)[..., None]], axis=-1)
+            variance = np.einsum("xkna,xkab,xknb->xkn", weights, q, weights)
+            E = _draws(q, random, b.shape[1])  # (N, k, draws, bounces + 1)
+            own = np.einsum("xkna,xkda->xkdn", weights, E)
+            dl, before = np.zeros(E.shape[:3]), np.zeros(E.shape[:3])
+            for k in range(n):
+                x = _solve(T, c, dl - E[..., k], inverse)
+                db = x + E[..., -1] * p[:, :, None, k]
+                variance[..., k] += _square(T, noise, c, before - x, db - own[..., k])
+                dl, before = dl - db, x
+            variances[:, start : start + _TOGETHER] = variance
+        deviations.append(np.sqrt(np.maximum(variances, 0.0)))
+    packed = [shape.pack([d[..., k] for d in deviations], T.grid).astype(np.float32) for k in range(n)]
+    return SeparationStd(packed[0], np.stack(packed)[1:])
+
+
+def of_compensation(
+    T: Transport,
+    noise: Noise,
+    pattern: np.ndarray,
+    bounds: tuple[float, float] = (-np.inf, np.inf),
+    inverse: Inverse | None = None,
+    systems: Sequence[tuple[Operator, np.ndarray]] = (),
+    weights: Sequence[np.ndarray] | None = None,
+) -> CompensationStd:
+    """Of a pattern that was clipped to `bounds`.
+
+    `systems` and `weights`, as `ltcl.compensation` has them, where it is the best within bounds.
+    """
+    p, shape = layout.unpack("pattern", pattern, T.grid, T.channels)
+    free = [(bounds[0] < light) & (light < bounds[1]) & ~T.masked[:, None] for light in p]
+    mixed = p if T.mixing is None else list(np.einsum("cd,dnk->cnk", T.mixing, np.stack(p)))
+    mixed = mixed if T.blocks is None else [np.concatenate(p)] * 3
+    q = [covariance(T, noise, c, a[..., None].astype(np.float64))[..., 0, 0] for c, a in enumerate(mixed)]
+    q = [np.maximum(variance, 0.0) for variance in q]
+    appearance = shape.pack([np.sqrt(variance) for variance in q], T.camera_grid)
+    random = np.random.default_rng(0)
+    if systems:
+        joint = q if len(systems) == len(q) else [np.concatenate(q)]
+        parts = free if len(systems) == len(q) else [np.concatenate(free)]
+        W = weights or [np.ones((1, 1))] * len(systems)
+        variances = [
+            _clipped(T, noise, c, system, joint[c], parts[c], np.broadcast_to(W[c], joint[c].shape), random)
+            for c, system in enumerate(systems)
+        ]
+        variances = variances if len(systems) == len(q) else np.split(variances[0], 3)
+    else:
+        variances = []
+        for c, (variance, f) in enumerate(zip(q, np.atleast_2d(T.first_bounce), strict=True)):
+            e = _draws(variance[..., None, None], random, variance.shape[1])[..., 0]
+            parts = [slice(start, start + _TOGETHER) for start in range(0, variance.shape[1], _TOGETHER)]
+            x = np.concatenate([_solve(T, c, e[:, some], inverse) for some in parts], axis=1)
+            variances.append(_ratio(variance + _square(T, noise, c, x, x - e), f[:, None] ** 2))
+        if T.mixing is not None:
+            variances = list(np.einsum("cd,dnk->cnk", np.linalg.inv(T.mixing) ** 2, np.stack(variances)))
+    deviations = [np.sqrt(variance * part) for variance, part in zip(variances, free, strict=True)]
+    return CompensationStd(
+        *(picture.astype(np.float32) for picture in (shape.pack(deviations, T.grid), appearance))
+    )
+
+
+def _clipped(
+    T: Transport,
+    noise: Noise,
+    c: int,
+    system: tuple[Operator, np.ndarray],
+    q: np.ndarray,
+    free: np.ndarray,
+    weights: np.ndarray,
+    random: np.random.Generator,
+) -> np.ndarray:
+    """Variances (N, k) of light that solves least squares, frame by frame, from q (M, k) of the picture."""
+    (A, scale), direct = system, T.is_square and not T.couples
+    variances = np.empty(free.shape)
+    for k in range(q.shape[1]):
+        e = _draws(q[:, k, None, None, None], random, q.shape[1] if direct else 0)[:, 0, :, 0]
+        most = np.where(free[:, k] & (scale > 0), _FAR * np.abs(e).max(), 0.0)
+        W = np.repeat(weights[:, k, None], e.shape[1], axis=1)
+        x = minimise(A, e, -most, most, np.zeros((len(free), e.shape[1])), weights=W, rtol=_RTOL).x
+        if direct:  # of A = S: e of the pixel itself, and a rest as above
+            total = q[:, k] + _square(T, noise, c, x[:, None], (x - e)[:, None])[:, 0]
+        else:
+            total = np.mean(np.square(x, dtype=np.float64), axis=1)
+        variances[:, k] = _ratio(total, scale**2)
+    return variances
+
+
+def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:
+    """Covariances (M, k, n, n) of E a, for a (N, k, n) and channel c; and of diag(E) as one more."""
+    n, known = a.shape[-1], np.isfinite(noise.white[c])
+    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1) if known.any() else a
+    i, j = np.triu_indices(w.shape[-1])
+    pairs = w[..., i] * w[..., j]
+    sums = variance(T, noise, c, pairs.reshape(len(pairs), -1)).reshape(-1, *pairs.shape[1:])
+    q = np.zeros((*sums.shape[:2], *2 * (w.shape[-1] + diagonal,)))
+    q[..., i, j] = q[..., j, i] = sums
+    if diagonal:
+        v = noise.diagonal(T.first_bounce)[c, :, None, None] ** 2
+        q[..., -1, :-1] = q[..., :-1, -1] = v * w
+        q[..., -1, -1] = v[..., 0]
+    if not known.any():
+        return q
+    V = np.where(known[:, None], np.maximum(q[..., n, n], 1e-300), 1.0)
+    factor = np.where(known[:, None], (np.where(known, noise.white[c], 0.0)[:, None] / V - 1.0) / V, 0.0)
+    q += factor[..., None, None] * q[..., n, :, None] * q[..., n, None, :]
+    return np.delete(np.delete(q, n, axis=-1), n, axis=-2)
+
+
+def variance(T: Transport, noise: Noise, c: int, squares: np.ndarray) -> np.ndarray:
+    """sum_j v_ij squares_j, (M, k), of (N, k) and channel c; of blocks (3 N, k), channel below channel."""
+    matrices = [T.matrices[c]] if T.blocks is None else T.blocks[c]
+    columns = np.tile(noise.columns[c], len(matrices))[:, None]
+    light = np.zeros((T.shape[0], squares.shape[1])) + noise.floor[c] ** 2 * (columns.T @ squares)
+    if noise.photons[c] > 0.0:
+        weighted = (columns * squares).astype(np.float32)
+        if T.is_square:
+            seen = T.systems[c].matmat(np.atleast_2d(T.first_bounce)[c][:, None] * weighted)
+        else:
+            seen = sum(A @ s for A, s in zip(matrices, np.split(weighted, len(matrices)), strict=True))
+        light += noise.photons[c] * seen
+    return noise.rows[c][:, None] * light
+
+
+def _square(T: Transport, noise: Noise, c: int, z: np.ndarray, Rz: np.ndarray) -> np.ndarray:
+    """Mean square over draws of R z, (N, k, draws), where it stands out of what the noise of R makes of z."""
+    f = np.atleast_2d(T.first_bounce)[c][:, None]
+    made = variance(T, noise, c, _ratio(np.mean(z**2, axis=-1), f**2))
+    return np.maximum(np.mean(Rz**2, axis=-1) - (1.0 + (2.0 / z.shape[-1]) ** 0.5) * made, 0.0)
+
+
+def _draws(q: np.ndarray, random: np.random.Generator, pictures: int) -> np.ndarray:
+    """Random errors (M, k, draws, n) of the covariances q (M, k, n, n), for a task of so many pictures."""
+    draws = {0: _WHOLE_DRAWS, 1: _DRAWS}.get(pictures, _FRAME_DRAWS)
+    values, vectors = np.linalg.eigh(q)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    return random.standard_normal((*q.shape[:2], draws, q.shape[-1])) @ np.swapaxes(roots, -1, -2)
+
+
+def _solve(T: Transport, c: int, light: np.ndarray, inverse: Inverse | None) -> np.ndarray:
+    """X of light (N, k, draws)."""
+    b = light.reshape(len(light), -1)
+    x = inverse.solve(b, c) if inverse is not None else solve(T.systems[c], b, rtol=default_rtol(_RTOL, T))
+    return x.x.astype(np.float64).reshape(light.shape)
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a / b; 0 where b is."""
+    return np.divide(a, b, out=np.zeros(np.broadcast_shapes(a.shape, b.shape)), where=b > 0)

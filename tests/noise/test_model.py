@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Noise of T against noise that is known: estimated, from a second measurement, acquired; in files."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+import scipy.sparse.linalg
+
+import ltcl
+from ltcl import scenes
+from ltcl.acquisition import VirtualRig, acquire
+from ltcl.acquisition.radiometry import Response
+from ltcl.cli.main import main
+from ltcl.errors import InputError, InputTypeError
+from ltcl.noise import Noise
+
+from .measured import SCENES, measure, noise_of, truth
+
+random = np.random.default_rng()
+LEVELS = (1e-5, 1e-4, 1e-3, 1e-2)
+CLOSE = 1.3
+LINE = Response(np.array([[-0.004 / 0.996, 1.0]]))
+ATTRIBUTES = ("photons", "floor", "rows", "columns", "white")
+
+
+def seed() -> int:
+    return int(random.integers(1 << 31))
+
+
+def ratios(T: ltcl.Transport, noise: Noise, exact: Noise) -> np.ndarray:
+    """Standard deviations over true ones, of all entries of the truth T."""
+    return np.sqrt(noise.variance(T.to_numpy()) / exact.variance(T.to_numpy()))
+
+
+def within(ratio: np.ndarray) -> float:
+    return float(np.mean(np.abs(np.log(ratio)) < np.log(CLOSE)))
+
+
+def with_factors(noise: Noise, spread: float) -> Noise:
+    rows, columns = (np.exp(spread * random.standard_normal(x.shape)) for x in (noise.rows, noise.columns))
+    return replace(noise, rows=rows / rows.mean(), columns=columns / columns.mean())
+
+
+def same(a: Noise | None, b: Noise) -> bool:
+    return (
+        a is not None
+        and a.source == b.source
+        and all(np.array_equal(getattr(a, n), getattr(b, n)) for n in ATTRIBUTES)
+    )
+
+
+@pytest.mark.parametrize("photons", [0.0, 1.0, 300.0])
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("scene", SCENES)
+def test_estimate_is_within_a_factor_of_1_3(scene: str, level: float, photons: float) -> None:
+    """Of 95 % of the entries, and of the first bounce; that of the glossy scene has structure of 1e-5."""
+    T = truth(scene)
+    exact = noise_of(T, level, photons)
+    ratio = ratios(T, measure(T, exact, seed(), known=False).noise, exact)
+    assert within(ratio) > 0.95
+    limit = 2.5 if (scene, level) == ("glossy", 1e-5) else 1.45  # few samples: 1.3 of most seeds
+    assert 1.0 / limit < np.median(np.diag(ratio)) < limit
+
+
+@pytest.mark.parametrize("scene", ["corner", "occluded"])
+def test_estimate_finds_factors_of_rows_and_columns(scene: str) -> None:
+    T = truth(scene)
+    exact = with_factors(noise_of(T, 1e-3), 0.6)
+    noise = measure(T, exact, seed(), known=False).noise
+    assert within(ratios(T, noise, exact)) > 0.8  # 0.33 without factors
+    for name in ("rows", "columns"):
+        logs = np.log([getattr(noise, name)[0], getattr(exact, name)[0]])
+        assert np.corrcoef(logs)[0, 1] > 0.8
+
+
+def noisy(change: Any = None, n: int = 8) -> tuple[np.ndarray, tuple[int, int], float]:
+    T = truth("corner", n)
+    noise = noise_of(T, 1e-3)
+    entries = measure(T, noise, seed()).to_numpy()
+    return entries, T.grid, float(noise.floor[0])
+
+
+def dark(T: np.ndarray) -> np.ndarray:
+    T = T.copy()
+    T[:, 5] = T[[7, 40]] = 0.0
+    return T + np.diag(np.where(np.diag(T) == 0, 0.1, 0.0)).astype(T.dtype)
+
+
+@pytest.mark.parametrize(
+    ("change", "upper"),
+    [
+        (lambda T, grid: ltcl.Transport(T, grid), 1.5),
+        (lambda T, grid: ltcl.Transport(scipy.sparse.csr_array(T), grid), 1.5),
+        (lambda T, grid: ltcl.Transport([T, T, T], grid), 1.5),
+        (lambda T, grid: ltcl.Transport(T[:100], grid, camera_grid=(10, 10)), 1.5),
+        (lambda T, grid: ltcl.Transport(dark(T), grid), 1.5),
+        (lambda T, grid: ltcl.Transport(np.maximum(T, 0.0), grid), 1.5),
+        (lambda T, grid: ltcl.Transport(T, (1, 128)), 1.5),
+        # Three standard deviations are a threshold: what stays is larger than the noise.
+        (lambda T, grid: ltcl.Transport(scipy.sparse.csr_array(np.where(T > 0.002, T, 0.0)), grid), 4.0),
+    ],
+    ids=["dense", "sparse", "colour", "rectangular", "dark rows", "clipped", "one row", "thresholded"],
+)
+def test_estimate_of_any_transport(change: Any, upper: float) -> None:
+    T, grid, floor = noisy()
+    noise = change(T, grid).noise
+    assert noise.source == "estimated"
+    assert np.all(noise.floor > floor / 1.5)
+    assert np.all(noise.floor < upper * floor)
+
+
+def test_estimate_is_not_confused_by_texture() -> None:
+    scene = scenes.dihedral(12)
+    T = replace(scene, albedo=random.uniform(0.2, 0.9, scene.albedo.shape)).transport()
+    exact = noise_of(T, 1e-3)
+    assert within(ratios(T, measure(T, exact, seed(), known=False).noise, exact)) > 0.95
+
+
+@pytest.mark.parametrize("grid", [(1, 1), (1, 2), (6, 12), (8, 16)])
+def test_estimate_of_a_transport_without_noise_is_next_to_nothing(grid: tuple[int, int]) -> None:
+    exact = scenes.dihedral(grid[0]).transport() if grid[1] > 2 else ltcl.Transport(np.eye(grid[1]), grid)
+    assert np.max(exact.noise.diagonal(exact.first_bounce)) < 1e-4 * np.median(exact.first_bounce)
+
+
+def test_estimate_refuses_what_shows_no_entries() -> None:
+    T = truth("corner", 8)
+    operator = scipy.sparse.linalg.aslinearoperator(T.to_numpy())
+    for closed in (ltcl.compress(T, rtol=0.1), ltcl.Transport(operator, T.grid, T.first_bounce)):
+        with pytest.raises(InputError, match="noise="):
+            closed.noise  # noqa: B018
+
+
+@pytest.mark.parametrize("photons", [0.0, 300.0])
+@pytest.mark.parametrize("layout", [np.asarray, scipy.sparse.csr_array])
+def test_second_measurement_shows_the_noise(layout: Any, photons: float) -> None:
+    """Also where an object has moved, of 1 % of a row and one more entry."""
+    T = truth("painted")
+    exact = with_factors(noise_of(T, 1e-3, photons), 0.6)
+    first, second = (measure(T, exact, seed(), known=False).to_numpy() for _ in range(2))
+    second[3, 5] += 5.0
+    second[7] += 0.1 * (random.random(len(second)) < 0.01)
+    other = ltcl.Transport(layout(second), T.grid)
+    noise = ltcl.Transport(layout(first), T.grid, noise=other).noise
+    assert noise.source == "measured twice"
+    ratio = ratios(T, noise, exact)
+    assert within(ratio) > 0.97
+    assert 1 / CLOSE < np.median(np.diag(ratio)) < CLOSE
+
+
+@pytest.mark.parametrize(
+    ("noise", "error", "match"),
+    [
+        (0.1, InputTypeError, "noise is a float"),
+        (Noise.uniform((3, 4), 0.1), InputError, r"noise.*\(3, 4\).*\(128, 128\)"),
+        (Noise.uniform((128, 128), [0.1] * 3), InputError, "noise.*3 channel"),
+        (ltcl.Transport(np.eye(12), (3, 4)), InputError, r"noise.*grid \(3, 4\)"),
+        (ltcl.Transport([np.eye(128)] * 3, (8, 16)), InputError, "noise.*channels 3"),
+    ],
+)
+def test_other_noise_is_refused(noise: Any, error: type[Exception], match: str) -> None:
+    T = truth("corner", 8)
+    with pytest.raises(error, match=match):
+        ltcl.Transport(T.to_numpy(), T.grid, noise=noise)
+
+
+BAD = {"floor": [-1.0], "photons": [np.nan], "rows": np.ones(4), "columns": [[np.inf] * 4], "white": [[1.0]]}
+
+
+@pytest.mark.parametrize(("name", "value"), [*BAD.items(), ("floor", [1.0, 1.0]), ("source", "guessed")])
+def test_bad_noise_is_refused(name: str, value: Any) -> None:
+    good = Noise.uniform((4, 4), 0.1)
+    with pytest.raises((InputError, InputTypeError), match=rf"noise\.{name}"):
+        Noise(**{**vars(good), name: value})
+
+
+def test_a_transport_is_no_second_measurement_of_itself() -> None:
+    T = truth("corner", 8)
+    with pytest.raises(InputError, match="noise"):
+        ltcl.Transport(T.to_numpy(), T.grid, noise=T).noise  # noqa: B018
+
+
+KINDS = [
+    (kind, end) for kind in ("given", "measured twice", "colour") for end in ("npz", "zarr", "h5", "pickle")
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "extension"), [*KINDS, *(("compressed", end) for end in ("npz", "zarr", "pickle"))]
+)
+def test_noise_is_kept_unless_it_is_an_estimate(
+    kind: str, extension: str, tmp_path: Path, disk_without_delay: None
+) -> None:
+    entries, grid, floor = noisy()
+    again, _, _ = noisy()
+    noise: Any = Noise.uniform(entries.shape, floor, floor**2)
+    if kind == "compressed":
+        plain = ltcl.compress(ltcl.Transport(entries, grid), rtol=0.1)
+        T = ltcl.Transport(plain.matrices, grid, plain.first_bounce, noise=noise)
+    elif kind == "colour":
+        three = Noise.uniform(entries.shape, [floor] * 3)
+        T = ltcl.Transport([scipy.sparse.csr_array(entries)] * 3, grid, noise=three)
+    else:
+        second = ltcl.Transport(again, grid)
+        T = ltcl.Transport(entries, grid, noise=noise if kind == "given" else second)
+    path = tmp_path / f"T.{extension}"
+    if extension == "pickle":
+        kept, estimated = (pickle.loads(pickle.dumps(X)) for X in (T, ltcl.Transport(entries, grid)))  # noqa: S301
+    else:
+        ltcl.save(path, T)
+        kept = ltcl.load(path)
+        ltcl.save(path, ltcl.Transport(entries, grid))
+        estimated = ltcl.load(path)
+    assert same(kept.measured_noise, T.noise)
+    assert estimated.measured_noise is None
+
+
+def test_second_measurement_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    entries = noisy()[0]
+    paths = [str(tmp_path / name) for name in ("T.npz", "again.npz", "other.npz", "C.npz")]
+    for path, T in zip(paths, (entries, noisy()[0], entries[:64, :64]), strict=False):
+        ltcl.save(path, ltcl.Transport(T, (8, len(T) // 8)))
+    assert main(["compress", paths[0], "--noise", paths[1], "--out", paths[3], "--rtol", "noise"]) == 0
+    assert main(["analyze", paths[0], "--noise", paths[2]]) == 1
+    assert "noise is a T of grid (8, 8)" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(("strategy", "least"), [("pixel", 0.6), ("adaptive", 0.6), ("hadamard", 0.3)])
+def test_acquired_transports_have_the_noise_of_their_scan(
+    strategy: str, least: float, tmp_path: Path, disk_without_delay: None
+) -> None:
+    """Errors of entries, first bounce and pictures, in standard deviations.
+
+    Entries of an S-matrix batch share their noise, the first bounce's; the model has its mean over the row,
+    of all entries only where none is dropped.
+    """
+    T, z, diagonal, pictures = truth("corner", 4), [], [], []
+    seed()
+    exact, p = T.to_numpy(), random.random(T.shape[1])
+    for number in range(2):
+        camera = {"bits": 12, "ambient": 0.01, "read": 0.003, "gain": 2000.0, "response": "linear"}
+        rig, path = VirtualRig(exact, T.grid, seed=seed() % 1000, **camera), tmp_path / f"{number}.zarr"
+        options = {"order": 7, "response": LINE, "sigmas": 0.0 if strategy == "hadamard" else 3.0}
+        scan = acquire(rig, geometry="aligned", strategy=strategy, store=path, **options)
+        again = ltcl.load(path, on_dark="mask")
+        assert same(scan.noise, again.noise)
+        assert scan.noise.source == "acquired"
+        measured = scan @ np.eye(32).reshape(32, *T.grid)
+        measured = measured.reshape(32, 32).T * (exact.sum() / measured.sum())
+        v, white = scan.noise.variance(exact), scan.noise.white[0]
+        total = v.sum(axis=1)
+        error = measured - exact
+        own = v + (white / total - 1.0)[:, None] * v**2 / total[:, None]
+        z.append((error / np.sqrt(own))[~np.eye(32, dtype=bool)])
+        diagonal.append(np.diag(error / np.sqrt(own)))
+        square = v @ p**2 + (white / total - 1.0) * (v @ p) ** 2 / total
+        pictures.append((error @ p) / np.sqrt(square))
+    for values in (z, diagonal, pictures):
+        assert least < np.sqrt(np.mean(np.square(values))) < 1.7
