@@ -219,7 +219,10 @@ def variance(T: Transport, noise: Noise, c: int, squares: np.ndarray) -> np.ndar
         else:
             seen = sum(A @ s for A, s in zip(matrices, np.split(weighted, len(matrices)), strict=True))
         light += noise.photons[c] * seen
-    return noise.rows[c][:, None] * light
+    light *= noise.rows[c][:, None]
+    if T.is_square:
+        light -= noise.less_direct(T.first_bounce)[c][:, None] * squares
+    return light
 
 
 def _square(T: Transport, noise: Noise, c: int, z: np.ndarray, Rz: np.ndarray) -> np.ndarray:

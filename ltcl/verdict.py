@@ -172,7 +172,8 @@ def _noise(T: Transport, c: int) -> Iterator[tuple[str, float, str]]:
     def variances(squares: np.ndarray) -> np.ndarray:  # v_ij times squares (N, k)
         weights = noise.columns[c][:, None] * squares
         light = noise.photons[c] * product(weights) if noise.photons[c] else 0.0
-        return noise.rows[c][:, None] * (light + noise.floor[c] ** 2 * weights.sum(axis=0))
+        variance = noise.rows[c][:, None] * (light + noise.floor[c] ** 2 * weights.sum(axis=0))
+        return variance - noise.less_direct(T.first_bounce)[c][:, None] * squares if T.is_square else variance
 
     def deviation(a: np.ndarray, own: Any = 0.0) -> np.ndarray:
         """Of E a, (M,), less its diagonal, of covariances `own` * a; row sums of E may be those of white."""

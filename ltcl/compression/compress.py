@@ -263,7 +263,8 @@ def compress_inputs(
         reports.append(fit.report(trials))
         note("done", 1.0)
     on_dark = "mask" if inputs.masked else "raise"
-    C = Transport(matrices, inputs.grid, first_bounce=inputs.F, on_dark=on_dark, mixing=inputs.mixing)
+    settings: dict[str, Any] = {"on_dark": on_dark, "mixing": inputs.mixing, "noise": inputs.noise}
+    C = Transport(matrices, inputs.grid, first_bounce=inputs.F, **settings)
     return C, tuple(reports)
 
 

@@ -143,6 +143,7 @@ class Inputs:
     nbytes: int
     masked: bool = False
     mixing: np.ndarray | None = None
+    noise: Noise | None = None
 
 
 def validate_inputs(
@@ -200,7 +201,7 @@ def of_transport(T: Transport, memory: int | None = None, noise: Noise | None = 
     problems = [Problem(r, product, T.grid, f) for r, product, f in zip(R, operators, F, strict=True)]
     if noise is not None:
         problems = [replace(p, noise=_noise_of(p, noise, c)) for c, p in enumerate(problems)]
-    return Inputs(problems, F, T.grid, nbytes, bool(T.masked.any()), T.mixing)
+    return Inputs(problems, F, T.grid, nbytes, bool(T.masked.any()), T.mixing, noise or T.measured_noise)
 
 
 def _noise_of(problem: Problem, noise: Noise, channel: int) -> np.ndarray:

@@ -82,12 +82,12 @@ def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[
             text = f"T is made of {type(T).__name__}, whose noise does not show in its entries"
             raise InputError(f"noise is None, but {text}; give noise=, as that of what it was made from")
     channels = [_channel(T, grid, camera_grid) for T in matrices]
-    photons, floor, rows, columns = (np.stack(values) for values in zip(*channels, strict=True))
-    return Noise(photons, floor, rows, columns, np.full(rows.shape, np.inf), "estimated")
+    photons, floor, rows, columns, direct = (np.stack(values) for values in zip(*channels, strict=True))
+    return Noise(photons, floor, rows, columns, np.full(rows.shape, np.inf), "estimated", direct)
 
 
 def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tuple[Any, ...]:
-    """Photons, floor, rows (M,) and columns (N,)."""
+    """Photons, floor, rows (M,), columns (N,), and direct."""
     (M, N), own = T.shape, camera_grid == grid and hasattr(T, "diagonal")
     F, texture = np.asarray(T.diagonal() if own else [], np.float64), np.ones(max(M, N))
     rows, columns = np.ones(M), np.ones(N)
@@ -96,7 +96,7 @@ def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tup
         if np.isfinite(v).sum() >= _ENOUGH:
             break
     else:
-        return 0.0, _of_neighbours(T), rows, columns
+        return 0.0, _of_neighbours(T), rows, columns, 1.0
     first = _first_bounce(F, grid) if own else None
     if first and first[0] > 0.0:
         other = _blocks(T, grid, camera_grid, size, np.maximum(F / first[0], 0.1))
@@ -111,7 +111,8 @@ def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tup
         *other, share = _agreement(v / mean, light, first, width)
         if share >= _TRUSTED:
             (floor2, q), rows, columns = other, r, c
-    return q * floor2, floor2**0.5, rows, columns
+    direct = 1.0 if first is None else min(first[1] / (floor2 * (1.0 + q * first[0])), 1.0)
+    return q * floor2, floor2**0.5, rows, columns, direct
 
 
 def _blocks(

@@ -3,7 +3,8 @@
 
     variance of T_c[i, j] = rows_c[i] columns_c[j] (photons_c max(T_c[i, j], 0) + floor_c^2)
 
-for channel c, independent from entry to entry; but where the rows of T were made to add up to a measured
+for channel c, times `direct_c` on the diagonal of a square T, whose light came straight from the projector.
+Entries are independent of each other; but where the rows of T were made to add up to a measured
 white, whose variance is `white`, errors of a row are those that add up to it (`covariance` in
 `ltcl.uncertainty`).
 
@@ -31,6 +32,7 @@ Samples = Iterable[Sequence[np.ndarray]]
 _PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; samples of a row, about
 _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
 _AT_ONCE = 1 << 22  # samples
+_FIRST = 64  # first bounces at least, whose variance may have a factor of its own
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -47,6 +49,8 @@ class Noise:
         Variance of row sums, infinite where rows were not made to add up to a measured white.
     source : str
         "acquired", "measured twice", "given", or "estimated" from T alone.
+    direct : (channels,) float64
+        Factor of the variance of the first bounce: far below 1 of a path-traced T.
 
     InputError for other shapes, NaN, and negative numbers.
 
@@ -63,11 +67,14 @@ class Noise:
     columns: np.ndarray
     white: np.ndarray
     source: str = "given"
+    direct: Any = 1.0
 
     def __post_init__(self) -> None:
         n = np.size(self.photons)
         checks.one_of("noise.source", self.source, SOURCES)
-        for name, ndim in (("photons", 1), ("floor", 1), ("rows", 2), ("columns", 2), ("white", 2)):
+        object.__setattr__(self, "direct", np.broadcast_to(self.direct, n))
+        ndims = {"photons": 1, "floor": 1, "rows": 2, "columns": 2, "white": 2, "direct": 1}
+        for name, ndim in ndims.items():
             value = checks.real(f"noise.{name}", getattr(self, name)).astype(np.float64)
             largest = np.inf if name == "white" else np.finfo(float).max
             if value.ndim != ndim or len(value) != n or not np.all((value >= 0) & (value <= largest)):
@@ -91,12 +98,20 @@ class Noise:
     def variance(self, entries: Any, channel: int = 0) -> np.ndarray:
         """Of the entries (M, N) of a channel, float64."""
         light = self.photons[channel] * np.maximum(entries, 0.0) + self.floor[channel] ** 2
-        return self.rows[channel][:, None] * self.columns[channel] * light
+        variance = self.rows[channel][:, None] * self.columns[channel] * light
+        if variance.shape[0] == variance.shape[1]:
+            np.einsum("ii->i", variance)[:] *= self.direct[channel]
+        return variance
 
     def diagonal(self, F: Any) -> np.ndarray:
         """Standard deviation (channels, N) of the diagonal F (channels, N) or (N,) of a square T."""
         light = self.photons[:, None] * np.maximum(np.atleast_2d(F), 0.0) + self.floor[:, None] ** 2
-        return np.sqrt(self.rows * self.columns * light)
+        return np.sqrt(self.direct[:, None] * self.rows * self.columns * light)
+
+    def less_direct(self, F: Any) -> np.ndarray:
+        """By how much the variance of F is below that of bounced light as bright, (channels, N)."""
+        light = self.photons[:, None] * np.maximum(np.atleast_2d(F), 0.0) + self.floor[:, None] ** 2
+        return (1.0 - self.direct[:, None]) * self.rows * self.columns * light
 
     @classmethod
     def fit(
@@ -109,8 +124,8 @@ class Noise:
         are right, whatever the model misses. Else they are squares of errors, which count up to 9 variances.
         """
         values = [_fit(shape, each, exact=source == "acquired") for each in samples]
-        photons, floor, rows, columns = (np.stack(v) for v in zip(*values, strict=True))
-        return cls(photons, floor, rows, columns, np.broadcast_to(white, rows.shape), source)
+        photons, floor, rows, columns, direct = (np.stack(v) for v in zip(*values, strict=True))
+        return cls(photons, floor, rows, columns, np.broadcast_to(white, rows.shape), source, direct)
 
     @classmethod
     def measured_twice(cls, matrices: Sequence[Any], others: Sequence[Any]) -> Self:
@@ -145,16 +160,19 @@ class Noise:
         if "noise_floor" not in arrays:
             return None
         if missing := [f.name for f in fields(cls) if f"noise_{f.name}" not in arrays]:
-            raise InputError(f"noise_{missing[0]} is missing; noise has six arrays")
+            raise InputError(f"noise_{missing[0]} is missing; noise has seven arrays")
         values = {f.name: arrays[f"noise_{f.name}"] for f in fields(cls)}
         return cls(**{**values, "source": SOURCES[int(values["source"]) % len(SOURCES)]})
 
 
 def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ...]:
-    """Photons, floor, rows (M,) and columns (N,) of a channel: means in octaves of light, and factors."""
+    """Photons, floor, rows (M,), columns (N,) and direct: means in octaves of light, and factors."""
     stride = max(1, min(shape) // _ENTRIES)
     parts = [[x[(part[0] - part[1]) % stride == 0] for x in part] for part in samples]
     i, j, light, square = map(np.concatenate, zip(*parts, strict=True))
+    own = (i == j) & (shape[0] == shape[1]) & (not exact)
+    first = [x[own] for x in (i, light, square)]
+    i, j, light, square = (x[~own] for x in (i, j, light, square))
     factors, photons = [np.ones(n) for n in shape], 0.0
     top, floor2, scale = light.max(initial=0.0) or 1.0, float(square.mean()) if len(square) else 0.0, 1.0
     octave = np.clip(_LIGHTS - 2 + np.frexp(light / top)[1], 1, _LIGHTS - 2)
@@ -182,7 +200,12 @@ def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ..
             weight = root / np.maximum(A @ x, 1e-6 * mean.max())
             x = scipy.optimize.nnls(A * weight[:, None], mean * weight)[0]
         photons, floor2 = x[0] / top, max(x[1], 1e-6 * mean.max())
-    return scale * photons, (scale * floor2) ** 0.5, *factors
+    photons, floor2, direct = scale * photons, scale * floor2, 1.0
+    if len(first[0]) >= _FIRST:
+        model = factors[0][first[0]] * factors[1][first[0]] * (photons * np.maximum(first[1], 0.0) + floor2)
+        z = first[2] / np.maximum(model, 1e-300)
+        direct = float(np.minimum(z, _CLIPPED * z.mean()).mean())
+    return photons, floor2**0.5, *factors, direct
 
 
 def _differences(first: Any, second: Any) -> Iterator[tuple[np.ndarray, ...]]:

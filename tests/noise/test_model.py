@@ -263,3 +263,18 @@ def test_acquired_transports_have_the_noise_of_their_scan(
         pictures.append((error @ p) / np.sqrt(square))
     for values in (z, diagonal, pictures):
         assert least < np.sqrt(np.mean(np.square(values))) < 1.7
+
+
+def test_the_first_bounce_may_have_a_noise_of_its_own() -> None:
+    """As of a path tracer, which has no chance where light comes straight from the projector."""
+    T = truth("box")
+    noise = replace(noise_of(T, 1e-3, photons=100.0), direct=0.01)
+    first, second = (measure(T, noise, seed, known=False) for seed in (1, 2))
+    twice = ltcl.Transport(first.to_numpy(), T.grid, noise=second).noise
+    assert twice.direct == pytest.approx(0.01, rel=0.4)
+    for each in (twice, first.noise):
+        ratio = each.diagonal(T.first_bounce) / noise.diagonal(T.first_bounce)
+        assert 0.7 < np.median(ratio) < 1.4
+    shown = ltcl.compensate(ltcl.Transport(first.to_numpy(), T.grid, noise=twice), T @ np.full(T.grid, 0.5))
+    errors = (first @ shown.pattern - T @ shown.pattern) / shown.std.appearance
+    assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2

@@ -153,7 +153,8 @@ def test_compressed_inverted_and_masked_transports_have_the_same_deviations() ->
     b = ltcl.separate(exact, image, 2)
     c = ltcl.compensate(exact, image)
     tasks: list[tuple[ltcl.Transport, dict[str, Any]]]
-    tasks = [(C, {"exact": exact}), (exact, {"inverse": inverse}), (masked, {})]
+    assert C.noise is noise
+    tasks = [(C, {"exact": exact}), (C, {}), (exact, {"inverse": inverse}), (masked, {})]
     for T_, options in tasks:
         s, p = ltcl.separate(T_, image, 2, **options).std, ltcl.compensate(T_, image, **options).std
         assert np.median(np.abs(np.log(parts(s) / parts(b.std)))) < 0.02
