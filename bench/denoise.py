@@ -114,8 +114,8 @@ def main() -> None:
     """Run the bench."""
     given = options(__doc__ or "")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # of glossy scenes, at each separation
-    sizes = [(12, 1.0)] if given.smoke else [(12, 0.0), (12, 1.0), (20, 0.0)]
-    some = SCENES[:: 4 if given.smoke else 1]
+    sizes = [(8, 1.0)] if given.smoke else [(12, 0.0), (12, 1.0), (20, 0.0)]
+    some = SCENES[: 1 if given.smoke else None]
     cases = [measured(name, n, level, light) for n, light in sizes for name in some for level in LEVELS]
     names = [f"{c.scene} {c.pixels}, noise {c.level:g}, photons {c.photons:g}" for c in cases]
     rows = [dict(zip(QUANTITIES, case.shares.T.round(5).tolist(), strict=True)) for case in cases]
