@@ -212,9 +212,9 @@ def _refuse_impossible(T: Transport, image: list[np.ndarray], direct: list[np.nd
         k = int(np.argmax(beyond - margin))
         worst = np.argsort(np.minimum(b[:, k], l[:, k] - b[:, k]))[:8]
         where = ", ".join(f"({j // T.grid[1]}, {j % T.grid[1]})" for j in worst)
-        part, uncertainty = share[k] / light[k], margin[k] / light[k]
+        direct_share, uncertainty = share[k] / light[k], margin[k] / light[k]
         raise InputError(
-            f"direct light is {part:.0%} of the image, uncertain to {uncertainty:.1%}; "
+            f"direct light is {direct_share:.0%} of the image, uncertain to {uncertainty:.1%}; "
             "it must be from 0 to 100 %: T or its first bounce is wrong or noisy, most of all at the pixels "
             f"(row, column): {where}; mask dark ones by dark=, or measure T again"
         )

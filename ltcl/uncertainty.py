@@ -154,7 +154,7 @@ def of_compensation(
             variances.append(_ratio(variance + _square(T, noise, c, x, x - e), f[:, None] ** 2))
         if T.mixing is not None:
             variances = list(np.einsum("cd,dnk->cnk", np.linalg.inv(T.mixing) ** 2, np.stack(variances)))
-    deviations = [np.sqrt(variance * part) for variance, part in zip(variances, free, strict=True)]
+    deviations = [np.sqrt(variance * lit) for variance, lit in zip(variances, free, strict=True)]
     return CompensationStd(
         *(picture.astype(np.float32) for picture in (shape.pack(deviations, T.grid), appearance))
     )
@@ -228,8 +228,8 @@ def variance(T: Transport, noise: Noise, c: int, squares: np.ndarray) -> np.ndar
 def _square(T: Transport, noise: Noise, c: int, z: np.ndarray, Rz: np.ndarray) -> np.ndarray:
     """Mean square over draws of R z, (N, k, draws), where it stands out of what the noise of R makes of z."""
     f = np.atleast_2d(T.first_bounce)[c][:, None]
-    made = variance(T, noise, c, _ratio(np.mean(z**2, axis=-1), f**2))
-    return np.maximum(np.mean(Rz**2, axis=-1) - (1.0 + (2.0 / z.shape[-1]) ** 0.5) * made, 0.0)
+    of_noise = variance(T, noise, c, _ratio(np.mean(z**2, axis=-1), f**2))
+    return np.maximum(np.mean(Rz**2, axis=-1) - (1.0 + (2.0 / z.shape[-1]) ** 0.5) * of_noise, 0.0)
 
 
 def _draws(q: np.ndarray, random: np.random.Generator, pictures: int) -> np.ndarray:

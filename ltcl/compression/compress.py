@@ -412,17 +412,17 @@ def _significant(problem: Problem, bases: Bases, note: Callable[[str], object]) 
     rows, columns = bases.noise(problem.noise)
     least = [float(np.min(side, where=side > 0.0, initial=np.inf)) for side in (rows, columns)]
     least = _LEAST * _NOISE * math.prod(least) if max(least) < math.inf else 0.0
-    found = bases.gather(problem.R, threshold=least)
-    core, total = found.core.copy(), float(np.sum(rows**2) * np.sum(columns**2))
+    coefficients = bases.gather(problem.R, threshold=least)
+    core, total = coefficients.core.copy(), float(np.sum(rows**2) * np.sum(columns**2))
     sizes = np.repeat(rows, np.diff(core.indptr)) * columns[core.indices]
     small = np.abs(core.data) < _NOISE * sizes
     # What is dropped has all of its noise: where it is less than T.noise says, that is too much.
-    left, noise = found.dropped**2 + np.sum(core.data[small] ** 2), total - np.sum(sizes[~small] ** 2)
+    left, noise = coefficients.dropped**2 + np.sum(core.data[small] ** 2), total - np.sum(sizes[~small] ** 2)
     sizes *= np.clip(math.sqrt(left / noise), _LEAST, 1.0) if noise > 0.0 else 1.0
     small = np.abs(core.data) < _NOISE * sizes
-    second, core.data[small] = math.hypot(found.second, np.linalg.norm(core.data[small])), 0.0
+    second, core.data[small] = math.hypot(coefficients.second, np.linalg.norm(core.data[small])), 0.0
     core.eliminate_zeros()
-    numbers, indices = replace(found, core=core, second=second), found.core.indices[~small]
+    numbers, indices = replace(coefficients, core=core, second=second), coefficients.core.indices[~small]
     core, support = bases.restricted(core)
     of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2))  # what noise makes of light of norm 1
     packed = quantize(core, _QUIET * of_pictures)
@@ -430,7 +430,7 @@ def _significant(problem: Problem, bases: Bases, note: Callable[[str], object]) 
     x /= np.maximum(np.linalg.norm(x, axis=0), 1e-30)
     lost = losses(problem, support.operator(problem.operator.device, packed), x)[0]
     risk = np.sum(lost**2) / _GUESS + 2.0 * np.sum(sizes[~small] ** 2 * energies(bases.into, x)[indices])
-    return _Fit(bases, found, numbers, support, packed, None, _DIFFUSE, None, float(risk))
+    return _Fit(bases, coefficients, numbers, support, packed, None, _DIFFUSE, None, float(risk))
 
 
 def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> tuple[_Fit, list[Trial]]:

@@ -168,7 +168,10 @@ class Noise:
 def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ...]:
     """Photons, floor, rows (M,), columns (N,) and direct: means in octaves of light, and factors."""
     stride = max(1, min(shape) // _ENTRIES)
-    parts = [[x[(part[0] - part[1]) % stride == 0] for x in part] for part in samples]
+    parts = [
+        [x[(rows - columns) % stride == 0] for x in (rows, columns, *rest)]
+        for rows, columns, *rest in samples
+    ]
     i, j, light, square = map(np.concatenate, zip(*parts, strict=True))
     own = (i == j) & (shape[0] == shape[1]) & (not exact)
     first = [x[own] for x in (i, light, square)]

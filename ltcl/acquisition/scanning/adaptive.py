@@ -115,11 +115,13 @@ class Core(NamedTuple):
         return [scipy.sparse.csr_array((x, (row, column)), shape=self.cells.W.T.shape) for x in data]
 
     def variances(self, channel: int) -> Iterator[tuple[np.ndarray, ...]]:
-        """Rows, columns in the middle of cells, light, and variances whose sums over cells are right."""
-        C, V = (self.matrices(name)[channel].tocoo() for name in ("energy", "variance"))
-        W, known = self.cells.W, (V.data > 0.0) & (V.data < 1e-3 * UNKNOWN)
-        middle, area = W.indices[(W.indptr[:-1] + W.indptr[1:]) // 2], W.sum(axis=1)
-        yield tuple(x[known] for x in (V.row, middle[V.col], C.data, V.data * area[V.col]))
+        """Rows, columns, light, and variances of pixels whose sums over cells are right."""
+        C, V = (self.matrices(name)[channel] for name in ("energy", "variance"))
+        V.data = np.where(V.data < 1e-3 * UNKNOWN, V.data * self.cells.W.sum(axis=1)[V.indices], 0.0)
+        for start in range(0, V.shape[0], AT_ONCE):
+            light, variance = ((A[start : start + AT_ONCE] @ self.cells.W).toarray() for A in (C, V))
+            i, j = np.nonzero(variance)
+            yield i + start, j, light[i, j], variance[i, j]
 
 
 def most_patterns(cells: Cells) -> int:
