@@ -116,8 +116,9 @@ class Core(NamedTuple):
 
     def variances(self, channel: int) -> Iterator[tuple[np.ndarray, ...]]:
         """Rows, columns, light, and variances of pixels whose sums over cells are right."""
-        C, V = (self.matrices(name)[channel] for name in ("energy", "variance"))
-        V.data = np.where(V.data < 1e-3 * UNKNOWN, V.data * self.cells.W.sum(axis=1)[V.indices], 0.0)
+        C, V = self.matrices()[channel], self.matrices("variance")[channel]
+        area, v = np.asarray(self.cells.W.sum(axis=1)), np.asarray(V.data)
+        V.data = np.where(v < 1e-3 * UNKNOWN, v * area[V.indices], 0.0)
         for start in range(0, V.shape[0], AT_ONCE):
             light, variance = ((A[start : start + AT_ONCE] @ self.cells.W).toarray() for A in (C, V))
             i, j = np.nonzero(variance)
