@@ -119,7 +119,7 @@ class Core(NamedTuple):
         C, V = self.matrices()[channel], self.matrices("variance")[channel]
         area, v = np.asarray(self.cells.W.sum(axis=1)), np.asarray(V.data)
         V.data = np.where(v < 1e-3 * UNKNOWN, v * area[V.indices], 0.0)
-        for start in range(0, V.shape[0], AT_ONCE):
+        for start in range(0, self.cells.offsets[1], AT_ONCE):
             light, variance = ((A[start : start + AT_ONCE] @ self.cells.W).toarray() for A in (C, V))
             i, j = np.nonzero(variance)
             yield i + start, j, light[i, j], variance[i, j]
