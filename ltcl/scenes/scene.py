@@ -156,7 +156,8 @@ class Scene:
         device : Device or str, optional
             The device that `Transport` computes on; the best one if omitted.
         on_dark : "mask" or "raise"
-            What `Transport` does about patches of albedo 0: never light them, or refuse.
+            What `Transport` does about patches of albedo 0, or hidden from the camera or projector of a
+            glossy scene: never light them, or refuse.
 
         Examples
         --------
