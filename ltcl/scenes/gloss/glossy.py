@@ -163,22 +163,18 @@ class GlossyScene(Scene):
         self, albedo: np.ndarray, light: np.ndarray, count: int | None = None
     ) -> Iterator[np.ndarray]:
         """P A^k F Q light (N, k) one after another: `count` indirect ones, or until little is left."""
-        most = albedo.max()
+        most, blocks = albedo.max(), self.white.data
         arriving, bounce = self.Q @ light.astype(np.float64), 0
         while True:
-            leaving = self._reflect(albedo, arriving)
+            # K arriving, as products of dense blocks, which are much faster than those of `bsr_array`.
+            leaving = blocks @ arriving.reshape(len(blocks), blocks.shape[1], -1)
+            leaving *= albedo[:, None, None]
+            leaving = leaving.reshape(arriving.shape)
             yield self.P @ leaving
             left = np.abs(leaving).max(initial=0.0) * most / (1 - most)
             if bounce == count or (count is None and left <= _TAIL):
                 return
             arriving, bounce = self.G @ leaving, bounce + 1
-
-    def _reflect(self, albedo: np.ndarray, arriving: np.ndarray) -> np.ndarray:
-        """K arriving, as products of dense blocks, which are much faster than those of `bsr_array`."""
-        blocks = self.white.data
-        leaving = blocks @ arriving.reshape(len(blocks), blocks.shape[1], -1)
-        leaving *= albedo[:, None, None]
-        return leaving.reshape(arriving.shape)
 
 
 def glossy(
@@ -257,11 +253,13 @@ def glossy(
     lights = sight("projector", projector, walls, patches, boxes)
     sees = sight("camera", viewer.eye if camera is None else camera, walls, patches, boxes)
     exchange = beams.exchange(walls, n, directions, rays, boxes, seed)
+    entries = exchange.tocoo()  # with an empty last slot: no patch gets what others send to the camera
+    places = tuple(index + index // (slots - 1) for index in (entries.row, entries.col))
     form_factors, grid = _form_factors(exchange, patches.area), (n, n * len(walls))
     matte = name, grid, form_factors, albedos, patches.area, walls, viewer, blocks
     return GlossyScene(
         *matte,
-        G=_with_slots(exchange, slots),
+        G=scipy.sparse.csr_array((entries.data, places), (size * slots, size * slots)),
         white=_reflectance(n, materials, lights, sees),
         P=_last_slots((sees.share > 0).astype(np.float64), slots),
         Q=scipy.sparse.csr_array(_last_slots(lights.share, slots).T),
@@ -314,14 +312,6 @@ def _form_factors(exchange: Any, area: np.ndarray) -> np.ndarray:
     both = area[:, None] * (sums @ exchange @ sums.T).toarray() / bins
     form_factors = (both + both.T) / (2 * area[:, None])
     return form_factors / max(1.0, form_factors.sum(axis=1).max())
-
-
-def _with_slots(exchange: Any, slots: int) -> scipy.sparse.csr_array:
-    """The exchange with an empty last slot for each patch: no patch gets what others send to the camera."""
-    entries = exchange.tocoo()
-    row, column = (index + index // (slots - 1) for index in (entries.row, entries.col))
-    size = exchange.shape[0] // (slots - 1) * slots
-    return scipy.sparse.csr_array((entries.data, (row, column)), (size, size))
 
 
 def _last_slots(values: np.ndarray, slots: int) -> scipy.sparse.csr_array:
