@@ -153,7 +153,13 @@ class Search:
             light = trials[-1].light
             lines.append((trials[-1].slope, (trials[-1].least - trials[-1].slope) / t))
             farthest = max(farthest, t)
-            t, bound = _lowest(lines, 2 * farthest)
+            # Where in (0, 2 farthest] the largest of the lines a + b t is lowest, and how low.
+            a, b = np.array(lines).T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                crossings = ((a[:, None] - a) / (b - b[:, None])).ravel()
+            ts = np.append(crossings[(crossings > 0.0) & (crossings < 2 * farthest)], 2 * farthest)
+            heights = np.max(a + b * ts[:, None], axis=1)
+            t, bound = float(ts[np.argmin(heights)]), float(np.min(heights))
         return min(trials, key=lambda trial: trial.sine)
 
     def _from_above(self, loss: float) -> tuple[float, Columns]:
@@ -236,16 +242,6 @@ def _active_sets(
         errors[column] = np.linalg.norm(T @ light[lit, column] - b)
         least[column] = max(error - gap / error, 0.0) if error > 0.0 else 0.0
     return light, errors, np.minimum(least, errors)
-
-
-def _lowest(lines: list[tuple[float, float]], most: float) -> tuple[float, float]:
-    """Where in (0, most] the largest of the lines a + b t is lowest, and how low."""
-    a, b = np.array(lines).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossings = ((a[:, None] - a) / (b - b[:, None])).ravel()
-    t = np.append(crossings[(crossings > 0.0) & (crossings < most)], most)
-    heights = np.max(a + b * t[:, None], axis=1)
-    return float(t[np.argmin(heights)]), float(np.min(heights))
 
 
 def _inner(a: Columns, b: Columns) -> float:

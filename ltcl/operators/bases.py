@@ -102,7 +102,14 @@ class SubsetBasis(Basis):
         h, w = checks.grid("grid", grid)
         if of is not None and (of.device is not device or of.grid != (h, w)):
             raise InputError(f"of is for {of.grid} on {of.device}; it must be for {(h, w)} on {device}")
-        self.places = _places(places, h * w if of is None else of.shape[0])
+        count, places = h * w if of is None else of.shape[0], checks.real("places", places)
+        if places.ndim != 1 or not len(places) or places.dtype.kind not in "iu":
+            kind = f"{places.shape} of {places.dtype}"
+            raise InputError(f"places has shape {kind}; it must be (M,) whole numbers")
+        least, most = places.min(), places.max()
+        if least < 0 or most >= count or len(np.unique(places)) < len(places):
+            raise InputError(f"places are {least} to {most}; they must be different, below {count}")
+        self.places = places.astype(np.int64)
         if isinstance(of, SubsetBasis):
             self.places, of = of.places[self.places], of.of
         self.of, count = of, h * w if of is None else of.shape[0]
@@ -210,14 +217,3 @@ def multiresolution_order(grid: Any, levels: int) -> np.ndarray:
         level[down | right] = levels - split
         h, w = rows, columns
     return np.lexsort((band, x, y, level))
-
-
-def _places(places: Any, count: int) -> np.ndarray:
-    places = checks.real("places", places)
-    if places.ndim != 1 or not len(places) or places.dtype.kind not in "iu":
-        raise InputError(f"places has shape {places.shape} of {places.dtype}; it must be (M,) whole numbers")
-    if places.min() < 0 or places.max() >= count or len(np.unique(places)) < len(places):
-        raise InputError(
-            f"places are {places.min()} to {places.max()}; they must be different, below {count}"
-        )
-    return places.astype(np.int64)
