@@ -185,7 +185,16 @@ class Search:
     def _nearest(self, gain: float, light: Columns, accuracy: float) -> Trial:
         """The trial at this gain, whose error is above the least by `accuracy` at most, if it has settled."""
         problem = self.problem
-        solves = [self._solve(which, gain, start, accuracy) for which, start in enumerate(light)]
+        columns = sum(d.shape[1] for d in problem.desired)
+        rules = {"rtol": 0.0, "atol": accuracy * gain * self.size / np.sqrt(columns), "maxiter": _MAXITER}
+        solves = []  # of each system light, error and its lower bound of each column, and whether it settled
+        for which, start in enumerate(light):
+            if self.on_host:
+                solves.append((*_active_sets(problem, which, gain, self.A[which]), True))
+                continue
+            p, solution = problem.nearest(which, gain, start, **rules)
+            settled = solution.status is not Status.CONVERGED or not np.any(solution.errors)
+            solves.append((p, solution.errors / problem.unit, solution.least / problem.unit, settled))
         light = [p for p, *_ in solves]
         parts = zip(problem.target(gain), self.A, problem.systems, light, strict=True)
         missing = problem.weighted([b - A @ (system.scale[:, None] * p) for b, A, system, p in parts])
@@ -207,19 +216,6 @@ class Search:
             size=norm / self.size,
             settled=all(settled for *_, settled in solves),
         )
-
-    def _solve(
-        self, which: int, gain: float, start: np.ndarray, accuracy: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-        """Light of one system, the error and its lower bound of each column, and whether it has settled."""
-        problem = self.problem
-        if self.on_host:
-            return *_active_sets(problem, which, gain, self.A[which]), True
-        columns = sum(d.shape[1] for d in problem.desired)
-        rules = {"rtol": 0.0, "atol": accuracy * gain * self.size / np.sqrt(columns), "maxiter": _MAXITER}
-        light, solution = problem.nearest(which, gain, start, **rules)
-        settled = solution.status is not Status.CONVERGED or not np.any(solution.errors)
-        return light, solution.errors / problem.unit, solution.least / problem.unit, settled
 
 
 def _active_sets(

@@ -7,6 +7,7 @@ columns of C empty; with P, (M, N), that picks the others, its support, C = P^T 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,8 @@ class Basis(Operator):
 
     orthonormal = True
     isometric = True
+    # (x, out, a, b, y, transpose): queues out = a (W x) + b y, or with W^T; y is not read where b is 0.
+    _transform: Callable[[Array, Array, float, float, Array, bool], None]
 
     def __init__(
         self, device: Device, grid: Any, name: str, coefficients: int, *parts: Operator | Array | None
@@ -54,10 +57,6 @@ class Basis(Operator):
             self._transform(x, out, a, b, x if y is None else y, transpose)
         if c:
             vectors.axpy(c, x, out)
-
-    def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
-        """Queue ``out = a (W x) + b y``, or with W^T; y is an array in any case, not read where b is 0."""
-        raise NotImplementedError
 
     def _kernel(self, file: str, name: str, k: int, **defines: Any) -> tuple[Kernel, int]:
         """A kernel for k right-hand sides, and in how many pieces it takes them."""

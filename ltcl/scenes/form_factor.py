@@ -30,7 +30,7 @@ from ltcl.errors import InputError
 from ltcl.operators import CSR, Operator
 from ltcl.operators.base import Epilogue, widths
 from ltcl.scenes import exchange
-from ltcl.scenes.patches import Frame, Patches, check_blocks, check_patches, cut, lanes, padded, squared_size
+from ltcl.scenes.patches import Patches, check_blocks, check_patches, cut, lanes, padded, scaled, squared_size
 from ltcl.scenes.visibility import Rays
 from ltcl.scenes.walls import check_albedo
 
@@ -99,11 +99,10 @@ class FormFactor(Operator):
         super().__init__(device if isinstance(device, Device) else open_device(device), (count, count))
         self.device.require(60 * count, f"the geometry of {count} patches")
         self.error = _ERROR * float(shares.max())
-        frame = Frame.of(patches)
-        placed = frame.patches(patches)
+        placed, self._blocks = scaled(self.device, patches, blocks)
         vectors = (placed.centre, placed.right, placed.down, placed.normal)
         rows = np.concatenate([*(vector.T for vector in vectors), squared_size(placed)[None]])  # (13, N)
-        self._geometry, self._blocks = padded(self.device, rows), frame.upload_blocks(self.device, blocks)
+        self._geometry = padded(self.device, rows)
         self._defines = {"LANES": lanes(self.device), "BLOCKS": len(blocks)}
         self._albedo, self._area = self.device.upload(shares), self.device.upload(placed.area)
         self._near = CSR(self.device, self._correction(patches, blocks, shares, placed.area))

@@ -21,7 +21,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Device, open_device
-from ltcl.scenes.patches import Frame, Patches, check_blocks, check_patches, lanes, padded
+from ltcl.scenes.patches import Patches, check_blocks, check_patches, lanes, padded, scaled
 
 _LAUNCH = 1 << 30  # tests of a ray and a box in one launch: a fraction of a second, also for slow devices
 
@@ -31,8 +31,7 @@ class Rays:
 
     def __init__(self, patches: Patches, blocks: np.ndarray, device: Device, samples: int) -> None:
         self.device, self.count, self.rays, self.boxes = device, len(patches), samples**2, len(blocks)
-        frame = Frame.of(patches)
-        placed = frame.patches(patches)
+        placed, self._blocks = scaled(device, patches, blocks)
         cell = np.stack(np.meshgrid(*[np.arange(samples)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
         place = (cell + np.random.default_rng(1).random(cell.shape)) / samples - 0.5  # (s^2, 2) in edges
         edges = np.stack([placed.right, placed.down])  # (2, N, 3)
@@ -45,7 +44,6 @@ class Rays:
         self._starts = padded(device, points.reshape(-1, self.count))
         self._ends = padded(device, points[partner].reshape(-1, self.count))
         self._normals = padded(device, placed.normal.T)
-        self._blocks = frame.upload_blocks(device, blocks)
 
     def all(self) -> np.ndarray:
         """V of all patches, (N, N) float32, some rows in a launch: as many as one buffer holds."""
