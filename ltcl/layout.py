@@ -59,8 +59,16 @@ def unpack(name: str, picture: Any, grid: tuple[int, int], channels: int) -> tup
         logger.warning("%s holds %s, up to %d; %s", name, array.dtype, array.max(), UNITS % white)
     if array.dtype not in (np.float32, np.float64):
         array = array.astype(np.float64)
-    layout = _layout(name, array, grid, channels)
     n = grid[0] * grid[1]
+    for size, flat, colour in (((n,), True, False), ((*grid, 3), False, True), (grid, False, False)):
+        if array.shape == size or (not flat and array.shape[1:] == size and len(array)):
+            frames = None if array.shape == size else len(array)
+            layout = Layout(flat, frames, colour or channels == 3)
+            break
+    else:
+        raise InputError(
+            f"{name} has shape {array.shape}; it must be {grid}, {(*grid, 3)} or frames of these"
+        )
     values = array.reshape(layout.frames or 1, n, -1)  # (frames, N, 1 or 3)
     if channels == 1:
         return [np.array(values.transpose(1, 0, 2), order="C").reshape(n, -1)], layout
@@ -68,16 +76,6 @@ def unpack(name: str, picture: Any, grid: tuple[int, int], channels: int) -> tup
     for channel, column in enumerate(columns):
         column[...] = values[..., min(channel, values.shape[2] - 1)].T
     return columns, layout
-
-
-def _layout(name: str, array: np.ndarray, grid: tuple[int, int], channels: int) -> Layout:
-    n = grid[0] * grid[1]
-    for shape, flat, colour in (((n,), True, False), ((*grid, 3), False, True), (grid, False, False)):
-        if array.shape == shape:
-            return Layout(flat, None, colour or channels == 3)
-        if not flat and array.shape[1:] == shape and len(array):
-            return Layout(flat, len(array), colour or channels == 3)
-    raise InputError(f"{name} has shape {array.shape}; it must be {grid}, {(*grid, 3)} or frames of these")
 
 
 def to_light(columns: Sequence[np.ndarray], F: np.ndarray, mixing: np.ndarray | None) -> list[np.ndarray]:

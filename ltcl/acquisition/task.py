@@ -30,13 +30,14 @@ from ltcl.acquisition.rig import Rig, Shots, exact
 from ltcl.acquisition.scanning import adaptive, columns, plan
 from ltcl.acquisition.scanning.pictures import Log, Picture, Pictures
 from ltcl.acquisition.session import check_same, check_same_rig
-from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError
+from ltcl.errors import AcquisitionError, FileError, InputError, InputTypeError, ScanRefused
 from ltcl.files import as_path
 from ltcl.store import BlockStore, Parts, StoredRows, load
 from ltcl.store.block_store import check_place
 from ltcl.transport import Transport
 
 logger = logging.getLogger(__name__)
+_REFUSED = 0.3  # of white: relative deviation of row sums
 
 
 @dataclass(frozen=True)
@@ -315,7 +316,12 @@ def scan(store: BlockStore, shots: Shots, settings: Settings, progress: Progress
 
     columns.scan(pictures, code, store, settings.sigmas, count)
     white, sums = pictures.white, np.stack([columns.sums(store, c) for c in range(pictures.channels)])
-    columns.check_row_sums(str(store.path), sums, white)
+    # They do of a camera of one exposure that changes it by itself; others are refused in a batch.
+    if (relative := columns.deviation(sums, white)) > _REFUSED:
+        raise ScanRefused(
+            f"{store.path}: row sums of T deviate by {relative:.0%} from white (allowed: {_REFUSED:.0%}); "
+            "the scene, the light or the exposure changed during the scan: acquire into another store"
+        )
     store.extra(columns.SUMS, sums)
     store.update(patterns=total)
     for name, array in pictures.noise(partial(columns.variances, store)).items():

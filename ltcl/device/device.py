@@ -103,20 +103,17 @@ class Device:
                 f"a buffer of {checks.size(nbytes)} for an array {shape} is beyond the largest that "
                 f"{self.name} allows, {checks.size(self.max_allocation)}"
             )
-        with kernels.translated(f"allocating {checks.size(nbytes)} on {self.name}"):
-            return Array(self, self._allocate(nbytes + SPARE_BYTES), shape, dtype)
-
-    def _allocate(self, nbytes: int) -> Any:
-        """A buffer from the pool; or a new one, for which unused blocks of the pool make room."""
-        with self._lock:
-            if nbytes > self._largest_pooled:
+        size = nbytes + SPARE_BYTES
+        with kernels.translated(f"allocating {checks.size(nbytes)} on {self.name}"), self._lock:
+            if size > self._largest_pooled:  # a new one, for which unused blocks of the pool make room
                 self.allocations += 1
                 self._pool.free_held()
-                return self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, nbytes)
-            unused = self._pool.held_blocks
-            buffer = self._pool.allocate(nbytes)  # frees unused blocks and tries again by itself
-            self.allocations += self._pool.held_blocks >= unused
-            return buffer
+                buffer = self.cl.Buffer(self.context, self.cl.mem_flags.READ_WRITE, size)
+            else:
+                unused = self._pool.held_blocks
+                buffer = self._pool.allocate(size)  # frees unused blocks and tries again by itself
+                self.allocations += self._pool.held_blocks >= unused
+            return Array(self, buffer, shape, dtype)
 
     def upload(self, values: Any, dtype: Any = np.float32) -> Array:
         """A copy of `values` on the device, as `dtype`."""

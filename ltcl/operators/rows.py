@@ -120,23 +120,19 @@ class RowOperator(Operator):
     def fastest(self, x: Array, width: int) -> Variant:
         """The variant for products with `width` of the right-hand sides `x`, timed at the first call."""
         key = (width, x.columns)
-        if key not in self._fastest:
-            self._fastest[key] = self._measure(x, width)
-        return self._fastest[key]
-
-    def _measure(self, x: Array, width: int) -> Variant:
+        if key in self._fastest:
+            return self._fastest[key]
         variants, slab = self.variants(), max(self.slabs, key=lambda slab: slab.nbytes)
-        if len(variants) == 1:
-            return next(iter(variants.values()))
-        # Timed on the real matrix, into an array nobody needs: `out` may be an operand.
-        spare = self.device.empty((self.shape[0], *x.shape[1:]))
-        trials = {
-            name: self._launch(variant, slab, x, spare, 0, width, PLAIN) for name, variant in variants.items()
-        }
-        row = slab.nbytes // max(slab.rows, 1)
-        kind = " ".join(f"{name}={value}" for name, value in sorted(self.defines.items()))
-        problem = f"{kind} k={width} of {x.columns}, rows of about 2^{row.bit_length()} bytes"
-        return variants[tuning.choose(self.device, self.file, problem, trials)]
+        best = next(iter(variants))
+        if len(variants) > 1:  # timed on the real matrix, into an array nobody needs: `out` may be an operand
+            spare = self.device.empty((self.shape[0], *x.shape[1:]))
+            trials = {name: self._launch(v, slab, x, spare, 0, width, PLAIN) for name, v in variants.items()}
+            row = slab.nbytes // max(slab.rows, 1)
+            kind = " ".join(f"{name}={value}" for name, value in sorted(self.defines.items()))
+            problem = f"{kind} k={width} of {x.columns}, rows of about 2^{row.bit_length()} bytes"
+            best = tuning.choose(self.device, self.file, problem, trials)
+        self._fastest[key] = variants[best]
+        return variants[best]
 
     def kernel(self, name: str, width: int, columns: int, **defines: int) -> Kernel:
         """The kernel `name` for `width` of `columns` right-hand sides."""

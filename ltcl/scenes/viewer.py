@@ -138,10 +138,13 @@ def read(
     patches = (grid[0], grid[1] // len(walls))
     image = np.asarray(image, dtype=np.float32)
     seen = {i: viewer.homography(wall) for i, wall in enumerate((*walls, *screens)) if viewer.sees(wall)}
+    corners = np.array([(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 1)], dtype=np.float64)
+    outlines = {i: np.pad(_apply(homography, corners), ((0, 0), (0, 1))) for i, homography in seen.items()}
     parts = []
     for i in range(len(walls)):
         if i in seen:
-            hiding = [other for j, other in seen.items() if j != i and _overlap(seen[i], other)]
+            others = [j for j in seen if j != i and overlap(outlines[i], outlines[j], touch=1e-9)]
+            hiding = [seen[j] for j in others]
             parts.append(_read_wall(seen[i], to_pixels, image, patches, hiding))
         else:
             parts.append(np.zeros((*patches, *image.shape[2:]), dtype=np.float32))
@@ -182,13 +185,6 @@ def _hit(homography: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
         place = place[..., :2] / nearness[..., None]
     inside = np.all((place >= -_EDGE) & (place <= 1 + _EDGE), axis=-1)
     return place, np.where(inside, nearness, 0)
-
-
-def _overlap(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether two walls overlap in the image by more than a rounding error."""
-    corners = np.array([(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 1)], dtype=np.float64)
-    outlines = (np.pad(_apply(homography, corners), ((0, 0), (0, 1))) for homography in (first, second))
-    return overlap(*outlines, touch=1e-9)
 
 
 def _read_wall(

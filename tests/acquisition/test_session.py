@@ -119,7 +119,10 @@ class Terse(Plain):
 @pytest.mark.parametrize(
     ("kind", "others"),
     [
-        (Plain, [(Terse(), "rig.kind is 'terse'"), (Plain(bits=10), "levels"), (Plain(DIM), "blocks.*changed")]),
+        (
+            Plain,
+            [(Terse(), "rig.kind is 'terse'"), (Plain(bits=10), "levels"), (Plain(DIM), "blocks.*changed")],
+        ),
         (Terse, [(Terse(bits=10), r"1024 levels.*4096")]),
     ],
 )

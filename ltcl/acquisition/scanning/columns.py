@@ -18,13 +18,12 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.acquisition.geometry.resample import Blocks
 from ltcl.acquisition.scanning.pictures import UNKNOWN, Picture, Pictures
-from ltcl.errors import InputError, ScanRefused
+from ltcl.errors import InputError
 from ltcl.store import BlockStore
 
 _KNOWN = 1e-3 * UNKNOWN  # variances from there on are of unknown values
 _TILE = 4  # sides of tiles, from one to the next
 _RUN = 8  # columns that share light that only their sum shows (16: errors of bounces 1.25 times as forecast)
-_REFUSED = 0.3  # of white
 SUMS = "scanned.sums"
 """Extra array (channels, N) of a store: row sums of T by its columns, before they were made to add up."""
 
@@ -240,18 +239,6 @@ def deviation(sums: np.ndarray, white: Picture) -> float:
     light = np.sum(white.value[white.known] ** 2, dtype=np.float64)
     difference = (sums - white.value)[white.known]
     return float(np.sqrt(np.sum(difference**2) / light)) if light > 0 else float("nan")
-
-
-def check_row_sums(name: str, sums: np.ndarray, white: Picture) -> None:
-    """Raise ScanRefused where row sums (channels, N) deviate from white by more than 30 %.
-
-    They do of a camera of one exposure that changes it by itself; others are refused before a batch is kept.
-    """
-    if (relative := deviation(sums, white)) > _REFUSED:
-        raise ScanRefused(
-            f"{name}: row sums of T deviate by {relative:.0%} from white (allowed: {_REFUSED:.0%}); "
-            "the scene, the light or the exposure changed during the scan: acquire into another store"
-        )
 
 
 def balance(

@@ -134,7 +134,11 @@ class Pictures(Seen):
         for k, codes in enumerate(batch):
             shot = self._photograph(codes, times)
             if self._deviation(shot) is not None:
-                self._refuse([shot, *(self._photograph(c, times) for c in batch[k + 1 : k + 2])])
+                suspects = [shot, *(self._photograph(c, times) for c in batch[k + 1 : k + 2])]
+                found = [(s.numbers, d) for s in suspects if (d := self._deviation(s)) is not None]
+                texts = [deviation.describe(numbers, self.shots.name) for numbers, deviation in found]
+                text = self._rearranged(suspects) if len(texts) == 2 else None
+                raise AcquisitionError(f"{text or '; '.join(texts)}; {ADVICE}")
             light = self._merge(shot)
             lit, dark = self._on_grid(light), self._dark
             known = (lit.variance < UNKNOWN) & (dark.variance < UNKNOWN)
@@ -166,13 +170,6 @@ class Pictures(Seen):
             if deviation := find_deviation(samples, shot.seconds, self._sensor):
                 return deviation
         return None
-
-    def _refuse(self, shots: Sequence[_Shot]) -> None:
-        """Raise AcquisitionError about a shot whose exposures deviate, and the next one."""
-        deviations = [(shot, self._deviation(shot)) for shot in shots]
-        described = [d.describe(shot.numbers, self.shots.name) for shot, d in deviations if d is not None]
-        text = self._rearranged(shots) if len(described) == 2 else None
-        raise AcquisitionError(f"{text or '; '.join(described)}; {ADVICE}")
 
     def _rearranged(self, shots: Sequence[_Shot]) -> str | None:
         """Which photographs are exchanged, or which is missing, if that makes all of two patterns agree."""
