@@ -22,7 +22,7 @@ import numpy as np
 
 from ltcl import checks, layout
 from ltcl.errors import InputError, InputTypeError
-from ltcl.solvers import Inverse, Solution, monte_carlo, solve_each
+from ltcl.solvers import Inverse, Solution, solve_each
 from ltcl.solvers.solve import METHODS, SAMPLED
 from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
 from ltcl.uncertainty import SeparationStd, of_separation
@@ -141,7 +141,8 @@ def separate(
     """
     require(T)
     checks.count("bounces", bounces, least=0)
-    monte_carlo.check_whole(options)
+    if "pixels" in options:
+        raise InputTypeError("pixels= gives some pixels alone; a picture needs all: leave it out")
     checks.one_of("method", method, METHODS)
     seed = checks.count("seed", options.get("seed", 0), least=0, most=(1 << 64) - 1)
     columns, shape = layout.unpack("image", image, T.grid, T.channels)

@@ -18,7 +18,7 @@ theirs, the most where a block covers half of a patch.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -31,11 +31,9 @@ from ltcl.operators import CSR, Operator
 from ltcl.operators.base import Epilogue, widths
 from ltcl.scenes import exchange
 from ltcl.scenes.patches import Patches, check_blocks, check_patches, cut, lanes, padded, scaled, squared_size
+from ltcl.scenes.scene import Scene
 from ltcl.scenes.visibility import Rays
 from ltcl.scenes.walls import check_albedo
-
-if TYPE_CHECKING:
-    from ltcl.scenes.scene import Scene
 
 _NEAR = 5.0  # sizes of a pair, see `squared_size`
 _ERROR = 1e-4
@@ -162,7 +160,7 @@ class FormFactor(Operator):
         self, patches: Patches, blocks: np.ndarray, albedo: np.ndarray, area: np.ndarray
     ) -> scipy.sparse.csr_array:
         """A of near pairs less what the kernel takes it for, both ways, (N, N) sparse float64."""
-        i, j = _near_pairs(patches, _NEAR)
+        i, j = _near_pairs(patches)
         F = exchange.of_pairs(patches, i, j)
         if len(blocks):
             F = F * Rays(patches, blocks, self.device, _NEAR_SAMPLES).pairs(i, j)
@@ -185,14 +183,14 @@ class FormFactor(Operator):
         return np.concatenate(parts)
 
 
-def _near_pairs(patches: Patches, sizes: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs i < j whose centres are within `sizes` of their size and that see each other, boxes aside."""
+def _near_pairs(patches: Patches) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs i < j whose centres are within `_NEAR` of their size and that see each other, boxes aside."""
     squared, normal = squared_size(patches), patches.normal
     tree = scipy.spatial.KDTree(patches.centre)
-    pairs = tree.query_pairs(sizes * np.sqrt(2 * squared.max()), output_type="ndarray")
+    pairs = tree.query_pairs(_NEAR * np.sqrt(2 * squared.max()), output_type="ndarray")
     i, j = np.sort(pairs, axis=1).T if len(pairs) else np.zeros((2, 0), int)
     offset = patches.centre[j] - patches.centre[i]
-    close = np.square(offset).sum(axis=1) < sizes**2 * (squared[i] + squared[j])
+    close = np.square(offset).sum(axis=1) < _NEAR**2 * (squared[i] + squared[j])
     for plane, other, sign in ((i, j, 1), (j, i, -1)):  # does any point of the other rise above the plane?
         rise = sum(
             np.abs((edge[other] * normal[plane]).sum(axis=1)) for edge in (patches.right, patches.down)

@@ -16,14 +16,14 @@ import numpy as np
 
 from ltcl.errors import InputError
 from ltcl.scenes.patches import Patches, check_blocks
-from ltcl.scenes.walls import Block, Vector, Wall, point
+from ltcl.scenes.walls import Wall, point
 
 _HAIR = 1e-9
 """Of a wall's or block's side: rays that aim at a seam must not slip through it, and what runs along a face
 of a block is not stopped by it. Of a ray's length: where it starts and what it aims at may lie on a surface,
 and walls are in front of the face of a block that they lie on."""
 
-_LIGHT_POINTS, _SIGHT_POINTS = 8, 4  # along a patch
+_SIGHT_POINTS = 4  # along a patch
 _NEAR = 1e-6  # of a wall's side: a projector or camera this near lies on the wall
 
 
@@ -74,33 +74,6 @@ def clear(walls: Sequence[Wall], origins: np.ndarray, place: np.ndarray, blocks:
     [True, False]
     """
     return cast(walls, origins, place - origins, blocks).distance >= 1 - _HAIR
-
-
-def irradiance(
-    walls: Sequence[Wall], grid: tuple[int, int], light: Vector, blocks: Sequence[Block] = ()
-) -> np.ndarray:
-    """Light that falls on each patch from a point that shines alike in all directions, largest value 1.
-
-        E = mean over 8 x 8 points of the patch of  cos(t) / r^2,  0 where something stands in between
-
-    so the edge of a shadow is good to 1/64 of a patch's light or so. (h, w) float32, the walls side by side.
-    """
-    where = np.array(point("light", light))
-    if any(((where > block.low) & (where < block.high)).all() for block in blocks):
-        raise InputError(f"light is {light}, inside a block; move it out")
-    h, w = grid[0], grid[1] // len(walls)
-    u, v = ((np.arange(n * _LIGHT_POINTS) + 0.5) / (n * _LIGHT_POINTS) for n in (w, h))
-    boxes, parts = [(block.low, block.high) for block in blocks], []
-    for wall in walls:
-        points = wall.points(u, v[:, None])
-        ways = where - points
-        arrives = np.maximum(ways @ wall.normal, 0) / np.linalg.norm(ways, axis=-1) ** 3
-        arrives *= clear(walls, points.reshape(-1, 3), where, boxes).reshape(arrives.shape)
-        parts.append(arrives.reshape(h, _LIGHT_POINTS, w, _LIGHT_POINTS).mean(axis=(1, 3)))
-    picture = np.concatenate(parts, axis=1)
-    if picture.max() <= 0:
-        raise InputError(f"light is {light}, from where it reaches no patch; move it in front of a wall")
-    return (picture / picture.max()).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)

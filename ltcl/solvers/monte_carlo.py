@@ -317,9 +317,3 @@ def of_channel(channel: int, f: Callable[..., Any], *arguments: Any, **options: 
         return f(*arguments, **options)
     except (InputError, MemoryLimitError) as error:
         raise type(error)(f"in channel {channel}: {error}") from None
-
-
-def check_whole(options: dict[str, Any]) -> None:
-    """Refuse estimates of some pixels where whole pictures are needed."""
-    if "pixels" in options:
-        raise InputTypeError("pixels= gives some pixels alone; a picture needs all: leave it out")

@@ -77,14 +77,6 @@ def bins(vectors: np.ndarray, k: int) -> np.ndarray:
     return column * k + row
 
 
-def lattice(k: int, points: int) -> np.ndarray:
-    """Unit vectors (k^2, points^2, 3) spread evenly over each of k x k bins."""
-    place = ((np.arange(k)[:, None] + (np.arange(points) + 0.5) / points) / k).ravel()
-    square = np.stack(np.meshgrid(place, place, indexing="ij"), axis=-1)  # (k points, k points, 2)
-    cells = square.reshape(k, points, k, points, 2).swapaxes(1, 2)
-    return from_square(cells.reshape(k * k, points * points, 2))
-
-
 @dataclass(frozen=True, eq=False)
 class Lobe:
     """The part s p s of a material, between k x k bins and any other directions; mean 1 over the bins.
@@ -125,7 +117,10 @@ def lobe(exponent: float, k: int) -> Lobe:
             f"exponent is {exponent:g}; it must be at most {_SHARPEST * k * k} for {k * k} directions, "
             "which cannot show a sharper lobe; raise directions"
         )
-    places = lattice(k, _POINTS)
+    place = ((np.arange(k)[:, None] + (np.arange(_POINTS) + 0.5) / _POINTS) / k).ravel()
+    square = np.stack(np.meshgrid(place, place, indexing="ij"), axis=-1)  # spread evenly over each bin
+    cells = square.reshape(k, _POINTS, k, _POINTS, 2).swapaxes(1, 2)
+    places = from_square(cells.reshape(k * k, _POINTS**2, 2))
     means = np.stack([_bin_means(own, places, exponent).mean(axis=0) for own in places])
     means = (means + means.T) / 2  # rounding
     scale = np.ones(len(means))

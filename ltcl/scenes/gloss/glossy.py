@@ -242,7 +242,10 @@ def glossy(
     ((3, 9), 16, (27, 459))
     """
     walls, name, viewer = _room(room, camera)
-    blocks, boxes = _blocks(room, blocks)
+    if not isinstance(blocks, Sequence) or not all(isinstance(block, Block) for block in blocks):
+        raise InputTypeError(f"blocks is {blocks!r}; it must be a sequence of ltcl.scenes.Block")
+    blocks = (*(room.blocks if isinstance(room, Scene) else ()), *blocks)
+    boxes = np.array([(block.low, block.high) for block in blocks]).reshape(-1, 2, 3)
     n, k = checks.count("n", n), brdf.side(directions)
     size, slots = n * n * len(walls), k * k + 1
     needed = 8 * size * slots**2 + 4 * 8 * size**2  # reflectances; form factors and room to work
@@ -277,15 +280,6 @@ def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, Viewer]:
         raise InputError("camera is None; it must be a place (x, y, z) where room is walls only")
     viewer = Viewer(point("camera", camera), vector(cut(walls, 1).centre.mean(axis=0)))
     return walls, f"glossy room of {len(walls)} wall(s)", viewer
-
-
-def _blocks(room: Any, more: Any) -> tuple[tuple[Block, ...], np.ndarray]:
-    """All blocks, and their corners (B, 2, 3)."""
-    added = tuple(more) if isinstance(more, Sequence) else (more,)
-    if not all(isinstance(block, Block) for block in added):
-        raise InputTypeError(f"blocks is {more!r}; it must be a sequence of ltcl.scenes.Block")
-    every = (*(room.blocks if isinstance(room, Scene) else ()), *added)
-    return every, np.array([(block.low, block.high) for block in every]).reshape(-1, 2, 3)
 
 
 def _materials(gloss: Any, exponent: Any, walls: int, k: int) -> list[tuple[float, brdf.Lobe]]:
