@@ -117,7 +117,16 @@ def draw(
     y = (np.arange(height * supersample) + 0.5 - height * supersample / 2) / scale + visible.centre[1]
     for row in range(0, height, _BAND):
         rows = y[row * supersample : (row + _BAND) * supersample]
-        image[row : row + _BAND] = _shrink(_draw_points(seen, x, rows), supersample)
+        points = _lattice(x, rows)
+        values = np.zeros((*points.shape[:2], *picture.shape[2:]), dtype=np.float32)
+        nearest = np.zeros(points.shape[:2])
+        for homography, painting in seen:
+            place, nearness = _hit(homography, points)
+            shown = nearness > nearest
+            if shown.any():
+                nearest[shown] = nearness[shown]
+                values[shown] = _interpolate(painting, place * painting.shape[1::-1] - 0.5)[shown]
+        image[row : row + _BAND] = _shrink(values, supersample)
     return image
 
 
@@ -161,20 +170,6 @@ def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _lattice(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Homogeneous points (len(y), len(x), 3)."""
     return np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], axis=-1)
-
-
-def _draw_points(seen: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """What the viewer sees at points of the image plane, (len(y), len(x)[, 3]) float32."""
-    points = _lattice(x, y)
-    values = np.zeros((len(y), len(x), *seen[0][1].shape[2:]), dtype=np.float32)
-    nearest = np.zeros((len(y), len(x)))
-    for homography, painting in seen:
-        place, nearness = _hit(homography, points)
-        shown = nearness > nearest
-        if shown.any():
-            nearest[shown] = nearness[shown]
-            values[shown] = _interpolate(painting, place * painting.shape[1::-1] - 0.5)[shown]
-    return values
 
 
 def _hit(homography: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -200,8 +200,17 @@ def refuse_crossing(walls: Sequence[Wall]) -> None:
     edge in the middle of the other.
     """
     for first, second in itertools.combinations(walls, 2):
-        same = bool(first.normal @ second.normal > 0)
-        problem = _crossing(first.outline, second.outline, same)
+        a, b, problem = first.outline, second.outline, ""
+        touch = _TOUCH * max(np.abs(np.diff(corners, axis=0)).max() for corners in (a, b))
+        over, under = (a - b[0]) @ _normal(b), (b - a[0]) @ _normal(a)
+        if first.normal @ second.normal > 0 and max(np.abs(over).max(), np.abs(under).max()) <= touch:
+            problem = "lie on top of each other" if overlap(a, b, touch) else ""
+        elif min(-over.min(), over.max(), -under.min(), under.max()) > touch:
+            # Both planes are cut. On their common line each wall fills an interval.
+            line = np.cross(_normal(a), _normal(b))
+            line /= np.linalg.norm(line)
+            (low, high), (other_low, other_high) = _span(a, over, line), _span(b, under, line)
+            problem = "cut through each other" if min(high, other_high) - max(low, other_low) > touch else ""
         if problem:
             raise InputError(f"walls {first.name!r} and {second.name!r} {problem}; move or shorten one")
 
@@ -216,20 +225,6 @@ def overlap(first: np.ndarray, second: np.ndarray, touch: float) -> bool:
             if min(a.max(), b.max()) - max(a.min(), b.min()) <= touch:
                 return False
     return True
-
-
-def _crossing(first: np.ndarray, second: np.ndarray, same: bool) -> str:
-    touch = _TOUCH * max(np.abs(np.diff(corners, axis=0)).max() for corners in (first, second))
-    over, under = (first - second[0]) @ _normal(second), (second - first[0]) @ _normal(first)
-    if same and max(np.abs(over).max(), np.abs(under).max()) <= touch:
-        return "lie on top of each other" if overlap(first, second, touch) else ""
-    if min(-over.min(), over.max(), -under.min(), under.max()) <= touch:
-        return ""
-    # Both planes are cut. On their common line each wall fills an interval.
-    line = np.cross(_normal(first), _normal(second))
-    line /= np.linalg.norm(line)
-    (low, high), (other_low, other_high) = _span(first, over, line), _span(second, under, line)
-    return "cut through each other" if min(high, other_high) - max(low, other_low) > touch else ""
 
 
 def _normal(corners: np.ndarray) -> np.ndarray:

@@ -136,22 +136,21 @@ def calibrate(
         raise InputError(f"seconds is {seconds!r}; it must hold at least two different exposures")
     checks.number("saturation", saturation, above=0.0, most=1.0)
     codes = np.moveaxis(bracket.codes(MOST), -1, 0)
-    curves = [_fit(_samples(channel), bracket, saturation) for channel in codes]
+    curves = [_fit(channel, bracket, saturation) for channel in codes]
     return Response(np.stack([_tabulate(theta, _TABLE) for theta in curves]))
 
 
-def _samples(codes: np.ndarray) -> np.ndarray:
-    """Codes (K, P) of random pixels that are spread over all levels of brightness."""
+def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
+    """Coefficients of the curve of one channel, from its codes (K, pixels).
+
+    P random pixels count, spread over all levels of brightness.
+    """
     brightness = codes.mean(axis=0)
     low, high = brightness.min(), brightness.max()
     bins = ((brightness - low) * (_BINS / (high - low + 1e-9))).astype(int)
     # Weighted sampling without replacement (Efraimidis and Spirakis 2006), by 1 / size of a pixel's bin.
     keys = np.random.default_rng(0).exponential(size=len(bins)) * np.bincount(bins)[bins]
-    return codes[:, np.argsort(keys)[:_SAMPLES]].astype(np.float64)
-
-
-def _fit(codes: np.ndarray, bracket: Stack, saturation: float) -> np.ndarray:
-    """Coefficients of the curve of one channel, from its codes (K, P)."""
+    codes = codes[:, np.argsort(keys)[:_SAMPLES]].astype(np.float64)
     t, grid = bracket.seconds[:, None], np.linspace(0.0, 1.0, _FINE)
     usable = (codes <= saturation) & (codes > (0.5 / (bracket.levels - 1) if bracket.levels else 0.0))
     seen = int(np.count_nonzero((usable * t).max(axis=0) > np.where(usable, t, np.inf).min(axis=0)))

@@ -66,8 +66,15 @@ def exchange(
         some = np.arange(start, min(start + step, len(patches)))
         met = met + _met(walls, n, patches, some, _places(len(some), k, rays, generator), boxes)
     E = scipy.sparse.diags_array(share / rays) @ met
-    settled = _settle((E + E.T) / 2, share, lost=share - E.sum(axis=1))
-    return scipy.sparse.csr_array(scipy.sparse.diags_array(1 / share) @ settled)
+    E, lost, scale = (E + E.T) / 2, share - E.sum(axis=1), np.ones(beams)
+    for _ in range(_ROUNDS):  # to d E d with d (E d + lost) = share
+        correction = share / (scale * (E @ scale + lost))
+        scale *= np.sqrt(correction)
+        if np.abs(correction - 1).max() < _CLOSE:
+            break
+    # Rows alone are scaled last, to make that exact.
+    rows = scipy.sparse.diags_array(1.0 / (E @ scale + lost))
+    return scipy.sparse.csr_array(rows @ E @ scipy.sparse.diags_array(scale))
 
 
 def _places(patches: int, k: int, rays: int, generator: np.random.Generator) -> np.ndarray:
@@ -102,15 +109,3 @@ def _met(
     got = there * bins + brdf.bins(back, k)
     size = len(patches) * bins
     return scipy.sparse.csr_array((np.ones(len(good)), (sent, got)), shape=(size, size))
-
-
-def _settle(E: Any, share: np.ndarray, lost: np.ndarray) -> Any:
-    """d E d with d (E d + lost) = share; the last step scales rows alone, to make that exact."""
-    scale = np.ones(len(share))
-    for _ in range(_ROUNDS):
-        correction = share / (scale * (E @ scale + lost))
-        scale *= np.sqrt(correction)
-        if np.abs(correction - 1).max() < _CLOSE:
-            break
-    rows = share / (E @ scale + lost)
-    return scipy.sparse.diags_array(rows) @ E @ scipy.sparse.diags_array(scale)
