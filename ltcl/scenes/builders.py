@@ -227,24 +227,17 @@ def _assemble(
     if occluder is None:
         factors = exchange.form_factors(walls, n)
     else:
-        patches = _with_faces(patches, occluder, len(faces), n)
         factors = _past_block(walls, faces, occluder, n, device)
+    if occluder is not None and faces:
+        of_walls = patches.reshape(len(patches), n, len(walls), n)[:, 0, :, 0].T
+        of_block = np.atleast_1d(np.asarray(occluder.albedo, np.float64))
+        channels = max(len(patches), len(of_block))
+        both = (of_walls, len(walls)), (of_block, len(faces))
+        colours = np.concatenate([np.broadcast_to(colour, (count, channels)) for colour, count in both])
+        patches = spread_albedo(colours, len(every), n)
     areas = np.tile(np.repeat([wall.area / n**2 for wall in every], n), n)
     blocks = () if occluder is None else (occluder,)
     return Scene(name, (n, len(every) * n), factors, patches, areas, every, viewer, blocks)
-
-
-def _with_faces(patches: np.ndarray, block: Block, faces: int, n: int) -> np.ndarray:
-    """Albedo of the walls' patches (channels, N), and of the block's faces behind them."""
-    if not faces:
-        return patches
-    own = spread_albedo(np.repeat(np.reshape(block.albedo, (1, -1)), faces, axis=0), faces, n)
-    channels = max(len(patches), len(own))
-    parts = [
-        np.broadcast_to(albedo.reshape(len(albedo), n, -1, n), (channels, n, albedo.shape[1] // n**2, n))
-        for albedo in (patches, own)
-    ]
-    return np.concatenate(parts, axis=2).reshape(channels, -1)
 
 
 def _lit_faces(block: Block) -> tuple[Wall, ...]:
