@@ -92,3 +92,13 @@ def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any
         l_d = way.run()
         assert np.linalg.norm(l_d - truth) <= 1e-2 * np.linalg.norm(truth)
         assert way.error == pytest.approx(np.linalg.norm(l_d - truth) / np.linalg.norm(truth), rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_a_bounce_of_the_corner_is_that_of_the_dihedral(load: Callable[[str], Any], n: int) -> None:
+    A, exact = load("_corner").Bounce(n, 0.5), dihedral(n, albedo=0.5).A
+    for start, stop in ((0, 2 * n * n), (n, n + 1), (1, 2 * n), (0, 0)):
+        np.testing.assert_allclose(A.rows(start, stop), exact[start:stop], rtol=1e-6, atol=1e-9)
+    for shape in ((2 * n * n,), (2 * n * n, 3)):
+        x = np.random.default_rng(n).random(shape, dtype=np.float32)
+        np.testing.assert_allclose(A.matmat(x), exact @ x, rtol=1e-6, atol=1e-6)
