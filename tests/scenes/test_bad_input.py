@@ -52,7 +52,7 @@ CASES: list[tuple[Callable[[], Any], str]] = [
     (lambda: frame(Viewer((1, 1, 3), (1, 1, 0)), [SCREEN]), "straight up or down"),
     (lambda: Wall("flat", (0, 0, 0), (1, 0, 0), (2, 0, 0)), "wall 'flat' .* no area"),
     (lambda: Block((0, 0, 0), (0.1, 0, 0.1)), r"block size is \(0.1, 0.0, 0.1\)"),
-    (lambda: shine(gloss=-0.1), "gloss has the value -0.1"),
+    (lambda: shine(gloss=-0.1), "gloss is -0.1"),
     (lambda: shine(directions=60), "directions is 60; it must be a square number"),
     (lambda: shine(projector=(0, 0.5, 0.5)), "projector is at .*, on the wall 'right'"),
     (lambda: shine(camera=(-1, -1, 0.5)), "camera is at .*, where it faces none of 2 wall"),

@@ -283,19 +283,15 @@ def _room(room: Any, camera: Any) -> tuple[tuple[Wall, ...], str, Viewer]:
 
 
 def _materials(gloss: Any, exponent: Any, walls: int, k: int) -> list[tuple[float, brdf.Lobe]]:
-    """Share and lobe of each wall."""
-    shares, exponents = _per_wall("gloss", gloss, walls), _per_wall("exponent", exponent, walls)
-    outside = shares[(shares < 0) | (shares > 1)]
-    if len(outside):
-        raise InputError(f"gloss has the value {outside[0]:g}; all must be at least 0 and at most 1")
-    lobes = {value: brdf.lobe(value, k) for value in exponents.tolist()}
-    return [(share, lobes[value]) for share, value in zip(shares.tolist(), exponents.tolist(), strict=True)]
-
-
-def _per_wall(name: str, value: Any, walls: int) -> np.ndarray:
-    """One number for each wall, (walls,), of one for all or one for each."""
-    array = checks.finite(name, checks.real(name, value)).astype(np.float64)
-    return np.broadcast_to(checks.shape(name, array, (), (walls,)), (walls,))
+    """Share and lobe of each wall, of one number for all or one for each."""
+    numbers = []
+    for name, value in (("gloss", gloss), ("exponent", exponent)):
+        array = checks.finite(name, checks.real(name, value)).astype(np.float64)
+        numbers.append(np.broadcast_to(checks.shape(name, array, (), (walls,)), (walls,)).tolist())
+    for share in numbers[0]:
+        checks.number("gloss", share, least=0.0, most=1.0)
+    lobes = {value: brdf.lobe(value, k) for value in numbers[1]}
+    return [(share, lobes[value]) for share, value in zip(*numbers, strict=True)]
 
 
 def _form_factors(exchange: Any, area: np.ndarray) -> np.ndarray:
