@@ -30,7 +30,7 @@ _NOISE = ["ltcl/noise", *(f"ltcl/{name}.py" for name in ("uncertainty", "denoisi
 # Lines at most, by the folders and modules that they are of: the Python of the core, and what belongs to it.
 BUDGETS: dict[str, tuple[int, list[str]]] = {
     "device": (900, ["ltcl/device"]),
-    "operators": (2580, ["ltcl/operators"]),
+    "operators": (2570, ["ltcl/operators"]),
     "solvers": (2800, ["ltcl/solvers"]),
     "theory and diagnostics": (1100, ["ltcl/theory", "ltcl/diagnostics.py"]),
     "compression": (1760, ["ltcl/compression"]),
@@ -44,7 +44,7 @@ _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1215, "images": 500, "batch": 500, "cli": 2145, "scenes": 2760}
+_OTHERS = {"acquisition": 6310, "store": 1215, "images": 500, "batch": 500, "cli": 2145, "scenes": 2680}
 _BENCHES = (
     "_boxes _coefficients _corner _harness _peers _ways claims csr dense4k launches products relax "
     "resolution131k solve video walk"

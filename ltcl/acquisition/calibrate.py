@@ -301,6 +301,7 @@ def _response(session: CaptureSession, effort: _Effort, seconds: float, response
         session.hot = _hot_pixels(session.photograph(0 * full, seconds))
     session.sensor = Sensor(response)
     level = _brightness(session.photograph(full, seconds), session.hot)
+    shots.digest.clear()  # of probes; photographs at the exposure of white tell rigs apart
     return nearest(shots.exposures, seconds * _WHITE / max(level, 0.01))
 
 

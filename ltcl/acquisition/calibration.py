@@ -38,7 +38,8 @@ class Calibration:
 
     `exposures` in seconds, ascending; `offset`, the camera's linear value without light; `ambient`, `white`,
     (H, W[, 3]), what a black projector shows and a white one adds; `mixing`, (3, 3), None of one channel;
-    `resampling` to the projector's pixels; `sharpness`, None of an aligned camera.
+    `resampling` to the projector's pixels; `sharpness`, None of an aligned camera; `anchor`, None of older
+    stores.
     """
 
     exposures: tuple[float, ...]
@@ -50,8 +51,8 @@ class Calibration:
     projector: Response
     mixing: np.ndarray | None
     resampling: Resampling
-    sharpness: Sharpness | None
-    anchor: Anchor
+    sharpness: Sharpness | None = None
+    anchor: Anchor | None = None
 
     @property
     def light(self) -> np.ndarray:
@@ -65,7 +66,7 @@ class Calibration:
         names = [name.removeprefix(PREFIX) for name in scan.extras if name.startswith(PREFIX)]
         if not names:
             raise FileError(f"{scan.path}: holds no calibration; ltcl.acquire writes one")
-        if not {"resampling.doubtful", "anchor.pixels"} <= {*names}:
+        if "resampling.doubtful" not in names:
             raise FileError(f"{scan.path}: its calibration is of an earlier ltcl; it must be acquired again")
         arrays = {name: np.array(scan.extra(PREFIX + name)) for name in names}
 
@@ -73,6 +74,9 @@ class Calibration:
             return {k.removeprefix(prefix): array for k, array in arrays.items() if k.startswith(prefix)}
 
         R, ambient, white, anchor = map(group, ("resampling.", "ambient.", "white.", "anchor."))
+        anchor.pop("shift", None)  # of earlier versions
+        for light in (ambient, white):  # of earlier versions: 0 where it is not valid
+            light["variance"] = np.where(light["valid"], light["variance"], np.float32(np.inf))
         (h, w), (H, W) = R["coverage"].shape, R["camera_grid"].tolist()
         weights = scipy.sparse.csr_array((R["data"], R["indices"], R["indptr"]), shape=(h * w, H * W))
         *sensor, levels = arrays["noise"].tolist()
@@ -88,7 +92,7 @@ class Calibration:
             arrays.get("mixing"),
             Resampling(weights, R["coverage"], (h, w), (H, W), R["doubtful"]),
             Sharpness((y, x), width) if "sharpness" in arrays else None,
-            Anchor(**anchor),
+            Anchor(**anchor) if anchor else None,
         )
 
     def write(self, store: BlockStore) -> None:
@@ -110,7 +114,8 @@ class Calibration:
         if self.mixing is not None:
             arrays["mixing"] = self.mixing
         for group in ("ambient", "white", "anchor"):
-            arrays |= {f"{group}.{field}": array for field, array in vars(getattr(self, group)).items()}
+            if (record := getattr(self, group)) is not None:
+                arrays |= {f"{group}.{field}": array for field, array in vars(record).items()}
         for name, array in arrays.items():
             store.extra(PREFIX + name, array)
 

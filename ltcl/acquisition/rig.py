@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 import scipy.sparse
 
@@ -23,6 +24,7 @@ from ltcl.errors import AcquisitionError, InputError, InputTypeError, LtclError
 
 SHORTEST, LONGEST = 1e-4, 30.0  # seconds that a rig without `exposures` must be able to expose for
 _SAME = 1e-3  # relative difference of exposures that no camera distinguishes
+_CELLS = 8  # along a side of the digest of a photograph
 _Kind = tuple[tuple[int, ...], np.dtype]  # shape and type of a photograph
 
 
@@ -70,7 +72,8 @@ class Shots(Closing):
 
     InputTypeError for a rig that lacks a member, InputError where one cannot be used. `exposures` are None
     for any from 1e-4 to 30 s; `count` is of the photographs, `image` the last as the rig gave it. After the
-    first there are `camera_grid` and `levels` (256 of 8 bits, None of floats).
+    first there are `camera_grid`, `levels` (256 of 8 bits, None of floats), and `digest`: of the first under
+    "black" and "white" the seconds, and means over 8 x 8 cells.
 
     Examples
     --------
@@ -92,6 +95,7 @@ class Shots(Closing):
         self.camera_grid: tuple[int, int] | None = None
         self.levels: int | None = None
         self.expected: tuple[Any, Any] | None = None  # these two, of the scan that is resumed
+        self.digest: dict[str, dict[str, Any]] = {}
         self._first: _Kind | None = None
         try:
             json.dumps(self.describe(), allow_nan=False)
@@ -138,6 +142,11 @@ class Shots(Closing):
             expected = f"{text.format(*self.expected)}, as the scan was begun with, or another store"
             raise InputError(f"{name} has {text.format(*sizes)}; it must have {expected}")
         self.count += 1
+        for view, code in (("black", 0.0), ("white", 1.0)):
+            if view not in self.digest and np.all(codes == code):
+                size = min(_CELLS, image.shape[1]), min(_CELLS, image.shape[0])
+                cells = cv2.resize(scaled, size, interpolation=cv2.INTER_AREA)
+                self.digest[view] = {"seconds": seconds, "cells": cells.astype(float).round(5).tolist()}
         return scaled
 
     def describe(self) -> dict[str, Any]:
@@ -145,7 +154,7 @@ class Shots(Closing):
         rig = getattr(self.rig, "describe", lambda: {"kind": type(self.rig).__name__})()
         facts = {"rig": rig, "projector_grid": self.grid, "channels": self.channels}
         facts |= {"camera_grid": self.camera_grid, "levels": self.levels}
-        return facts | {"photographs": self.count}
+        return facts | {"digest": self.digest, "photographs": self.count}
 
     def close(self) -> None:
         """Close the rig, where it can be closed."""

@@ -38,6 +38,7 @@ from ltcl.transport import Transport
 
 logger = logging.getLogger(__name__)
 _REFUSED = 0.3  # of white: relative deviation of row sums
+_SAME_VIEW = 0.03  # of full scale, mean over the cells of a digest: lamps and exposures vary less
 
 
 @dataclass(frozen=True)
@@ -243,7 +244,7 @@ def _open(path: Path, resume: bool) -> BlockStore | None:
 
 
 def _check_begun(store: BlockStore, shots: Shots, settings: Settings) -> None:
-    """Refuse to go on with another rig, as far as it describes itself, or other settings."""
+    """Refuse to go on with another rig or other settings; without `describe()` black and white are shown."""
     facts, path, described = store.attributes, store.path, store.provenance["acquisition"]
     before = facts.get("settings")
     if facts["strategy"] not in plan.STRATEGIES or not isinstance(before, dict):
@@ -256,6 +257,14 @@ def _check_begun(store: BlockStore, shots: Shots, settings: Settings) -> None:
     check_same_rig(described["rig"], shots, path)
     if described.get("camera_grid"):  # which the first photograph shows
         shots.expected = tuple(described["camera_grid"]), described["levels"]
+    if hasattr(shots.rig, "describe") or store.final:
+        return
+    for name, digest in described.get("digest", {}).items():
+        shots.photograph(np.full(shots.grid, float(name == "white")), digest["seconds"])
+        difference = np.mean(np.abs(np.subtract(shots.digest[name]["cells"], digest["cells"])))
+        if difference > _SAME_VIEW:
+            text = f"{name} differs by {difference:.1%} of full scale from that of {path}"
+            raise InputError(f"{text}; rig and scene must be the same")
 
 
 def _calibrate(path: Path, shots: Shots, settings: Settings, log: Any, progress: Progress) -> BlockStore:

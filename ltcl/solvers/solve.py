@@ -273,8 +273,8 @@ def _validate(
     if isinstance(chosen, MonteCarlo):
         chosen.check(n)
     rule = Rule(rtol, atol / unit if atol else 0.0, maxiter, callback)
-    required = np.inf  # where all columns are dark
-    if np.any(b):
+    required = rtol if np.any(b) else np.inf  # where all columns are dark
+    if np.any(b) and atol:
         norms = np.atleast_1d(np.linalg.norm(b.astype(np.float64), axis=0))
         lit = norms > 0.0
         required = float(np.min(rule.target(norms)[lit] / norms[lit], initial=np.inf))

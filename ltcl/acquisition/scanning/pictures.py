@@ -228,7 +228,7 @@ class Pictures(Seen):
         It names the photographs of the batch (with `anchor.compact` images) that show it first, or just not.
         """
         known, (image,), (seconds,) = self.calibration, blocks.images, blocks.seconds
-        if known.anchor.deviation(image, seconds, self._sensor) is None:
+        if known.anchor is None or known.anchor.deviation(image, seconds, self._sensor) is None:
             return
         shots = [*shots, blocks._replace(images=[anchor.compact(self._merge(blocks))])]
         *shifts, moved = (
