@@ -35,6 +35,13 @@ _TIERS = ((20.0, 3), (7.0, 4), (4.0, 5), (3.0, 6), (2.0, 8))
 _TOUCHING, _APART = 40, 16  # points on each piece of an edge: nearer than all tiers, and farther
 _FLAT = 1e-12  # of the patches' size: heights above a plane that are rounding errors
 _SLAB = 4096  # pairs of patches at a time, so that temporary arrays stay in the cache
+_TURNS = {  # where (down, right) of a picture lie after quarter turns, and mirrored: order and signs
+    (turn, mirror): (order[::step], sign[::step])
+    for turn, (order, sign) in enumerate(
+        (((0, 1), (1, 1)), ((1, 0), (1, -1)), ((0, 1), (-1, -1)), ((1, 0), (-1, 1)))
+    )
+    for mirror, step in ((False, 1), (True, -1))
+}
 _AROUND = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2  # corners of a patch, in edges (down, right)
 
 
@@ -57,10 +64,37 @@ def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
 def fill(matrix: np.ndarray, walls: Sequence[Wall], pairs: Iterable[tuple[int, int]]) -> None:
     """Write the form factors between pairs of walls, both ways, in a matrix (n, walls, n, n, walls, n)."""
     n = len(matrix)
+    known: dict[bytes, np.ndarray] = {}
     for i, j in pairs:
-        both = of_walls(walls[i], walls[j], n)
+        key, turn, other_turn, mirror = _congruent(walls[i], walls[j])
+        axes = (1, 0, 3, 2) if mirror else (0, 1, 2, 3)
+        if key not in known:
+            both = np.rot90(of_walls(walls[i], walls[j], n), -turn, axes=(0, 1))
+            known[key] = np.rot90(both, -other_turn, axes=(2, 3)).transpose(axes)
+        both = np.rot90(np.rot90(known[key].transpose(axes), turn, axes=(0, 1)), other_turn, axes=(2, 3))
         matrix[:, i, :, :, j, :] = both * (n**2 / walls[i].area)
         matrix[:, j, :, :, i, :] = both.transpose(2, 3, 0, 1) * (n**2 / walls[j].area)
+
+
+def _congruent(first: Wall, second: Wall) -> tuple[bytes, int, int, bool]:
+    """What congruent pairs of walls have in common, and the turns of their pictures that make it so.
+
+    That is the lengths and angles of edges (down, right), normals, and the way from middle to middle, of all
+    quarter turns of both pictures the first in order. Mirror images have rows for columns.
+    """
+    edges = [np.array([wall.down, wall.right], np.float64) for wall in (first, second)]
+    offset = np.subtract(second.corner, first.corner) + (edges[1].sum(axis=0) - edges[0].sum(axis=0)) / 2
+    vectors = np.array([*edges[0], first.normal, *edges[1], second.normal, offset])
+    vectors[[0, 1, 3, 4, 6]] /= np.linalg.norm(edges[0][0])
+    gram = (vectors @ vectors.T).round(9)
+    keys = []
+    for turn, other_turn, mirror in itertools.product(range(4), range(4), (False, True)):
+        (order, sign), (other_order, other_sign) = _TURNS[turn, mirror], _TURNS[other_turn, mirror]
+        places = [*order, 2, *(3 + k for k in other_order), 5, 6]
+        signs = np.array([*sign, 1, *other_sign, 1, 1])
+        turned = gram[np.ix_(places, places)] * np.outer(signs, signs) + 0.0  # no -0
+        keys.append((turned.tobytes(), turn, other_turn, mirror))
+    return min(keys)
 
 
 def of_walls(first: Wall, second: Wall, n: int) -> np.ndarray:
