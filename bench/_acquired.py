@@ -5,15 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 import _figures as figures
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _NAMES = {"adaptive": "adaptive", "hadamard": "S-matrices", "pixel": "one at a time"}
 _COLOURS = {"adaptive": "#c0392b", "hadamard": "#2a7f9e", "pixel": "#e0b34c"}

@@ -227,7 +227,6 @@ def of_cost(costs: list[Cost], largest: int) -> list[Claim]:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     sides = [8, 16] if given.smoke else [16, 24, 32, 48, 64]
     run = partial(measured, device=given.device)

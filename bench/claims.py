@@ -118,7 +118,6 @@ def untrue(device: Device, random: Random, tally: Counter[str]) -> str | None:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     random, tally, total = np.random.default_rng(0), Counter[str](), SOLVES[given.smoke]
     with warnings.catch_warnings():

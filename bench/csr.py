@@ -76,7 +76,6 @@ def compare(given: Options, name: str, A: Any) -> list[Row]:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     n, per_row = (2048, 32) if given.smoke else (131072, 256)
     rows = []

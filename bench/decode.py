@@ -92,7 +92,6 @@ def facts(found: Correspondence, whole: Correspondence, peer: Peer, truth: tuple
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     grid, camera = ((48, 64), (60, 80)) if given.smoke else ((768, 1024), (1024, 1280))
     truth = scene(grid, camera)

@@ -20,7 +20,6 @@ from ltcl.operators import Dense
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     scene = ltcl.scenes.box(6 if given.smoke else 32, sides=4, albedo=0.45)
     T = scene.transport(device=given.device)

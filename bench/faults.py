@@ -253,7 +253,6 @@ def opened(device: str | None) -> Device:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     faults, clean = (1, 2) if given.smoke else (FAULTS, CLEAN)
     jobs = [(k, KINDS if k < faults else (), None) for k in range(clean)]

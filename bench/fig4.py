@@ -11,9 +11,9 @@ in cyan and magenta; the bleeding cancels; n terms remove the bounces up to n; t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -23,9 +23,6 @@ from _harness import options
 from ltcl.plots.page import FAINT, INK, axes_at, label_at
 from ltcl.scenes import Scene
 from ltcl.theory import bounce_coefficients
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TERMS, SHOWN, ORDERS, BOUNCES = 30, (0, 1, 2, 3, 8), 5, 8
 
@@ -201,7 +198,6 @@ def draw_contents(figure: Figure) -> None:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     scene, l_d = boxes.coloured_box(4 if given.smoke else 16)
     T = scene.transport(first_bounce=scene.first_bounce, device=given.device)

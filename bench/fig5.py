@@ -12,9 +12,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -26,10 +27,6 @@ from ltcl.plots.page import FAINT, INK
 from ltcl.scenes import box
 from ltcl.solvers import matrix_series
 from ltcl.theory import inverse_error_bound
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 BELOW_HALF, ORDERS = (0.2, 0.3, 0.4, 0.45), 10
 ALBEDOS, SIDES, OPEN_ALBEDO = (0.2, 0.3, 0.4, 0.45, 0.49, 0.51), (6, 5, 4, 3, 2, 1), 0.62
@@ -236,7 +233,6 @@ def draw_races(axes: Axes, races: Mapping[float, Race]) -> None:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     found = measure(given.smoke, given.device)
     claims = series_claims(found) + race_claims(found)

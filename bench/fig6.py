@@ -14,10 +14,11 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse.linalg
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -27,9 +28,6 @@ from _figures import Claim
 from _harness import options
 from ltcl.plots.page import FAINT
 from ltcl.scenes import Block, Scene, box, glossy
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SHADED, BLOCK = 1.15 * np.array(ALBEDO[:5]), Block((0.3, 0.42, 0), (0.28, 0.28, 0.5), albedo=(0.5, 0.5, 0.5))
 LAMP = (0.85, 0.75, 0.8)
@@ -221,7 +219,6 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     shade = with_shadows(4 if given.smoke else 14, given.device)
     gloss = with_gloss(4 if given.smoke else 12, given.smoke)

@@ -20,9 +20,10 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import _figures as figures
 from _figures import Claim
@@ -43,9 +44,6 @@ from _ways import (
     problem,
 )
 from ltcl import checks
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SIZES, SMOKE = (8, 12, 16, 22, 32, 46, 64, 90, 128, 182, 256), (2, 4, 8)  # patches along a wall, N = 2 n^2
 SERIES, DENSE, SQUARES = 4232, 32768, 4  # the largest N; arrays of N x N float32 on the way
@@ -252,7 +250,6 @@ def said(spent: float) -> str:
 
 
 def main() -> None:
-    """Run it."""
     given = options(__doc__ or "")
     points = [p for n in (SMOKE if given.smoke else SIZES) for p in measure(given, n)]
     laws = {} if given.smoke else {name: law(*curve(points, name)) for name in METHODS if name != "peer"}

@@ -9,10 +9,11 @@ every step, where the paper's score where they end (eq. 26). Errors are those ag
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.stats
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -21,15 +22,9 @@ from _figures import Claim
 from _harness import options
 from ltcl.scenes import Scene, box
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 ALBEDO, LAMP, FEW, MANY = 0.4, (0.85, 0.75, 0.8), 30, 1000
 COUNTS, SEEDS = np.array([8, 16, 32, 64, 128, 256, 512]), 3
-KINDS: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "final gather": {"gather": True},
-}
+KINDS: dict[str, dict[str, Any]] = {"plain": {}, "final gather": {"gather": True}}
 
 
 @dataclass(frozen=True)
@@ -128,7 +123,6 @@ def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     found = prepare(6 if given.smoke else 32, given.device)
     errors = {kind: found.errors(kind) for kind in KINDS}

@@ -11,9 +11,9 @@ The paper's timing, 0.09 s against 4.6 s of dense inversion at 4K x 4K, is measu
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -22,9 +22,6 @@ from _figures import Claim
 from _harness import options
 from ltcl.scenes import Scene, dihedral, glossy
 from ltcl.scenes.walls import Wall
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 WHITE, GREEN = (0.85, 0.8, 0.75), (0.25, 1.0, 0.35)
 BOARD = Wall(
@@ -173,7 +170,6 @@ def draw(plain: Parts, board: Parts) -> Figure:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     plain = diffuse(6 if given.smoke else 24, given.device)
     board = with_board(5 if given.smoke else 14, given.smoke, given.device)

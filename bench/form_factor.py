@@ -81,7 +81,6 @@ def actions(
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     n = 12 if given.smoke else 148
     patches = cut(box(1).walls, n)

@@ -20,9 +20,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import _board as board
 import _figures as figures
@@ -32,10 +34,6 @@ from _harness import Options, options
 from acquire import corner, held
 from ltcl.acquisition import VirtualRig, acquire, camera_map
 from ltcl.images import to_srgb
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 N = 16
 SIZES, CLAIMED = (1.5, 2.0, 3.0, 4.0), (3.0, 4.0)
@@ -255,7 +253,6 @@ def _pictures(figure: Figure, loop: rendered.Loop) -> None:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     found, cameras, loop = virtual(given), placed(given), None
     if importlib.util.find_spec("mitsuba") is not None:

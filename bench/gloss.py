@@ -14,9 +14,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
@@ -25,10 +27,6 @@ from _harness import Options, options
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
 from ltcl.separation import LARGEST_NEGATIVE
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 ALBEDO, PROJECTOR = 0.5, (2.4, 1.2, 1.2)
 ROOMS = {"both walls": (1.0, 1.0), "unlit wall": (0.0, 1.0)}  # share of the gloss on each wall
@@ -249,7 +247,6 @@ def _curves(axes: Axes, found: Sequence[Case], value: Callable[[Case], float], *
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # the warning is among what is measured
     found = cases(given)

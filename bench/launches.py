@@ -141,7 +141,6 @@ def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int)
 
 
 def main() -> None:
-    """Count and print."""
     given = options(__doc__ or "")
     rows = [
         row(given.device, kind, make, method, k)

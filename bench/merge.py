@@ -115,7 +115,6 @@ def responses(n: int) -> list[Row]:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     rows = speeds(given, 64 if given.smoke else 1200) + responses(64 if given.smoke else 400)
     report(given, "Merging exposures", rows, {"exposures": len(SECONDS), "opencv": cv2.__version__})

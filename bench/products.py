@@ -14,9 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import _figures as figures
 from _coefficients import ROWS, analysis, largest, note, relative
@@ -28,10 +30,6 @@ from ltcl.compression.sources import source
 from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_to_support
 from ltcl.plots.page import INK
 from ltcl.scenes import landscape
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 ALBEDO, ERROR = 0.8, 0.01
 ERRORS = (0.1, 0.03, ERROR, 0.003)
@@ -216,7 +214,6 @@ def across(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> No
 
 
 def main() -> None:
-    """Run it."""
     given = options(__doc__ or "")
     at, (memory, nbytes) = problem(given.smoke), triad(given.device, given.smoke)
     found, points, ms = forms(given, at), list[Point](), dict[str, float]()

@@ -64,7 +64,6 @@ def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     n, per_row, dense = (2048, 32, 256) if given.smoke else (131072, 256, 4096)
     pyamg = importlib.util.find_spec("pyamg")  # the extra `bench` brings it

@@ -20,9 +20,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
@@ -36,9 +37,6 @@ from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
 from ltcl.scenes import CornerRows, dihedral, landscape
 from ltcl.scenes.viewer import draw as draw_view
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 ALBEDO, REFERENCE = (0.8, 0.65, 0.5), 0.5
 THRESHOLD, RTOL = 2e-5, 5e-4  # of numbers of A; of solutions with R
@@ -210,7 +208,6 @@ def draw(found: Pictures) -> Figure:
 
 
 def main() -> None:
-    """Run it."""
     given = options(__doc__ or "")
     corner = Corner(CornerRows(8 if given.smoke else 256, REFERENCE))
     built = build(given, corner)

@@ -131,7 +131,6 @@ def divergent(given: Options, facts: dict[str, Any]) -> Row:
 
 
 def main() -> None:
-    """Run the bench."""
     given, facts = options(__doc__ or ""), {}
     dense, large = box(given, 0.8), sparse(given, 0.8)
     rows = compare(dense, facts) + compare(large, facts)

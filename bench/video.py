@@ -82,7 +82,6 @@ def actions(T: ltcl.Transport, inverse: ltcl.Inverse, folder: Path) -> dict[str,
 
 
 def main() -> None:
-    """Run it."""
     given = options(__doc__ or "")
     grid, coarse = ((16, 32), (4, 8)) if given.smoke else ((256, 512), (32, 64))
     T = transport(given, grid, coarse)

@@ -102,7 +102,6 @@ def check(name: str, found: np.ndarray, exact: np.ndarray, samples: int) -> None
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
     R, b = signed(n, per_row), np.random.default_rng(2).random(n, dtype=np.float32)
