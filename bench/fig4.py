@@ -11,6 +11,7 @@ in cyan and magenta; the bleeding cancels; n terms remove the bounces up to n; t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -83,48 +84,27 @@ def claims(found: Series) -> list[Claim]:
     """What the paper says of the figure."""
     alternate = (-1.0) ** np.arange(11)
     right = np.mean(np.sign(found.terms[:11]) == alternate[:, None, None])
-    red, green = bleeding(found.scene, found.terms[:11])
     before, after = cast(found.scene, found.sums[0]), cast(found.scene, found.sums[-1])
     off, errors = bounce_error(found), found.errors
     absent = not any(contents(n, n)[1:].any() for n in range(1, ORDERS + 1))
     closer = int(np.argmin(np.diff(errors[:21]) < 0)) or 20
+    listed = [Claim("terms alternate in sign", f"in {right:.0%} of values of 11 terms", "100%", right == 1)]
+    names = (("red", "cyan", "green"), ("green", "magenta", "red"))
+    for (own, opposite, other), excess in zip(names, bleeding(found.scene, found.terms[:11]), strict=True):
+        text = f"the picture bleeds {own}; odd terms turn it to {opposite}, even ones to {own}"
+        shown = " ".join(f"{value:+.0%}" for value in excess[:4])
+        measured = f"beside the {own} wall, {own} over {other} and blue: {shown} ..."
+        listed.append(Claim(text, measured, "+ - + - ...", (excess * alternate > 0).all()))
+    colour = f"colour cast of neutral walls {before:.0%}, after {TERMS} terms {after:.1g}"
+    bounces = f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}"
+    error = f"error {errors[0]:.2g}, after {TERMS} terms {errors[-1]:.1g}; each of the first {closer} closer"
+    removed, converges = absent and off < 1e-5, errors[-1] < 1e-3 and closer == 20
     return [
-        Claim("terms alternate in sign", f"in {right:.0%} of values of 11 terms", "100%", bool(right == 1)),
-        Claim(
-            "the picture bleeds red; odd terms turn it to cyan, even ones to red",
-            "beside the red wall, red over green and blue: " + _percent(red),
-            "+ - + - ...",
-            bool((red * alternate > 0).all()),
-        ),
-        Claim(
-            "the picture bleeds green; odd terms turn it to magenta, even ones to green",
-            "beside the green wall, green over red and blue: " + _percent(green),
-            "+ - + - ...",
-            bool((green * alternate > 0).all()),
-        ),
-        Claim(
-            "in the end no colour bleeds",
-            f"colour cast of neutral walls {before:.0%}, after {TERMS} terms {after:.1g}",
-            "below 1e-3",
-            after < 1e-3 < before,
-        ),
-        Claim(
-            "n terms remove the bounces 1 .. n (eq. 12, 13)",
-            f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}",
-            "0; below 1e-5",
-            absent and off < 1e-5,
-        ),
-        Claim(
-            "the series converges to the direct light",
-            f"error {errors[0]:.2g}, after {TERMS} terms {errors[-1]:.1g}; each of the first {closer} closer",
-            "below 1e-3; 20",
-            bool(errors[-1] < 1e-3 and closer == 20),
-        ),
+        *listed,
+        Claim("in the end no colour bleeds", colour, "below 1e-3", after < 1e-3 < before),
+        Claim("n terms remove the bounces 1 .. n (eq. 12, 13)", bounces, "0; below 1e-5", removed),
+        Claim("the series converges to the direct light", error, "below 1e-3; 20", converges),
     ]
-
-
-def _percent(values: np.ndarray) -> str:
-    return " ".join(f"{value:+.0%}" for value in values[:4]) + " ..."
 
 
 def draw(found: Series) -> Figure:
@@ -135,34 +115,28 @@ def draw(found: Series) -> Figure:
         "A closed box, seen through its front wall. Above: the picture and n terms of the series, which",
         "swings around the direct light until it settles there. Below: the terms alone; neutral grey is 0.",
     )
-    scene = found.scene
-    lefts, width = figures.columns(len(SHOWN) + 1)
-    gain = 0.9 / np.quantile(found.sums[0], 0.999)
-    for left, n in zip(lefts, SHOWN, strict=False):
-        label = _after(n) if n else r"picture $l_{out}$"
+    scene, gain, sums, terms = found.scene, 0.9 / np.quantile(found.sums[0], 0.999), [], []
+    for n in SHOWN:
         image = figures.light(scene, scene.picture(found.sums[n]), gain)
-        figures.picture(figure, (left, 130, width), image, label, f"error {found.errors[n]:.2g}")
+        sums.append((image, _after(n) if n else r"picture $l_{out}$", f"error {found.errors[n]:.2g}"))
         scale = 1 / np.quantile(np.abs(found.terms[n]), 0.999)
         power = rf"{'-+'[n % 2 == 0]}R^{n}\,l_{{out}}" if n > 1 else r"-R\,l_{out}" if n else "l_{out}"
         image = figures.signed(scene, scene.picture(found.terms[n]), scale)
-        figures.picture(figure, (left, 340, width), image, f"${power}$", f"shown \u00d7 {scale:.2g}")
+        terms.append((image, f"${power}$", f"shown \u00d7 {scale:.2g}"))
     image = figures.light(scene, scene.picture(found.l_d), gain)
-    figures.picture(figure, (lefts[-1], 130, width), image, r"direct light $l_d$", "the truth")
+    figures.pictures(figure, 130, [*sums, (image, r"direct light $l_d$", "the truth")])
+    lefts, width = figures.columns(len(SHOWN) + 1)
+    for left, shown in zip(lefts, terms, strict=False):
+        figures.picture(figure, (left, 340, width), *shown)
     note = "Even terms are light\nthat bled: red, green.\nOdd ones take light\naway: cyan, magenta."
     label_at(figure, lefts[-1], 350, note, size=10, color=FAINT, linespacing=1.5)
     draw_contents(figure)
-    axes = figures.graph(
-        figure, (640, 580, 330, 220), "Error of the sum, each colour", "terms n", "relative error"
-    )
+    box = (640, 580, 330, 220)
+    axes = figures.graph(figure, box, "Error of the sum, each colour", "terms n", "relative error")
     for name, colour, channel in (("green", "#8bd17c", 1), ("red", "#ff5d5d", 0), ("blue", "#5c9cff", 2)):
         off = np.linalg.norm(found.sums[:, channel] - found.l_d[channel], axis=1)
-        axes.plot(
-            off / np.linalg.norm(found.l_d[channel]),
-            color=colour,
-            lw=2,
-            label=name,
-            ls="--" if channel == 0 else "-",
-        )
+        look: Any = {"color": colour, "lw": 2, "ls": "-" if channel else "--"}
+        axes.plot(off / np.linalg.norm(found.l_d[channel]), label=name, **look)
     axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
     axes.set_xlim(0, TERMS)
     return figure
@@ -175,21 +149,12 @@ def _after(n: int) -> str:
 def draw_contents(figure: Figure) -> None:
     """The table of `contents`: which bounces n terms leave."""
     table = np.array([contents(n, BOUNCES) for n in range(ORDERS + 1)])
-    axes = axes_at(figure, (130, 580, 430, 220))
-    label_at(
-        figure,
-        30,
-        572,
-        "How often each bounce of light is in the sum",
-        size=11,
-        fontweight="bold",
-        va="bottom",
-    )
+    axes, bold = axes_at(figure, (130, 580, 430, 220)), {"fontweight": "bold", "va": "bottom"}
+    label_at(figure, 30, 572, "How often each bounce of light is in the sum", size=11, **bold)
     axes.imshow(np.arcsinh(table), cmap="RdBu_r", vmin=-6, vmax=6, aspect="auto")
     for (n, j), value in np.ndenumerate(table):
-        axes.text(
-            j, n, str(value), ha="center", va="center", fontsize=10, color="#15171b" if value else "#b9bdc4"
-        )
+        colour = "#15171b" if value else "#b9bdc4"
+        axes.text(j, n, str(value), ha="center", va="center", fontsize=10, color=colour)
     axes.set_xticks(range(BOUNCES + 1), ["direct", *map(str, range(1, BOUNCES + 1))], color=INK, fontsize=9.5)
     names = ["picture", *map(_after, range(1, ORDERS + 1))]
     axes.set_yticks(range(ORDERS + 1), names, color=INK, fontsize=9.5)

@@ -69,95 +69,74 @@ class Found:
         return [*self.closed.values(), *self.opened.values(), self.below]
 
 
-def measure(smoke: bool, device: ltcl.Device) -> Found:
-    """Run everything."""
-    n = 4 if smoke else 16
-    return Found(
-        swings(n, device),
-        {m: norms(n // 2, m, device) for m in BELOW_HALF},
-        {m: race(f"closed, albedo {m}", n, 6, m, device) for m in ALBEDOS},
-        {
-            sides: race(f"{sides} side(s), albedo {OPEN_ALBEDO}", n, sides, OPEN_ALBEDO, device)
-            for sides in SIDES
-        },
-        race("5 sides, albedo 0.6", n, 5, 0.6, device),
-    )
+def measure(n: int, device: ltcl.Device) -> Found:
+    closed = {m: race(f"closed, albedo {m}", n, 6, m, device) for m in ALBEDOS}
+    name = f"side(s), albedo {OPEN_ALBEDO}"
+    opened = {sides: race(f"{sides} {name}", n, sides, OPEN_ALBEDO, device) for sides in SIDES}
+    below, of_series = race("5 sides, albedo 0.6", n, 5, 0.6, device), swings(n, device)
+    return Found(of_series, {m: norms(n // 2, m, device) for m in BELOW_HALF}, closed, opened, below)
 
 
-def series_claims(found: Found) -> list[Claim]:
-    """(a) and (b)."""
+def claims(found: Found) -> list[Claim]:
+    """(a) to (d)."""
     signs = np.array([np.sign(swing[:9] - 1) for swing in found.swings.values()])
     left = {name: abs(swing[8] - 1) / abs(swing[4] - 1) for name, swing in found.swings.items()}
-    ratios = {m: norm / BOUNDS[m] for m, norm in found.norms.items()}
-    worst = max(
-        float(ratio.max(where=norm > ROUNDING, initial=0))
-        for ratio, norm in zip(ratios.values(), found.norms.values(), strict=True)
+    is_alike = (signs == (-1.0) ** np.arange(9)).all() and max(left.values()) < 1.1 * min(left.values())
+    parts = ", ".join(f"{part:.2f} ({name})" for name, part in left.items())
+    large = {m: norm > ROUNDING for m, norm in found.norms.items()}
+    ratios = {m: (norm / BOUNDS[m])[large[m]] for m, norm in found.norms.items()}
+    worst = max(float(ratio.max(initial=0)) for ratio in ratios.values())
+    off = max(np.abs(ratio / (1 - 2 * m) - 1).max(initial=0) for m, ratio in ratios.items())
+    closed, opened, below = found.closed, found.opened, found.below
+    late = max(abs(r.steps() - math.log(RTOL) / math.log(r.rho)) for m, r in closed.items() if m < 0.5)
+    fewer = [opened[sides].steps() for sides in SIDES[2:]]
+    falls = fewer == sorted(set(fewer), reverse=True) and fewer[0] <= 20
+    most, error = max(r.chebyshev.products for r in found.races), max(r.error for r in found.races)
+    converged = all(r.chebyshev.converged for r in found.races) and error < 1e-4
+    shared = "light that all walls share shrinks by m / (1 - m) = 0.82 an iteration: 1 % takes 23"
+    limit = (
+        "its form factors have the eigenvalue 0.82, not the 4/5 of one patch a wall: the limit is albedo "
+        "0.61, and at 0.62 it diverges very slowly"
     )
-    off = max(
-        np.abs(ratio / (1 - 2 * m) - 1).max(where=found.norms[m] > ROUNDING, initial=0)
-        for m, ratio in ratios.items()
-    )
+
+    def slow(text: str, race: Race, name: str = "", differs: str = "") -> Claim:
+        return Claim(text, name + race.said, "over 50", 50 < race.steps() < math.inf, differs)
+
     return [
         Claim(
             "(a) alike at a corner, an edge and the centre: above, below, above ...",
-            "4 terms more leave " + ", ".join(f"{part:.2f} ({name})" for name, part in left.items()),
+            f"4 terms more leave {parts}",
             "signs alternate; within 10 %",
-            bool((signs == (-1.0) ** np.arange(9)).all() and max(left.values()) < 1.1 * min(left.values())),
+            is_alike,
         ),
         Claim("(b) the error stays below eq. 16", f"at most {worst:.3f} of the bound", "1", worst <= 1),
         Claim(
             "(b) it follows eq. 16 up to a constant", f"1 - 2m for all n, to {off:.1g}", "0.01", off < 0.01
         ),
-    ]
-
-
-def race_claims(found: Found) -> list[Claim]:
-    """(c) and (d)."""
-    closed, opened, below = found.closed, found.opened, found.below
-    late = max(abs(r.steps() - math.log(RTOL) / math.log(r.rho)) for m, r in closed.items() if m < 0.5)
-    fewer = [opened[sides].steps() for sides in SIDES[2:]]
-    most = max(r.chebyshev.products for r in found.races)
-    error = max(r.error for r in found.races)
-    all_converged = all(r.chebyshev.converged for r in found.races)
-    return [
         Claim(
             "(c) albedo 0.45 converges in a few iterations",
             closed[0.45].said,
             "1 % in at most 10",
             closed[0.45].steps() <= 10,
-            "light that all walls share shrinks by m / (1 - m) = 0.82 an iteration: 1 % takes 23",
+            shared,
         ),
         Claim("(c) the rate is m / (1 - m)", f"1 % at most {late:.1f} iterations off it", "1", late <= 1),
-        Claim(
-            "(c) near 0.5 slowly",
-            f"0.49: {closed[0.49].said}",
-            "over 50",
-            50 < closed[0.49].steps() < math.inf,
-        ),
+        slow("(c) near 0.5 slowly", closed[0.49], "0.49: "),
         Claim("(c) 0.51 diverges", closed[0.51].said, "diverges", closed[0.51].diverged),
         Claim("(d) 6 sides diverge", opened[6].said, "diverges", opened[6].diverged),
-        Claim(
-            "(d) 5 sides converge very slowly",
-            opened[5].said,
-            "over 50",
-            50 < opened[5].steps() < math.inf,
-            "its form factors have the eigenvalue 0.82, not the 4/5 of one patch a wall: the limit is albedo "
-            "0.61, and at 0.62 it diverges very slowly",
-        ),
-        Claim(
-            "(d) so they do below that limit", f"0.60: {below.said}", "over 50", 50 < below.steps() < math.inf
-        ),
+        slow("(d) 5 sides converge very slowly", opened[5], differs=limit),
+        slow("(d) so they do below that limit", below, "0.60: "),
         Claim(
             "(d) fewer sides converge fast, the faster the fewer",
             f"4, 3, 2, 1 sides: 1 % in {', '.join(map(str, fewer))}",
             "falling, at most 20",
-            fewer == sorted(set(fewer), reverse=True) and fewer[0] <= 20,
+            falls,
         ),
         Claim(
             "ours: Chebyshev converges in all of them",
             f"to 1e-5 in at most {most} products, {error:.1g} off the truth",
             "below 1e-4",
-            all_converged and error < 1e-4,
+            converged,
         ),
     ]
 
@@ -171,45 +150,24 @@ def draw(found: Found) -> Figure:
         "open box. Chebyshev's undoes the very same boxes in about 10 steps, whatever the albedo.",
     )
     left, right, above, below, size = 85, 580, 145, 540, (370, 290)
-    axes = figures.graph(
-        figure,
-        (left, above, *size),
-        "(a) The series swings alike everywhere",
-        "terms n",
-        "sum / direct light",
-        "linear",
-    )
+    title, ylabel = "(a) The series swings alike everywhere", "sum / direct light"
+    axes = figures.graph(figure, (left, above, *size), title, "terms n", ylabel, "linear")
     axes.axhline(1, color=FAINT, lw=1, ls=":")
     for (name, swing), shade in zip(found.swings.items(), SHADES, strict=False):
         axes.plot(swing, "o-", color=shade, lw=2, ms=5, label=f"{name} of the floor")
     axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
-    axes = figures.graph(
-        figure,
-        (right, above, *size),
-        "(b) Error of the series in a closed box",
-        "terms n",
-        r"$\Vert S^{-1} - S_n^{-1} \Vert$",
-    )
+    title, ylabel = "(b) Error of the series in a closed box", r"$\Vert S^{-1} - S_n^{-1} \Vert$"
+    axes, n = figures.graph(figure, (right, above, *size), title, "terms n", ylabel), range(1, ORDERS + 1)
     for (m, norm), shade in zip(found.norms.items(), SHADES, strict=False):
-        axes.plot(range(1, ORDERS + 1), BOUNDS[m], color=shade, lw=1.5, ls=":")
-        axes.plot(
-            range(1, ORDERS + 1),
-            np.where(norm > ROUNDING, norm, np.nan),
-            "o",
-            color=shade,
-            ms=5,
-            label=f"albedo {m:g}",
-        )
+        axes.plot(n, BOUNDS[m], color=shade, lw=1.5, ls=":")
+        shown = np.where(norm > ROUNDING, norm, np.nan)
+        axes.plot(n, shown, "o", color=shade, ms=5, label=f"albedo {m:g}")
     axes.plot([], [], color=INK, lw=1.5, ls=":", label="bound, eq. 16")
     axes.legend(frameon=False, labelcolor=INK, fontsize=10)
-    title = "(c) Closed box, albedo 0.2 to 0.51"
-    draw_races(
-        figures.graph(figure, (left, below, *size), title, "iteration", "relative residual"), found.closed
-    )
-    title = f"(d) Albedo {OPEN_ALBEDO}, box of 6 to 1 sides"
-    draw_races(
-        figures.graph(figure, (right, below, *size), title, "iteration", "relative residual"), found.opened
-    )
+    titles = "(c) Closed box, albedo 0.2 to 0.51", f"(d) Albedo {OPEN_ALBEDO}, box of 6 to 1 sides"
+    for place, title, races in zip((left, right), titles, (found.closed, found.opened), strict=True):
+        axes = figures.graph(figure, (place, below, *size), title, "iteration", "relative residual")
+        draw_races(axes, races)
     return figure
 
 
@@ -234,10 +192,9 @@ def draw_races(axes: Axes, races: Mapping[float, Race]) -> None:
 
 def main() -> None:
     given = options(__doc__ or "")
-    found = measure(given.smoke, given.device)
-    claims = series_claims(found) + race_claims(found)
+    found = measure(4 if given.smoke else 16, given.device)
     facts = {r.name: f"{r.said}; Chebyshev 1e-5 in {r.chebyshev.products} products" for r in found.races}
-    figures.conclude(given, "Figure 5: convergence", claims, facts, lambda: draw(found))
+    figures.conclude(given, "Figure 5: convergence", claims(found), facts, lambda: draw(found))
 
 
 if __name__ == "__main__":

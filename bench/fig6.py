@@ -63,11 +63,8 @@ class Recovery:
     @functools.cached_property
     def rho(self) -> float:
         """rho(R) = rho(A) / (1 - rho(A)), of the slowest colour, by Arnoldi's method on A."""
-        largest = (
-            scipy.sparse.linalg.eigs(A, 1, return_eigenvectors=False, v0=np.ones(A.shape[0]))
-            for A in self.bounces
-        )
-        rho = max(float(np.abs(value[0])) for value in largest)
+        eigs = functools.partial(scipy.sparse.linalg.eigs, k=1, return_eigenvectors=False)
+        rho = max(float(np.abs(eigs(A, v0=np.ones(A.shape[0]))[0])) for A in self.bounces)
         return rho / (1 - rho)
 
     @property
@@ -77,10 +74,8 @@ class Recovery:
 
     def chebyshev(self) -> int:
         """Products that Chebyshev's iteration needs, in the slowest colour."""
-        return max(
-            ltcl.solve(S, l, "chebyshev", rtol=RTOL).products
-            for S, l in zip(self.systems, self.sums[0], strict=True)
-        )
+        pairs = zip(self.systems, self.sums[0], strict=True)
+        return max(ltcl.solve(S, l, "chebyshev", rtol=RTOL).products for S, l in pairs)
 
 
 def sums(systems: tuple[Any, ...], l_out: np.ndarray) -> np.ndarray:
@@ -105,9 +100,8 @@ def with_gloss(n: int, smoke: bool) -> Recovery:
     l_d = np.stack([K @ (scene.Q @ np.ones(scene.Q.shape[1])) for K in scene.K])
     systems = tuple(map(LightField, scene.A))
     l_out = np.stack([S @ l for S, l in zip(systems, l_d, strict=True)])
-    return Recovery(
-        scene.matte, l_d, sums(systems, l_out), systems, scene.A, lambda l: scene.picture(l @ scene.P.T)
-    )
+    found, seen = sums(systems, l_out), lambda l: scene.picture(l @ scene.P.T)
+    return Recovery(scene.matte, l_d, found, systems, scene.A, seen)
 
 
 def glossy_box(n: int, smoke: bool) -> Any:
@@ -146,54 +140,36 @@ def in_shadow(found: Recovery) -> np.ndarray:
 
 def claims(shade: Recovery, gloss: Recovery, camera: float) -> list[Claim]:
     """Of both boxes."""
-    dark = in_shadow(shade)
+    dark, (shade_products, gloss_products) = in_shadow(shade), (shade.chebyshev(), gloss.chebyshev())
+    shadows = f"light in them {dark[0]:.0%} of that outside, after 10 iterations {dark[10]:.1g}"
+    products = f"shadows {shade_products}, gloss {gloss_products} products to 1 %"
+    is_fewer = shade_products < shade.steps and gloss_products < gloss.steps
+    radius = f"rho(R) = {camera:.2f}, of the light field {gloss.rho:.2f}"
+    one_camera = "one camera's T F^-1 is another operator: gloss makes its rho(R) larger (eq. 28)"
+    rates = []
+    for name, found in (("shadows", shade), ("gloss", gloss)):
+        text, rate = f"{name}: each iteration leaves rho(R) of the error", found.rate / found.rho
+        measured = f"{found.rate:.3f}, rho(R) = {found.rho:.3f}"
+        rates.append(Claim(text, measured, "within 2%", abs(rate - 1) < 0.02))
     return [
         Claim("shadows: direct light in 10 iterations", f"1 % after {shade.steps}", "10", shade.steps <= 10),
-        Claim(
-            "shadows get as dark as they are",
-            f"light in them {dark[0]:.0%} of that outside, after 10 iterations {dark[10]:.1g}",
-            "below 1%",
-            dark[10] < 0.01 < dark[0],
-        ),
+        Claim("shadows get as dark as they are", shadows, "below 1%", dark[10] < 0.01 < dark[0]),
         Claim("gloss: direct light in 20 iterations", f"1 % after {gloss.steps}", "20", gloss.steps <= 20),
-        *(
-            Claim(
-                f"{name}: each iteration leaves rho(R) of the error",
-                f"{found.rate:.3f}, rho(R) = {found.rho:.3f}",
-                "within 2%",
-                abs(found.rate / found.rho - 1) < 0.02,
-            )
-            for name, found in (("shadows", shade), ("gloss", gloss))
-        ),
-        Claim(
-            "ours: Chebyshev needs fewer",
-            f"shadows {shade.chebyshev()}, gloss {gloss.chebyshev()} products to 1 %",
-            "fewer",
-            shade.chebyshev() < shade.steps and gloss.chebyshev() < gloss.steps,
-        ),
-        Claim(
-            "one camera's T F^-1 is another operator: gloss makes its rho(R) larger (eq. 28)",
-            f"rho(R) = {camera:.2f}, of the light field {gloss.rho:.2f}",
-            "larger",
-            camera > gloss.rho,
-        ),
+        *rates,
+        Claim("ours: Chebyshev needs fewer", products, "fewer", is_fewer),
+        Claim(one_camera, radius, "larger", camera > gloss.rho),
     ]
 
 
-def draw_row(
-    figure: Figure, found: Recovery, top: float, shown: tuple[int, ...], names: tuple[str, str]
-) -> None:
+def draw_row(figure: Figure, found: Recovery, top: float, shown: tuple[int, ...], name: str) -> None:
     """The picture, some sums, and the truth."""
-    lefts, width = figures.columns(len(shown) + 2, gap=20)
-    picture = found.seen(found.sums[0])
-    gain = 0.9 / np.quantile(picture, 0.98)
-    columns = [(names[0], f"error {found.errors[0]:.2g}", picture)]
+    images = [(name, f"error {found.errors[0]:.2g}", found.sums[0])]
     for n in shown:
-        said = f"{n} iteration{'s' * (n > 1)}"
-        columns.append((said, f"error {found.errors[n]:.2g}", found.seen(found.sums[n])))
-    columns.append((names[1], "the truth", found.seen(found.l_d)))
-    for left, (label, note, image) in zip(lefts, columns, strict=True):
-        figures.picture(figure, (left, top, width), figures.light(found.scene, image, gain), label, note)
+        images.append((f"{n} iteration{'s' * (n > 1)}", f"error {found.errors[n]:.2g}", found.sums[n]))
+    images.append((r"direct light $l_d$", "the truth", found.l_d))
+    gain = 0.9 / np.quantile(found.seen(found.sums[0]), 0.98)
+    views = [(figures.light(found.scene, found.seen(l), gain), *text) for *text, l in images]
+    figures.pictures(figure, top, views, gap=20)
 
 
 def draw(shade: Recovery, gloss: Recovery) -> Figure:
@@ -204,11 +180,10 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
         "Above: a lamp, a block, and light that bounces into its shadows. Below: glossy walls in even light.",
         "Iterations take the bounces out, until shadows and highlights are as they were; below 0 is black.",
     )
-    draw_row(figure, shade, 130, SHADOWS, ("lamp and block", r"direct light $l_d$"))
-    draw_row(figure, gloss, 370, GLOSSES, ("glossy walls", r"direct light $l_d$"))
-    axes = figures.graph(
-        figure, (85, 620, 860, 210), "Error of the direct light", "iteration", "relative error"
-    )
+    draw_row(figure, shade, 130, SHADOWS, "lamp and block")
+    draw_row(figure, gloss, 370, GLOSSES, "glossy walls")
+    box, title = (85, 620, 860, 210), "Error of the direct light"
+    axes = figures.graph(figure, box, title, "iteration", "relative error")
     for found, name, colour in ((shade, "shadows", "#5cc8ff"), (gloss, "gloss", "#ffb347")):
         said = f"{name}: rho(R) = {found.rho:.2f}, 1 % after {found.steps}"
         axes.plot(found.errors, color=colour, lw=2, label=said)
@@ -223,11 +198,10 @@ def main() -> None:
     shade = with_shadows(4 if given.smoke else 14, given.device)
     gloss = with_gloss(4 if given.smoke else 12, given.smoke)
     camera = max(channel.spectral_radius for channel in one_camera(given.smoke, given.device).channels)
+    errors = [[float(f"{e:.3g}") for e in found.errors] for found in (shade, gloss)]
     facts = {
         "unknowns": [found.l_d.shape[1] for found in (shade, gloss)],
-        "relative error after n iterations": [
-            [float(f"{e:.3g}") for e in found.errors] for found in (shade, gloss)
-        ],
+        "relative error after n iterations": errors,
         "largest albedo": [float(found.scene.albedo.max()) for found in (shade, gloss)],
     }
     found = claims(shade, gloss, camera)

@@ -67,27 +67,19 @@ def slope(errors: np.ndarray) -> tuple[float, float]:
 def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
     """Of the curves, and of 30 samples."""
     plain, gathered = (found.error(found.run(FEW, 0, kind)) for kind in ("plain", "final gather"))
-    many = found.error(found.run(MANY, 0, "plain"))
+    many, due = found.error(found.run(MANY, 0, "plain")), (FEW / MANY) ** 0.5
     value, half = slope(errors["plain"])
+    variance, slopes = "variance falls as one over the samples", f"slope {value:.3f} +- {half:.3f}"
+    gather, few = (
+        f"{FEW} samples a pixel suffice with final gather",
+        f"error {gathered:.1%}, without {plain:.0%}",
+    )
+    more = f"error {many:.1%} of {MANY} samples, {plain:.0%} of {FEW}"
+    accurate, is_due = f"{due:.2f} times, within a tenth", abs(many / plain / due - 1) <= 0.1
     return [
-        Claim(
-            "variance falls as one over the samples",
-            f"slope {value:.3f} +- {half:.3f}",
-            "-1 within 99 % confidence",
-            abs(value + 1) <= half,
-        ),
-        Claim(
-            f"{FEW} samples a pixel suffice with final gather",
-            f"error {gathered:.1%}, without {plain:.0%}",
-            "at most 5%, a tenth of that without",
-            gathered <= min(0.05, plain / 10),
-        ),
-        Claim(
-            "more samples make it more accurate",
-            f"error {many:.1%} of {MANY} samples, {plain:.0%} of {FEW}",
-            f"{(FEW / MANY) ** 0.5:.2f} times, within a tenth",
-            abs(many / plain / (FEW / MANY) ** 0.5 - 1) <= 0.1,
-        ),
+        Claim(variance, slopes, "-1 within 99 % confidence", abs(value + 1) <= half),
+        Claim(gather, few, "at most 5%, a tenth of that without", gathered <= min(0.05, plain / 10)),
+        Claim("more samples make it more accurate", more, accurate, is_due),
     ]
 
 
@@ -98,21 +90,15 @@ def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
         f"Figure 8: {len(found.l_d)} pixels inverted by random walks",
         "Each pixel by walks of its own; then one exact product, which smooths their noise away.",
     )
-    lefts, width = figures.columns(5, gap=20)
-    gain = 0.9 / np.quantile(found.l_out, 0.98)
-    for left, (label, light) in zip(
-        lefts,
-        (
-            ("the picture", found.l_out),
-            (f"{FEW} samples", found.run(FEW, 0, "plain")),
-            (f"{FEW}, final gather", found.run(FEW, 0, "final gather")),
-            (f"{MANY} samples", found.run(MANY, 0, "plain")),
-            (r"direct light $l_d$", found.l_d),
-        ),
-        strict=True,
-    ):
-        image = figures.light(found.scene, light.reshape(found.scene.grid), gain)
-        figures.picture(figure, (left, 110, width), image, label, f"error {found.error(light):.2g}")
+    gain, images = 0.9 / np.quantile(found.l_out, 0.98), [("the picture", found.l_out)]
+    for samples, kind in ((FEW, "plain"), (FEW, "final gather"), (MANY, "plain")):
+        label = f"{samples}, {kind}" if KINDS[kind] else f"{samples} samples"
+        images.append((label, found.run(samples, 0, kind)))
+    views = []
+    for label, light in (*images, (r"direct light $l_d$", found.l_d)):
+        view = figures.light(found.scene, light.reshape(found.scene.grid), gain)
+        views.append((view, label, f"error {found.error(light):.2g}"))
+    figures.pictures(figure, 110, views, gap=20)
     axes = figures.graph(figure, (85, 360, 860, 210), "Variance", "samples a pixel", "squared error")
     for (kind, values), colour in zip(errors.items(), ("#5cc8ff", "#ffb347"), strict=True):
         axes.loglog(COUNTS, (values**2).mean(axis=1), color=colour, lw=2, label=kind)
@@ -126,18 +112,11 @@ def main() -> None:
     given = options(__doc__ or "")
     found = prepare(6 if given.smoke else 32, given.device)
     errors = {kind: found.errors(kind) for kind in KINDS}
-    facts = {
-        "pixels": len(found.l_d),
-        "albedo": ALBEDO,
-        "samples": COUNTS.tolist(),
-        **{
-            f"relative error, {kind}": np.round(values.mean(axis=1), 5).tolist()
-            for kind, values in errors.items()
-        },
-    }
-    figures.conclude(
-        given, "Figure 8: Monte Carlo", claims(found, errors), facts, lambda: draw(found, errors)
-    )
+    facts = {"pixels": len(found.l_d), "albedo": ALBEDO, "samples": COUNTS.tolist()}
+    for kind, values in errors.items():
+        facts[f"relative error, {kind}"] = np.round(values.mean(axis=1), 5).tolist()
+    listed = claims(found, errors)
+    figures.conclude(given, "Figure 8: Monte Carlo", listed, facts, lambda: draw(found, errors))
 
 
 if __name__ == "__main__":

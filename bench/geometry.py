@@ -16,6 +16,7 @@ compensated. Where the photographs of a real set-up lie beside the checkout, the
 from __future__ import annotations
 
 import importlib.util
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +65,9 @@ class Found:
     errors: dict[str, float]
     masked: int
 
+    def __str__(self) -> str:
+        return ", ".join(f"{kind} {error:.2%}" for kind, error in self.errors.items())
+
     @property
     def worst(self) -> float:
         """Of all kinds."""
@@ -102,9 +106,8 @@ def measured(given: Options, truth: np.ndarray, view: View, camera: str, noise: 
     (response, bits), (electrons, read) = CAMERAS[camera], NOISES[noise]
     C = camera_map(view.place, view.grid, (N, N), points=16)
     common: dict[str, Any] = {"response": response, "bits": bits, "gain": electrons, "read": read}
-    rig = VirtualRig(
-        truth, (N, N), camera_grid=view.grid, camera_map=C, ambient=0.01, seed=view.seed, **common
-    )
+    common |= {"camera_grid": view.grid, "camera_map": C, "ambient": 0.01, "seed": view.seed}
+    rig = VirtualRig(truth, (N, N), **common)
     with TemporaryDirectory() as folder:
         T = acquire(rig, strategy="pixel", store=Path(folder) / "T.zarr", device=given.device)
         P, seen = held(N), ~T.masked
@@ -137,57 +140,35 @@ def placed(given: Options) -> list[Found]:
 
 def claims(found: list[Found], cameras: list[Found], loop: rendered.Loop | None) -> list[Claim]:
     """What has to hold."""
-    listed = [
-        Claim(
-            f"T p of held patterns, {one.size:g} camera pixels to a side, {one.camera}",
-            ", ".join(f"{kind} {error:.2%}" for kind, error in one.errors.items()),
-            "at most 2 %",
-            one.worst <= LIMIT,
-        )
-        for one in found
-        if one.size in CLAIMED and one.noise == next(iter(NOISES))
-    ]
+    listed = []
+    for one in found:
+        if one.size in CLAIMED and one.noise == next(iter(NOISES)):
+            text = f"T p of held patterns, {one.size:g} camera pixels to a side, {one.camera}"
+            listed.append(Claim(text, str(one), "at most 2 %", one.worst <= LIMIT))
     worst = [one.worst for one in cameras]
-    listed.append(
-        Claim(
-            f"T p of held patterns, {len(cameras)} cameras at random, 3 to 4.5 camera pixels to a side",
-            f"median {np.median(worst):.2%}, worst {max(worst):.2%}",
-            "at most 1 %, each",
-            max(worst) <= AT_RANDOM,
-        )
-    )
+    text = f"T p of held patterns, {len(cameras)} cameras at random, 3 to 4.5 camera pixels to a side"
+    measured = f"median {np.median(worst):.2%}, worst {max(worst):.2%}"
+    listed.append(Claim(text, measured, "at most 1 %, each", max(worst) <= AT_RANDOM))
     if loop is not None:
-        before, after = loop.decibels
-        listed += [
-            Claim(
-                "T p on a rendered corner, against renders from the projector's place",
-                f"{loop.errors.max():.2%}",
-                "at most 4 %",
-                float(loop.errors.max()) <= RENDERED,
-            ),
-            Claim(
-                "a picture compensated on it comes nearer to what was asked for",
-                f"{before:.1f} dB, then {after:.1f} dB",
-                "10 dB more",
-                after >= before + 10,
-            ),
-        ]
+        (before, after), error = loop.decibels, float(loop.errors.max())
+        text = "T p on a rendered corner, against renders from the projector's place"
+        listed.append(Claim(text, f"{error:.2%}", "at most 4 %", error <= RENDERED))
+        text = "a picture compensated on it comes nearer to what was asked for"
+        measured = f"{before:.1f} dB, then {after:.1f} dB"
+        listed.append(Claim(text, measured, "10 dB more", after >= before + 10))
     return listed
 
 
 def facts(found: list[Found], cameras: list[Found], loop: rendered.Loop | None) -> dict[str, Any]:
     """A line for each acquisition, and the real photographs."""
-    told: dict[str, Any] = {"projector pixels": N * N}
+    lines: dict[str, Any] = {"projector pixels": N * N}
     names = [f"{one.size:g} camera pixels, {one.camera}, {one.noise}" for one in found]
     names += [f"at random, seed {seed}, {one.size:.2f} camera pixels" for seed, one in enumerate(cameras)]
-    for name, one in zip(names, found + cameras, strict=True):
-        parts = ", ".join(f"{kind} {error:.2%}" for kind, error in one.errors.items())
-        told[name] = f"{parts}; {one.masked} pixels masked"
-    if loop is None:
-        told["rendered corner"] = "left out, mitsuba is not installed"
-    else:
-        told["rendered corner"] = f"{loop.pattern.shape}, {loop.photographs} photographs of the scan"
-    return told | board.facts()
+    lines |= {n: f"{o}; {o.masked} pixels masked" for n, o in zip(names, found + cameras, strict=True)}
+    lines["rendered corner"] = "left out, mitsuba is not installed"
+    if loop is not None:
+        lines["rendered corner"] = f"{loop.pattern.shape}, {loop.photographs} photographs of the scan"
+    return lines | board.facts()
 
 
 def draw(found: list[Found], cameras: list[Found], loop: rendered.Loop | None) -> Figure:
@@ -198,35 +179,42 @@ def draw(found: list[Found], cameras: list[Found], loop: rendered.Loop | None) -
         "Above: largest error of T p over held patterns, of a corner with 16 x 16 projector pixels",
         "seen askance. Below: a rendered corner, by a camera half a wall beside the projector.",
     )
-    quiet = next(iter(NOISES))
-    axes = figures.graph(
-        figure, (80, 140, 400, 220), "By size", "camera pixels to a projector pixel's side", ""
-    )
-    for camera in CAMERAS:
-        chosen = [one for one in found if one.camera == camera and one.noise == quiet]
-        for kind, style in zip(KINDS, ("-", "--", ":"), strict=True):
-            values = [one.errors[kind] for one in chosen]
-            colour = f"C{list(CAMERAS).index(camera)}"
-            label = f"{camera}, {kind}"
-            axes.plot([one.size for one in chosen], values, style, color=colour, marker="o", label=label)
+    styles, quiet = dict(zip(KINDS, ("-", "--", ":"), strict=True)), next(iter(NOISES))
+    xlabel = "camera pixels to a projector pixel's side"
+    axes = figures.graph(figure, (80, 140, 400, 220), "By size", xlabel, "")
+    for (number, camera), (kind, style) in itertools.product(enumerate(CAMERAS), styles.items()):
+        some = [one for one in found if one.camera == camera and one.noise == quiet]
+        look: Any = {"color": f"C{number}", "marker": "o", "label": f"{camera}, {kind}"}
+        axes.plot([one.size for one in some], [one.errors[kind] for one in some], style, **look)
     sizes, worst = [one.size for one in cameras], [one.worst for one in cameras]
     axes.plot(sizes, worst, "x", color=figures.FAINT, label=f"{len(cameras)} cameras at random, worst")
     _percent(axes)
     axes.legend(frameon=False, labelcolor=figures.FAINT, fontsize=8.5)
-    axes = figures.graph(
-        figure, (580, 140, 380, 220), "By noise, 3 camera pixels", "electrons at full scale", ""
-    )
-    chosen = [one for one in found if one.size == 3.0 and one.camera == found[-1].camera]
-    electrons = [NOISES[one.noise][0] for one in chosen]
-    for kind, style in zip(KINDS, ("-", "--", ":"), strict=True):
-        axes.plot(electrons, [one.errors[kind] for one in chosen], style, color="C1", marker="o", label=kind)
+    title, xlabel = "By noise, 3 camera pixels", "electrons at full scale"
+    axes = figures.graph(figure, (580, 140, 380, 220), title, xlabel, "")
+    some = [one for one in found if one.size == 3.0 and one.camera == found[-1].camera]
+    electrons = [NOISES[one.noise][0] for one in some]
+    for kind, style in styles.items():
+        errors = [one.errors[kind] for one in some]
+        axes.plot(electrons, errors, style, color="C1", marker="o", label=kind)
     axes.set_xscale("log")
     axes.set_xticks(electrons, [f"{count:g}" for count in electrons])
     axes.minorticks_off()
     _percent(axes)
     if loop is not None:
-        _pictures(figure, loop)
+        before, after = loop.decibels
+        views = [
+            (loop.desired, "asked for", "on the projector's pixels"),
+            (loop.pattern, "pattern", "what the projector sends"),
+            (loop.before, "before", f"the picture itself sent: {before:.1f} dB"),
+            (loop.after, "after", f"the pattern sent: {after:.1f} dB"),
+        ]
+        figures.pictures(figure, 480, [(_grey(image), *text) for image, *text in views])
     return figure
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    return np.repeat(to_srgb(np.clip(image / max(float(image.max()), 1e-9), 0, 1))[..., None], 3, -1)
 
 
 def _percent(axes: Axes) -> None:
@@ -237,21 +225,6 @@ def _percent(axes: Axes) -> None:
     axes.axhline(LIMIT, color=figures.FAINT, lw=1)
 
 
-def _pictures(figure: Figure, loop: rendered.Loop) -> None:
-    """What was asked for, what the projector then sends, and the wall before and after."""
-    before, after = loop.decibels
-    listed = [
-        (loop.desired, "asked for", "on the projector's pixels"),
-        (loop.pattern, "pattern", "what the projector sends"),
-        (loop.before, "before", f"the picture itself sent: {before:.1f} dB"),
-        (loop.after, "after", f"the pattern sent: {after:.1f} dB"),
-    ]
-    lefts, width = figures.columns(len(listed))
-    for left, (image, label, note) in zip(lefts, listed, strict=True):
-        shown = to_srgb(np.clip(image / max(float(image.max()), 1e-9), 0, 1))
-        figures.picture(figure, (left, 480, width), np.repeat(shown[..., None], 3, -1), label, note)
-
-
 def main() -> None:
     given = options(__doc__ or "")
     found, cameras, loop = virtual(given), placed(given), None
@@ -259,14 +232,8 @@ def main() -> None:
         n = 12 if given.smoke else 24
         patterns = held(n).T.reshape(-1, n, n)[:, : 3 * n // 4].astype(np.float32)
         loop = rendered.loop(n, 16 if given.smoke else 32, patterns, given.device)
-    title = "A camera that is not aligned with the projector"
-    figures.conclude(
-        given,
-        title,
-        claims(found, cameras, loop),
-        facts(found, cameras, loop),
-        lambda: draw(found, cameras, loop),
-    )
+    title, results = "A camera that is not aligned with the projector", (found, cameras, loop)
+    figures.conclude(given, title, claims(*results), facts(*results), lambda: draw(*results))
 
 
 if __name__ == "__main__":
