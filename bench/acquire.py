@@ -17,6 +17,7 @@ photographs and time against the number of pixels, beside what the plan said bef
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,10 +28,11 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator
 
 import _figures as figures
 import ltcl
-from _acquired import Cost, draw
 from _figures import Claim
 from _harness import options
 from ltcl.acquisition import Report, VirtualRig, acquire
@@ -42,6 +44,25 @@ CAMERAS = {"srgb, 8 bits": ("srgb", 8), "film, 12 bits": ("film", 12)}
 STRATEGIES = ("adaptive", "hadamard", "pixel")
 COLOURS, MIXING = (0.7, 0.5, 0.3), [[0.9, 0.15, 0.0], [0.05, 0.8, 0.1], [0.0, 0.2, 0.9]]
 TILES = 8
+# Of the strategies: name and colour of their curves, and width, as one lies below another.
+LINES = {
+    "adaptive": ("adaptive", "#c0392b", 1.5),
+    "hadamard": ("S-matrices", "#2a7f9e", 4),
+    "pixel": ("one at a time", "#e0b34c", 1.5),
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of one acquisition: photographs and seconds of exposure, as planned and as taken; seconds it ran."""
+
+    strategy: str
+    pixels: int
+    planned: int
+    photographs: int
+    planned_exposure: float
+    exposure: float
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -76,14 +97,9 @@ def held(n: int) -> np.ndarray:
     """Noise, stripes and smooth patterns, (N, 6)."""
     rng = np.random.default_rng(11)
     y, x = np.mgrid[:n, :n] / n
-    parts = [rng.random((n, n)) for _ in range(2)]
-    parts += [
-        np.sin(60 * x + 20 * y) > 0,
-        x * (1 - y),
-        0.5 + 0.5 * np.sin(9 * x),
-        (x - 0.3) ** 2 + y**2 < 0.1,
-    ]
-    return np.stack([np.asarray(part, np.float64) for part in parts]).reshape(6, -1).T
+    smooth = [x * (1 - y), 0.5 + 0.5 * np.sin(9 * x), (x - 0.3) ** 2 + y**2 < 0.1]
+    patterns = [rng.random((n, n)), rng.random((n, n)), np.sin(60 * x + 20 * y) > 0, *smooth]
+    return np.stack(patterns).astype(np.float64).reshape(6, -1).T
 
 
 class Truth:
@@ -195,18 +211,17 @@ def claims(found: list[Found]) -> list[Claim]:
     """What has to hold of each acquisition."""
     listed = []
     for one in found:
-        worst, noisy = max(one.bounces[1:]), f"{one.inside:.1%} within 3 deviations"
+        ratios = ", ".join(f"{ratio:.2f}" for ratio in one.bounces[1:])
+        bounces, inside = (
+            f"{one.name}: bounces 1 to 3, error over std",
+            f"{one.inside:.1%} within 3 deviations",
+        )
         listed += [
             Claim(f"{one.name}: T p of held patterns", f"{one.held:.2%}", "at most 2 %", one.held <= 0.02),
             Claim(f"{one.name}: row sum furthest off", f"{one.sums:.2%}", "at most 2 %", one.sums <= 0.02),
             Claim(f"{one.name}: far light, all", f"{one.weak:.2%} off", "at most 2 %", one.weak <= 0.02),
             Claim(f"{one.name}: compensated", f"{one.decibels:.1f} dB", "at least 30", one.decibels >= 30),
-            Claim(
-                f"{one.name}: bounces 1 to 3, error over std",
-                ", ".join(f"{ratio:.2f}" for ratio in one.bounces[1:]) + f"; {noisy}",
-                "at most 2",
-                worst <= 2,
-            ),
+            Claim(bounces, f"{ratios}; {inside}", "at most 2", max(one.bounces[1:]) <= 2),
         ]
     return listed
 
@@ -215,33 +230,61 @@ def of_cost(costs: list[Cost], largest: int) -> list[Claim]:
     """What has to hold of photographs."""
     cost = {one.strategy: one.photographs for one in costs if one.pixels == largest}
     over = max(one.photographs / one.planned for one in costs)
+    fifth = "an adaptive scan takes a fifth of the photographs of one pixel at a time"
+    counts, is_fifth = f"{cost['adaptive']} of {cost['pixel']}", 5 * cost["adaptive"] <= cost["pixel"]
     return [
-        Claim(
-            "an adaptive scan takes a fifth of the photographs of one pixel at a time",
-            f"{cost['adaptive']} of {cost['pixel']}",
-            "at most 1 / 5",
-            5 * cost["adaptive"] <= cost["pixel"],
-        ),
+        Claim(fifth, counts, "at most 1 / 5", is_fifth),
         Claim("photographs over what the plan said, at most", f"{over:.3f}", "at most 1", over <= 1),
     ]
+
+
+def draw(costs: list[Cost]) -> Figure:
+    """Photographs, time of exposure and time of computing against pixels; dashed what plans said."""
+    figure = figures.page(
+        440,
+        "What it takes to measure a transport",
+        "A corner of n x n pixels, a camera of 12 bits. Dashed: what plans said.",
+    )
+    quantities = [
+        ("photographs", 1, "photographs", "planned"),
+        ("hours of exposure", 3600, "exposure", "planned_exposure"),
+        ("seconds of computing", 1, "seconds", None),
+    ]
+    for place, (title, unit, taken, planned) in enumerate(quantities):
+        axes = figures.graph(figure, (70 + 320 * place, 140, 260, 230), title, "pixels", "")
+        for strategy, (label, colour, width) in LINES.items():
+            some = [cost for cost in costs if cost.strategy == strategy]
+            pixels = [cost.pixels for cost in some]
+            values = [getattr(cost, taken) / unit for cost in some]
+            axes.plot(pixels, values, "o-", ms=4, lw=width, color=colour, label=label)
+            if planned is not None:
+                values = [getattr(cost, planned) / unit for cost in some]
+                axes.plot(pixels, values, "--", lw=1, color=colour)
+        sides = sorted({round(cost.pixels**0.5) for cost in costs})
+        axes.set_xscale("log")
+        axes.set_xticks([n * n for n in sides], [f"{n}\u00b2" for n in sides])
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+        axes.minorticks_off()
+        if place == 0:
+            axes.legend(frameon=False, labelcolor=figures.FAINT, fontsize=9.5)
+    return figure
 
 
 def main() -> None:
     given = options(__doc__ or "")
     sides = [8, 16] if given.smoke else [16, 24, 32, 48, 64]
     run = partial(measured, device=given.device)
-    truth = Truth([corner(sides[-1])])
-    cameras = list(CAMERAS)[1:] if given.smoke else CAMERAS
+    truth, cameras = Truth([corner(sides[-1])]), list(CAMERAS)[1:] if given.smoke else CAMERAS
     found = [run(truth, camera, k, name=f"{k}, {camera}") for camera in cameras for k in STRATEGIES]
-    smaller = [
-        run(Truth([corner(n)]), "film, 12 bits", k, name=f"{k}, {n}") for n in sides[:-1] for k in STRATEGIES
-    ]
+    costs = []
+    for n, k in itertools.product(sides[:-1], STRATEGIES):
+        costs.append(run(Truth([corner(n)]), "film, 12 bits", k, name=f"{k}, {n}").cost)
+    costs += [one.cost for one in found if "film" in one.name]
     colour = Truth([corner(8 if given.smoke else 32, albedo) for albedo in COLOURS], MIXING)
-    mixed = [run(colour, "srgb, 8 bits", k, name=f"{k}, colours") for k in STRATEGIES[:2]]
-    largest = [one.cost for one in found if "film" in one.name]
-    costs = [*(one.cost for one in smaller), *largest]
+    found += [run(colour, "srgb, 8 bits", k, name=f"{k}, colours") for k in STRATEGIES[:2]]
     facts: dict[str, Any] = {"pixels": sides[-1] ** 2}
-    for one in [*found, *mixed]:
+    for one in found:
         facts[f"{one.name}, seconds"] = one.cost.seconds
         facts[f"{one.name}, photographs"] = one.cost.photographs
         facts[f"{one.name}, far light row by row"] = one.far
@@ -249,10 +292,9 @@ def main() -> None:
         if one.strategy != "adaptive":
             facts[f"{one.name}, columns beside white before they added up to it"] = one.sum_deviation
     for cost in costs:
-        facts[f"{cost.strategy}, {cost.pixels} pixels, photographs over plan"] = (
-            cost.photographs / cost.planned
-        )
-    listed = of_cost(costs, sides[-1] ** 2) + claims([*found, *mixed])
+        name = f"{cost.strategy}, {cost.pixels} pixels, photographs over plan"
+        facts[name] = cost.photographs / cost.planned
+    listed = of_cost(costs, sides[-1] ** 2) + claims(found)
     if given.smoke:  # so few pixels show that it runs, not how few photographs a larger one takes
         listed = listed[1:2]
     figures.conclude(given, "A transport from photographs", listed, facts, partial(draw, costs))

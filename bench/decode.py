@@ -10,15 +10,17 @@ finds fractions of a pixel: the facts tell what comes of that.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 
 from _harness import Row, options, report, seconds
 from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, decode
 
-TARGETS = {"whole": 2.0, "fraction": 1.0}
+QUESTIONS = {
+    "bits": ("bits and coordinates", None),
+    "whole": ("and neighbours compared", 2.0),
+    "fraction": ("and fractions of a pixel", 1.0),
+}
 
 
 def scene(grid: tuple[int, int], camera: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -67,16 +69,6 @@ def off(x: np.ndarray, y: np.ndarray, truth: tuple[np.ndarray, np.ndarray]) -> f
     return float(np.sqrt(np.nanmean((x - truth[0]) ** 2 + (y - truth[1]) ** 2)))
 
 
-def actions(code: GrayCode, images: list[np.ndarray], peer: Peer) -> dict[str, Callable[[], object]]:
-    """What is timed."""
-    return {
-        "opencv": peer,
-        "bits": lambda: code.decode(images, edges=False),
-        "whole": lambda: decode(images, code.grid, subpixel=False),
-        "fraction": lambda: decode(images, code.grid),
-    }
-
-
 def facts(found: Correspondence, whole: Correspondence, peer: Peer, truth: tuple[np.ndarray, ...]) -> dict:
     """How good the maps are: decoded, and off by how many projector pixels."""
     rows = slice(len(truth[0]) // 2, len(truth[0]) // 2 + 2)
@@ -100,26 +92,18 @@ def main() -> None:
     peer = Peer(code, images)
     if not peer():
         raise SystemExit("OpenCV decoded nothing")
-    times = seconds(actions(code, images, peer), 3)
-    mega = camera[0] * camera[1] / 1e6
-    theirs = 2 * mega / times["opencv"]
-    questions = {
-        "bits": ("bits and coordinates", None),
-        "whole": ("and neighbours compared", TARGETS["whole"]),
-        "fraction": ("and fractions of a pixel", TARGETS["fraction"]),
+    actions = {
+        "opencv": peer,
+        "bits": lambda: code.decode(images, edges=False),
+        "whole": lambda: decode(images, grid, subpixel=False),
+        "fraction": lambda: decode(images, grid),
     }
-    rows = [
-        Row(
-            question,
-            "cv2 GrayCodePattern.decode",
-            theirs,
-            mega / times[key],
-            "Mpixel/s",
-            mega / times[key] / theirs,
-            t,
-        )
-        for key, (question, t) in questions.items()
-    ]
+    rate = {name: camera[0] * camera[1] / spent / 1e6 for name, spent in seconds(actions, 3).items()}
+    rows, theirs = [], 2 * rate["opencv"]
+    for name, (question, target) in QUESTIONS.items():
+        ours = rate[name]
+        row = Row(question, "cv2 GrayCodePattern.decode", theirs, ours, "Mpixel/s", ours / theirs, target)
+        rows.append(row)
     found, whole = decode(images, grid), decode(images, grid, subpixel=False)
     report(given, "Gray code into a map", rows, facts(found, whole, peer, truth))
 

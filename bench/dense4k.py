@@ -33,16 +33,14 @@ def main() -> None:
     inverse = ltcl.Inverse([Dense(given.device, A)], [1e-5], T.grid, T.first_bounce)
     solution = ltcl.solve(S, l_out, "chebyshev", rtol=1e-2)
     run, nbytes = triad(given.device, given.smoke)
-    times = seconds(
-        {
-            "triad": run,
-            "ours": lambda: ltcl.solve(S, l_out, "chebyshev", rtol=1e-2),
-            "float64": lambda: np.linalg.solve(dense, l_out),
-            "kept32": lambda: scipy.linalg.lu_solve(factors32, l_out32),
-            "inverse": lambda: inverse.solve(l_out),
-        },
-        repeats=5,
-    )
+    actions = {
+        "triad": run,
+        "ours": lambda: ltcl.solve(S, l_out, "chebyshev", rtol=1e-2),
+        "float64": lambda: np.linalg.solve(dense, l_out),
+        "kept32": lambda: scipy.linalg.lu_solve(factors32, l_out32),
+        "inverse": lambda: inverse.solve(l_out),
+    }
+    times = seconds(actions, repeats=5)
     question = f"direct part at N = {T.shape[0]}"
     kept = "LU kept, float32 (ours: an inverse kept)"
     rows = [

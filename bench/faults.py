@@ -108,15 +108,12 @@ class Person:
         lamp = T.sum(axis=1) * (0.6 + 0.8 * x + 0.3 * y).ravel()
         added = lamp * np.random.default_rng(seed).uniform(0.01, 0.1) if kind == "light on in one" else 0.0
         shift = float(kind.split()[1]) if kind and kind.startswith("moved") else 0.0
-        self._rig, self._faulty_rig = (
-            VirtualRig(
-                T, (h, w), camera_grid=shape, camera_map=C, ambient=light, seed=seed, **CAMERAS[camera]
-            )
-            for (shape, C), light in (
-                (view((h, w), seed % VIEWS, 0.0), 0.01),
-                (view((h, w), seed % VIEWS, shift), 0.01 + added),
-            )
-        )
+        rigs = []
+        for moved, light in ((0.0, 0.01), (shift, 0.01 + added)):
+            shape, C = view((h, w), seed % VIEWS, moved)
+            place: dict[str, Any] = {"camera_grid": shape, "camera_map": C, "ambient": light}
+            rigs.append(VirtualRig(T, (h, w), seed=seed, **place, **CAMERAS[camera]))
+        self._rig, self._faulty_rig = rigs
         self.bits = self._rig.bits
 
     def prepare(self, shots: Iterable[tuple[Any, float]]) -> None:
@@ -179,6 +176,11 @@ class Outcome:
     named: bool
     text: str
 
+    @property
+    def where(self) -> str:
+        """Scan and photograph."""
+        return f"{self.scan}, photograph {self.at} of {self.count}"
+
 
 @dataclass(frozen=True)
 class Scan:
@@ -192,9 +194,7 @@ class Scan:
         k = self.number
         return SCENES[k % 5], list(CAMERAS)[k // 5 % 3], STRATEGIES[(k // 15 + k) % 3]
 
-    def acquired(
-        self, device: Device, kind: str | None = None, at: int = 0
-    ) -> tuple[np.ndarray, np.ndarray, int]:
+    def acquired(self, device: Device, kind: str | None = None, at: int = 0) -> tuple[Any, Any, int]:
         """T p of some patterns, which pixels are known, photographs."""
         name, camera, strategy = self.names
         rig = Person(name, camera, self.number, kind, at)
@@ -240,52 +240,42 @@ def numbers(text: str) -> set[int]:
     return result
 
 
-def run(job: tuple[int, Sequence[str], str | None]) -> list[Outcome]:
+def run(job: tuple[int, Sequence[str]]) -> list[Outcome]:
     """One scan and its faults, in a process of its own."""
-    number, kinds, device = job
-    return Scan(number).outcomes(kinds, opened(device))
+    number, kinds = job
+    return Scan(number).outcomes(kinds, device())
 
 
 @cache
-def opened(device: str | None) -> Device:
-    """The device of this process."""
-    return ltcl.open_device(device)
+def device() -> Device:
+    """That of this process."""
+    return ltcl.open_device()
 
 
 def main() -> None:
     given = options(__doc__ or "")
     faults, clean = (1, 2) if given.smoke else (FAULTS, CLEAN)
-    jobs = [(k, KINDS if k < faults else (), None) for k in range(clean)]
+    jobs = [(k, KINDS if k < faults else ()) for k in range(clean)]
     with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
         results = pool.map(run, jobs)
         followed = track(results, "scans", total=len(jobs), disable=not sys.stderr.isatty())
         outcomes = [one for several in followed for one in several]
-    facts: dict[str, Any] = {
-        "scans": len(outcomes),
-        "cameras": ", ".join(CAMERAS),
-        "scenes": ", ".join(SCENES),
-    }
+    facts: dict[str, Any] = {"scans": len(outcomes)}
+    facts |= {"cameras": ", ".join(CAMERAS), "scenes": ", ".join(SCENES)}
     claims, shares = [], {}
     for kind in KINDS:
         some = [one for one in outcomes if one.kind == kind]
         refused = [one for one in some if one.refused]
-        named = sum(one.named for one in refused)
         missed = [one for one in some if not one.refused and not one.change <= HARM]
-        claims += [
-            Claim(f"{kind}: kept, T p moved by over 1 %", f"{len(missed)} of {len(some)}", "0", not missed),
-            Claim(
-                f"{kind}: refused and named",
-                f"{named} of {len(refused)}",
-                "95 %",
-                named >= 0.95 * len(refused),
-            ),
-        ]
-        shares[kind] = len(refused) / len(some), named / len(some)
-        facts |= {
-            f"{kind}, kept": [f"{o.scan}, photograph {o.at} of {o.count}: {o.change:.1%}" for o in missed]
-        }
-        wrong = [f"{o.scan}, photograph {o.at} of {o.count}: {o.text}" for o in refused if not o.named]
-        facts |= {f"{kind}, another named": wrong}
+        wrong = [one for one in refused if not one.named]
+        named, count = len(refused) - len(wrong), len(refused)
+        lost = f"{len(missed)} of {len(some)}"
+        claims.append(Claim(f"{kind}: kept, T p moved by over 1 %", lost, "0", not missed))
+        is_named = named >= 0.95 * count
+        claims.append(Claim(f"{kind}: refused and named", f"{named} of {count}", "95 %", is_named))
+        shares[kind] = count / len(some), named / len(some)
+        facts[f"{kind}, kept"] = [f"{o.where}: {o.change:.1%}" for o in missed]
+        facts[f"{kind}, another named"] = [f"{o.where}: {o.text}" for o in wrong]
     wrong = [one for one in outcomes if one.kind is None and one.refused]
     claims.append(Claim("scans without a fault, refused", f"{len(wrong)} of {clean}", "0", not wrong))
     facts |= {"refused without a fault": [f"{o.scan}: {o.text}" for o in wrong]}

@@ -70,10 +70,8 @@ def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
     many, due = found.error(found.run(MANY, 0, "plain")), (FEW / MANY) ** 0.5
     value, half = slope(errors["plain"])
     variance, slopes = "variance falls as one over the samples", f"slope {value:.3f} +- {half:.3f}"
-    gather, few = (
-        f"{FEW} samples a pixel suffice with final gather",
-        f"error {gathered:.1%}, without {plain:.0%}",
-    )
+    gather = f"{FEW} samples a pixel suffice with final gather"
+    few = f"error {gathered:.1%}, without {plain:.0%}"
     more = f"error {many:.1%} of {MANY} samples, {plain:.0%} of {FEW}"
     accurate, is_due = f"{due:.2f} times, within a tenth", abs(many / plain / due - 1) <= 0.1
     return [

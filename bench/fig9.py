@@ -97,13 +97,11 @@ def highlight(parts: Parts) -> np.ndarray:
 
 def claims(plain: Parts, board: Parts) -> list[Claim]:
     """Of both scenes."""
-    total, turns, least = (
-        plain.found.sum(axis=0) + plain.separation.rest,
-        plain.walls.min(),
-        board.walls.min(),
-    )
+    turns, least = plain.walls.min(), board.walls.min()
+    total = plain.found.sum(axis=0) + plain.separation.rest
     left = float(np.abs(total - plain.picture).max() / plain.picture.max())
     bright, off = highlight(board), board.off
+    beside = "beside a glossy board they still do so in turn"
     in_turn = f"at least {turns:.2%} of each on its wall"
     times = f"{bright[0]:.1f} times the rest of the board; in bounces {_list(bright[1:], '.2f')}"
     is_direct = bright[0] > 2 and bright[1:].max() < 1.5
@@ -114,9 +112,7 @@ def claims(plain: Parts, board: Parts) -> list[Claim]:
         Claim("successive bounces light the two walls in turn", in_turn, "99.9%", turns >= 0.999),
         Claim("each bounce is A^k l_d", f"off by {_list(plain.off, '.1g')}", "1e-2", plain.off.max() <= 1e-2),
         Claim("they add up to the picture", f"to {left:.1g}", "1e-6", left <= 1e-6),
-        Claim(
-            "beside a glossy board they still do so in turn", f"at least {least:.0%}", "75%", least >= 0.75
-        ),
+        Claim(beside, f"at least {least:.0%}", "75%", least >= 0.75),
         Claim("the highlight is in the direct light alone", times, "above 2; below 1.5", is_direct),
         Claim(glossy, errors, "direct 1e-2, first bounce 20%", is_near),
     ]

@@ -84,6 +84,10 @@ class Point:
     pixels: float
     core: float
 
+    def __str__(self) -> str:
+        size = f"{self.kept:.4g} a row, {self.nbytes / 1e6:.4g} MB"
+        return f"{size}, {self.pixels:.4g} ms, core {self.core:.4g} ms"
+
 
 def problem(smoke: bool) -> Problem:
     """The corner under a landscape."""
@@ -98,16 +102,13 @@ def problem(smoke: bool) -> Problem:
 def forms(given: Options, at: Problem) -> list[Form]:
     """R in pixels, with its rows in wavelets, and in wavelets on both sides."""
     W = Wavelet(given.device, at.grid, "db2")
-    transform = analysis(W)
-    drop = DROP * float(np.linalg.norm(at.R.ravel()))
-
+    transform, drop = analysis(W), DROP * float(np.linalg.norm(at.R.ravel()))
     found = []
     for name, out, into in (("pixels", None, None), ("rows", None, W), ("both", W, W)):
         note(FORMATS[name])
         matrix: Any = at.R
         if into is not None:
-            rows = source("R", at.R)
-            matrix = coefficients(rows, out and transform, transform, drop=drop).core
+            matrix = coefficients(source("R", at.R), out and transform, transform, drop=drop).core
         x, y = (v if V is None else V.matvec(v) for V, v in ((into, at.x), (out, at.y)))
         found.append(Form(name, matrix, out, into, x, y))
     return found
@@ -129,18 +130,10 @@ def measure(
         actions[f"ours, {form}"] = product(A, at.x)
         actions[f"core, {form}"] = product(core, np.resize(at.x, core.shape[1]))
     ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
-    points = [
-        Point(
-            form=form,
-            wanted=wanted,
-            error=relative(A.matvec(at.x), at.y),
-            kept=numbers[form].nnz / len(at.x),
-            nbytes=A.nbytes,
-            pixels=ms[f"ours, {form}"],
-            core=ms[f"core, {form}"],
-        )
-        for form, _, A in ways
-    ]
+    points = []
+    for form, _, A in ways:
+        error, kept = relative(A.matvec(at.x), at.y), numbers[form].nnz / len(at.x)
+        points.append(Point(form, wanted, error, kept, A.nbytes, ms[f"ours, {form}"], ms[f"core, {form}"]))
     return points, {name: ms[name] for name in others}
 
 
@@ -205,9 +198,8 @@ def across(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> No
     axes.vlines(dense, min(ERRORS) / 1.3, max(ERRORS), color=OTHERS, lw=1, ls=":")
     arrow = {"arrowstyle": "->", "color": INK, "shrinkA": 4, "shrinkB": 4}
     axes.annotate("", (ours, ERROR), (theirs, ERROR), arrowprops=arrow)
-    axes.text(
-        (ours * theirs**2) ** (1 / 3), ERROR * 1.1, text, color=INK, fontsize=9, ha="center", va="bottom"
-    )
+    place = (ours * theirs**2) ** (1 / 3), ERROR * 1.1
+    axes.text(*place, text, color=INK, fontsize=9, ha="center", va="bottom")
     axes.set_ylim(min(ERRORS) / 1.3, max(ERRORS) * 3)
     axes.set_yticks(ERRORS, [f"{100 * error:.2g} %" for error in ERRORS])
     axes.minorticks_off()
@@ -220,16 +212,9 @@ def main() -> None:
     for wanted in ERRORS:
         more, others = measure(given, at, found, wanted, memory)
         points, ms = points + more, ms | others
-    facts: dict[str, Any] = {
-        "pixels": len(at.x),
-        "triad, GB/s": nbytes / ms.pop("triad") / 1e6,
-        **{
-            f"{FORMATS[point.form]}, error {point.error:.2%}": f"{point.kept:.4g} a row, "
-            f"{point.nbytes / 1e6:.4g} MB, {point.pixels:.4g} ms, core {point.core:.4g} ms"
-            for point in points
-        },
-        "not installed": ", ".join(missing()) or "none",
-    }
+    facts: dict[str, Any] = {"pixels": len(at.x), "triad, GB/s": nbytes / ms.pop("triad") / 1e6}
+    facts |= {f"{FORMATS[point.form]}, error {point.error:.2%}": str(point) for point in points}
+    facts["not installed"] = ", ".join(missing()) or "none"
     rows = compare(at, points, ms)
     report(given, "Products with a smooth R", rows, facts, lambda: draw(at, points, ms))
 

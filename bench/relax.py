@@ -52,10 +52,10 @@ def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
             raise SystemExit(f"the sweep of {name} is not that of PyAMG")
         actions["pyamg"] = lambda: theirs(full, host, b)
     times = {key: value * 1e3 for key, value in seconds(actions, repeats=15).items()}
-    sweeping, blockwise = f"{name}, strips of {relax.block}", f"{name}, block method"
+    sweeping, one = f"{name}, strips of {relax.block}", times["product"]
     rows = [
-        Row.of_times(sweeping, "one product", times["product"], times["sweep"], "ms", PRODUCT_TARGET),
-        Row.of_times(blockwise, "one product", times["product"], times["block"], "ms", PRODUCT_TARGET),
+        Row.of_times(sweeping, "one product", one, times["sweep"], "ms", PRODUCT_TARGET),
+        Row.of_times(f"{name}, block method", "one product", one, times["block"], "ms", PRODUCT_TARGET),
     ]
     if theirs is not None:
         target = PYAMG_TARGETS.get(name, PYAMG_DENSE)

@@ -72,7 +72,7 @@ class Stopwatch(dict[str, float]):
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time a block and say so."""
+        """Time a block and note it."""
         start = time.perf_counter()
         yield
         self[name] = time.perf_counter() - start
@@ -179,15 +179,14 @@ def claims(found: Pictures, ms: dict[str, float], smoke: bool) -> list[Claim]:
     if smoke:
         return []
     names = ["pattern", "direct", *(f"bounce {k + 1}" for k in range(BOUNCES))]
-    what, limit = "of 131072 pixels in colour", f"at most {ERROR:.0%}"
-    of_errors = [
-        Claim(f"{name} {what}", f"error {error:.2%}", limit, error <= ERROR)
-        for name, error in zip(names, found.errors, strict=True)
-    ]
-    return of_errors + [
-        Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most)
-        for name, most in TARGETS.items()
-    ]
+    listed, limit = [], f"at most {ERROR:.0%}"
+    for name, error in zip(names, found.errors, strict=True):
+        listed.append(
+            Claim(f"{name} of 131072 pixels in colour", f"error {error:.2%}", limit, error <= ERROR)
+        )
+    for name, most in TARGETS.items():
+        listed.append(Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most))
+    return listed
 
 
 def draw(found: Pictures) -> Figure:
@@ -198,12 +197,13 @@ def draw(found: Pictures) -> Figure:
         "A picture on a corner of two walls, the pattern that makes it, and its light by bounces (4 times).",
     )
     walls = dihedral(2)
-    lefts, width = figures.columns(3 + BOUNCES, gap=14)
     shown = [("wanted", found.wanted, 1.0), ("pattern", found.pattern, 0.6), ("direct", found.parts[0], 1.0)]
     shown += [(f"bounce {k + 1}", part, 4.0) for k, part in enumerate(found.parts[1:])]
-    for left, (label, picture, gain) in zip(lefts, shown, strict=True):
+    views = []
+    for label, picture, gain in shown:
         view = draw_view(walls.viewer, walls.walls, picture.astype(np.float32), 400, 2)
-        figures.picture(figure, (left, 110, width), to_srgb(np.clip(gain * view, 0, 1)), label)
+        views.append((to_srgb(np.clip(gain * view, 0, 1)), label))
+    figures.pictures(figure, 110, views)
     return figure
 
 

@@ -108,15 +108,14 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
         "gmres": lambda: scipy_gmres(problem, full),
     }
     times = {name: 1e3 * spent for name, spent in seconds(actions, repeats=REPEATS).items()}
-    loop = f"{'scipy.sparse' if scipy.sparse.issparse(R) else 'numpy'} Neumann loop"
-    targets = (NEUMANN_TARGET, GMRES_TARGET) if problem.b.ndim == 1 else (None, None)
-    name = problem.name
+    loop, name = f"{'scipy.sparse' if scipy.sparse.issparse(R) else 'numpy'} Neumann loop", problem.name
+    of_neumann, of_gmres = (NEUMANN_TARGET, GMRES_TARGET) if problem.b.ndim == 1 else (None, None)
     new = [Row.of_times(name, "3 later solves", 3 * times["ours"], first, "ms", 1.0)] * (problem.b.ndim == 1)
     return [
         *new,
         Row.of_times(name, "Neumann's products", products, ours.products, "products", PRODUCTS_TARGET),
-        Row.of_times(name, loop, times["neumann"], times["ours"], "ms", targets[0]),
-        Row.of_times(name, "scipy GMRES", times["gmres"], times["ours"], "ms", targets[1]),
+        Row.of_times(name, loop, times["neumann"], times["ours"], "ms", of_neumann),
+        Row.of_times(name, "scipy GMRES", times["gmres"], times["ours"], "ms", of_gmres),
     ]
 
 
