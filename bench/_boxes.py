@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import ltcl
+from _coefficients import relative
 from ltcl.scenes import Scene, box
 from ltcl.scenes.viewer import Viewer
 from ltcl.solvers import Solution, Status
@@ -84,5 +85,4 @@ def race(name: str, n: int, sides: int, albedo: float, device: ltcl.Device) -> R
     (l_out,) = all_bounces(scene, l_d[None])
     jacobi, chebyshev = (ltcl.solve(S, l_out, m, rtol=1e-5, throw=False) for m in ("jacobi", "chebyshev"))
     rho_a = albedo * float(np.linalg.eigvalsh(scene.form_factors)[-1])
-    error = float(np.linalg.norm(chebyshev.x - l_d) / np.linalg.norm(l_d))
-    return Race(name, rho_a / (1 - rho_a), jacobi, chebyshev, error)
+    return Race(name, rho_a / (1 - rho_a), jacobi, chebyshev, relative(chebyshev.x, l_d))

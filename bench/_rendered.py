@@ -18,6 +18,7 @@ import numpy as np
 import scipy.ndimage
 
 import ltcl
+from _coefficients import relative
 from ltcl.acquisition import Calibration, MitsubaRig, Report, acquire
 from ltcl.device import Device
 
@@ -53,7 +54,7 @@ def loop(n: int, samples: int, patterns: np.ndarray, device: Device) -> Loop:
         truth = MitsubaRig("dihedral", grid, samples=FINE, seed=9, **linear, **common)
         inner = scipy.ndimage.binary_erosion(found.resampling.coverage > 0.8, np.ones((3, 3)))
         unit = _unit(T, truth, inner)
-        errors = [_off(unit * np.asarray(T @ p), truth.radiance(p), inner) for p in patterns]
+        errors = [relative(unit * np.asarray(T @ p)[inner], truth.radiance(p)[inner]) for p in patterns]
         photographs = Report.of(path).photographs
         return Loop(np.array(errors), photographs, *_compensated(T, rig, found, truth, inner))
 
@@ -62,10 +63,6 @@ def _unit(T: ltcl.Transport, truth: MitsubaRig, inner: np.ndarray) -> float:
     white = np.ones(T.grid, np.float32)
     ours, theirs = np.asarray(T @ white, np.float64)[inner], truth.radiance(white)[inner]
     return float(ours @ theirs / (ours @ ours))
-
-
-def _off(seen: np.ndarray, wanted: np.ndarray, where: np.ndarray) -> float:
-    return float(np.linalg.norm((seen - wanted)[where]) / np.linalg.norm(wanted[where]))
 
 
 def _compensated(

@@ -33,6 +33,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 
 import _figures as figures
 import ltcl
+from _coefficients import relative
 from _figures import Claim
 from _harness import options
 from ltcl.acquisition import Report, VirtualRig, acquire
@@ -150,14 +151,9 @@ def measured(truth: Truth, camera: str, strategy: str, device: Device, name: str
         P = np.repeat(held(truth.n)[..., None], truth.channels, axis=-1)
         ratios, inside = of_bounces(T, truth)
         return Found(
-            name, strategy, cost, apart(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
+            name, strategy, cost, relative(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
             *far(T, truth, unit), compensated(T, truth, unit), ratios, inside,
         )  # fmt: skip
-
-
-def apart(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """The largest relative error over pictures and channels."""
-    return float(np.max(np.linalg.norm(ours - theirs, axis=0) / np.linalg.norm(theirs, axis=0)))
 
 
 def rows(T: ltcl.Transport, truth: Truth) -> tuple[np.ndarray, float]:
@@ -176,7 +172,7 @@ def far(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> tuple[float, float
     (y, x), (v, u) = (np.divmod(part, TILES) for part in (tile, np.arange(TILES**2)))
     beyond = (np.maximum(abs(y - v), abs(x - u)) > 1)[..., None]
     ours, theirs = (np.sum(beyond * seen, axis=1) for seen in (unit * shown(T, P), truth.seen(P)))
-    return apart(ours, theirs), float(np.max(np.abs(ours.sum(axis=0) / theirs.sum(axis=0) - 1)))
+    return relative(ours, theirs), float(np.max(np.abs(ours.sum(axis=0) / theirs.sum(axis=0) - 1)))
 
 
 def of_bounces(T: ltcl.Transport, truth: Truth) -> tuple[list[float], float]:

@@ -82,17 +82,22 @@ def claims(found: Found) -> list[Claim]:
     signs = np.array([np.sign(swing[:9] - 1) for swing in found.swings.values()])
     left = {name: abs(swing[8] - 1) / abs(swing[4] - 1) for name, swing in found.swings.items()}
     is_alike = (signs == (-1.0) ** np.arange(9)).all() and max(left.values()) < 1.1 * min(left.values())
-    parts = ", ".join(f"{part:.2f} ({name})" for name, part in left.items())
+    parts = "4 terms more leave " + ", ".join(f"{part:.2f} ({name})" for name, part in left.items())
     large = {m: norm > ROUNDING for m, norm in found.norms.items()}
     ratios = {m: (norm / BOUNDS[m])[large[m]] for m, norm in found.norms.items()}
     worst = max(float(ratio.max(initial=0)) for ratio in ratios.values())
     off = max(np.abs(ratio / (1 - 2 * m) - 1).max(initial=0) for m, ratio in ratios.items())
-    closed, opened, below = found.closed, found.opened, found.below
+    closed, opened, few = found.closed, found.opened, found.closed[0.45]
     late = max(abs(r.steps() - math.log(RTOL) / math.log(r.rho)) for m, r in closed.items() if m < 0.5)
     fewer = [opened[sides].steps() for sides in SIDES[2:]]
+    faster = f"4, 3, 2, 1 sides: 1 % in {', '.join(map(str, fewer))}"
     falls = fewer == sorted(set(fewer), reverse=True) and fewer[0] <= 20
     most, error = max(r.chebyshev.products for r in found.races), max(r.error for r in found.races)
+    products = f"to 1e-5 in at most {most} products, {error:.1g} off the truth"
     converged = all(r.chebyshev.converged for r in found.races) and error < 1e-4
+    alike = "(a) alike at a corner, an edge and the centre: above, below, above ..."
+    constant, factor = "(b) it follows eq. 16 up to a constant", f"1 - 2m for all n, to {off:.1g}"
+    quick = "(c) albedo 0.45 converges in a few iterations"
     shared = "light that all walls share shrinks by m / (1 - m) = 0.82 an iteration: 1 % takes 23"
     limit = (
         "its form factors have the eigenvalue 0.82, not the 4/5 of one patch a wall: the limit is albedo "
@@ -103,41 +108,18 @@ def claims(found: Found) -> list[Claim]:
         return Claim(text, name + race.said, "over 50", 50 < race.steps() < math.inf, differs)
 
     return [
-        Claim(
-            "(a) alike at a corner, an edge and the centre: above, below, above ...",
-            f"4 terms more leave {parts}",
-            "signs alternate; within 10 %",
-            is_alike,
-        ),
+        Claim(alike, parts, "signs alternate; within 10 %", is_alike),
         Claim("(b) the error stays below eq. 16", f"at most {worst:.3f} of the bound", "1", worst <= 1),
-        Claim(
-            "(b) it follows eq. 16 up to a constant", f"1 - 2m for all n, to {off:.1g}", "0.01", off < 0.01
-        ),
-        Claim(
-            "(c) albedo 0.45 converges in a few iterations",
-            closed[0.45].said,
-            "1 % in at most 10",
-            closed[0.45].steps() <= 10,
-            shared,
-        ),
+        Claim(constant, factor, "0.01", off < 0.01),
+        Claim(quick, few.said, "1 % in at most 10", few.steps() <= 10, shared),
         Claim("(c) the rate is m / (1 - m)", f"1 % at most {late:.1f} iterations off it", "1", late <= 1),
         slow("(c) near 0.5 slowly", closed[0.49], "0.49: "),
         Claim("(c) 0.51 diverges", closed[0.51].said, "diverges", closed[0.51].diverged),
         Claim("(d) 6 sides diverge", opened[6].said, "diverges", opened[6].diverged),
         slow("(d) 5 sides converge very slowly", opened[5], differs=limit),
-        slow("(d) so they do below that limit", below, "0.60: "),
-        Claim(
-            "(d) fewer sides converge fast, the faster the fewer",
-            f"4, 3, 2, 1 sides: 1 % in {', '.join(map(str, fewer))}",
-            "falling, at most 20",
-            falls,
-        ),
-        Claim(
-            "ours: Chebyshev converges in all of them",
-            f"to 1e-5 in at most {most} products, {error:.1g} off the truth",
-            "below 1e-4",
-            converged,
-        ),
+        slow("(d) so they do below that limit", found.below, "0.60: "),
+        Claim("(d) fewer sides converge fast, the faster the fewer", faster, "falling, at most 20", falls),
+        Claim("ours: Chebyshev converges in all of them", products, "below 1e-4", converged),
     ]
 
 

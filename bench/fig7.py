@@ -31,13 +31,13 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, bisect, note, relative
+from _coefficients import analysis, fewest, note, relative
 from _corner import interreflection
 from _figures import Claim
 from _harness import Options, options, seconds
 from ltcl import checks
 from ltcl.compression import invert_coefficients
-from ltcl.compression.coefficients import coefficients, drop_below
+from ltcl.compression.coefficients import coefficients
 from ltcl.compression.sources import source
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet, restrict_to_support
 from ltcl.scenes import CornerRows, landscape
@@ -151,14 +151,10 @@ def of_both(given: Options, at: Problem) -> Any:
 def of_rows(given: Options, at: Problem, C: Any) -> Any:
     """R W^T = W^T C, one column of C after the other."""
     W = Wavelet(given.device, at.rows.grid, "db2")
-
-    def synthesis(a: np.ndarray) -> np.ndarray:
-        return W.apply_transpose(given.device.upload(a)).get()
-
     columns = source("C", scipy.sparse.csr_array(C.T), MEMORY)
     drop, most = FINE * float(np.linalg.norm(C.data)), MOST * C.shape[0]
-    found = coefficients(columns, None, synthesis, drop=drop, most=most)
-    return scipy.sparse.csr_array(found.core.T)
+    synthesis = lambda a: W.apply_transpose(given.device.upload(a)).get()  # noqa: E731
+    return scipy.sparse.csr_array(coefficients(columns, None, synthesis, drop=drop, most=most).core.T)
 
 
 def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
@@ -168,12 +164,10 @@ def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
     def system(core: Any, V: Any = W) -> IdentityPlus:
         return IdentityPlus(Compressed(core, V if both else None, V))
 
-    def error(threshold: float) -> float:
-        S = system(CSR(given.device, drop_below(C, threshold)[0]))
-        return relative(iterated(S, at, DROPPED / 10).x, at.l_d)
+    def error(core: Any) -> float:
+        return relative(iterated(system(CSR(given.device, core)), at, DROPPED / 10).x, at.l_d)
 
-    threshold = bisect(error, DROPPED, float(np.abs(C.data).max()))
-    kept, _ = drop_below(C, threshold)
+    kept = fewest(C, error, DROPPED)
     core, V = restrict_to_support(kept, W) if both else (kept, W)
     return by_steps(system(Tiles(given.device, core, 1, "float16"), V), at, core.nnz / len(at.l_out))
 

@@ -27,11 +27,11 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, bisect, note, relative, transport
+from _coefficients import analysis, fewest, note, relative, transport
 from _figures import Claim
 from _harness import Options, options, product, seconds
 from ltcl.compression import SparseInverse, invert_coefficients
-from ltcl.compression.coefficients import Coefficients, coefficients, drop_below
+from ltcl.compression.coefficients import Coefficients, coefficients
 from ltcl.compression.sources import source
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
@@ -90,6 +90,10 @@ class Built:
     lighter: ltcl.Transport
     spent: Stopwatch
 
+    def compensate(self, picture: np.ndarray) -> ltcl.Compensation:
+        """The pattern for a picture, whatever light it takes."""
+        return ltcl.compensate(self.lighter, picture, bounds=(-10.0, 10.0), rtol=ERROR)
+
 
 def build(given: Options, corner: Corner) -> Built:
     """The transport, from rows of A alone."""
@@ -114,14 +118,13 @@ def enough(given: Options, corner: Corner, cores: list[Any]) -> list[Any]:
     grey = np.roll(corner.picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
     exact, found = corner.direct(grey[:, None]), []
     for channel, C in enumerate(cores):
-        truth = exact[:, channel]
 
-        def error(threshold: float, C: Any = C, truth: np.ndarray = truth) -> float:
-            core, V = restrict_to_support(drop_below(C, threshold)[0], W)
+        def error(core: Any, truth: np.ndarray = exact[:, channel]) -> float:
+            core, V = restrict_to_support(core, W)
             S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
             return relative(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
 
-        found.append(drop_below(C, bisect(error, SHARE * ERROR, float(np.abs(C.data).max())))[0])
+        found.append(fewest(C, error, SHARE * ERROR))
     return found
 
 
@@ -135,25 +138,19 @@ class Pictures:
     errors: list[float]
 
 
-def compensate(built: Built, picture: np.ndarray) -> ltcl.Compensation:
-    """The pattern for a picture, whatever light it takes."""
-    return ltcl.compensate(built.lighter, picture, bounds=(-10.0, 10.0), rtol=ERROR)
-
-
 def pictures(corner: Corner, built: Built) -> Pictures:
     """Compensate and separate a landscape, and compare with the truth."""
     wanted = corner.picture
     with built.spent("compensate, first call"):
-        compensation = compensate(built, wanted)
+        pattern = built.compensate(wanted).pattern
     with built.spent("separate, first call"):
         separation = ltcl.separate(built.T, wanted, BOUNCES, rtol=SEPARATION)
     exact = [corner.direct(wanted.reshape(-1, 3))]
     for _ in range(BOUNCES):
         exact.append(corner.bounce(exact[-1]))
     parts = [separation.direct, *separation.bounces]
-    pairs = zip([compensation.pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
-    errors = [relative(part.reshape(-1, 3), truth) for part, truth in pairs]
-    return Pictures(wanted, compensation.pattern, parts, errors)
+    pairs = zip([pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
+    return Pictures(wanted, pattern, parts, [relative(part.reshape(-1, 3), truth) for part, truth in pairs])
 
 
 def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
@@ -169,7 +166,7 @@ def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
         "product, on coefficients": product(R.core, np.zeros(R.core.shape[1], np.float32)),
         "product, in pixels": product(R, pixels[:, 0]),
         "solve in colour": solve,
-        "compensate in colour": lambda: compensate(built, wanted),
+        "compensate in colour": lambda: built.compensate(wanted),
     }
     return {name: 1e3 * spent for name, spent in seconds(actions).items()}
 
@@ -181,9 +178,8 @@ def claims(found: Pictures, ms: dict[str, float], smoke: bool) -> list[Claim]:
     names = ["pattern", "direct", *(f"bounce {k + 1}" for k in range(BOUNCES))]
     listed, limit = [], f"at most {ERROR:.0%}"
     for name, error in zip(names, found.errors, strict=True):
-        listed.append(
-            Claim(f"{name} of 131072 pixels in colour", f"error {error:.2%}", limit, error <= ERROR)
-        )
+        text = f"{name} of 131072 pixels in colour"
+        listed.append(Claim(text, f"error {error:.2%}", limit, error <= ERROR))
     for name, most in TARGETS.items():
         listed.append(Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most))
     return listed
