@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,12 +44,19 @@ def all_bounces(scene: Scene, l_d: np.ndarray) -> np.ndarray:
     return np.linalg.solve(system, l_d[..., None])[..., 0]
 
 
-def terms(S: Any, l_out: np.ndarray, count: int) -> np.ndarray:
-    """Terms (-R)^k l_out for k = 0 .. count, (count + 1, N), by products with S = I + R on the device."""
+def terms(systems: Sequence[Any], l_out: np.ndarray, count: int) -> np.ndarray:
+    """Terms (-R)^k l_out for k = 0 .. count, (count + 1, channels, N), by products with S = I + R."""
     found = [l_out]
     for _ in range(count):
-        found.append(found[-1] - S @ found[-1])
+        found.append(found[-1] - np.stack([S @ l for S, l in zip(systems, found[-1], strict=True)]))
     return np.stack(found)
+
+
+def lit(room: Scene, lamp: Any, device: ltcl.Device) -> tuple[Scene, np.ndarray, Any, np.ndarray]:
+    """A room from the front, its direct light under a lamp (channels, N), S of each channel, the picture."""
+    scene = from_the_front(room)
+    l_d = scene.albedo * scene.irradiance(lamp).reshape(-1)
+    return scene, l_d, scene.transport(scene.first_bounce, device).systems, all_bounces(scene, l_d)
 
 
 @dataclass(frozen=True)

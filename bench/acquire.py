@@ -136,7 +136,6 @@ def shown(T: ltcl.Transport, P: np.ndarray) -> np.ndarray:
 
 
 def measured(truth: Truth, camera: str, strategy: str, device: Device, name: str) -> Found:
-    """Acquire and compare."""
     response, bits = CAMERAS[camera]
     grid, T_or = (truth.n, truth.n), truth.matrices if truth.channels == 3 else truth.matrices[0]
     rig = VirtualRig(T_or, grid, mixing=truth.mixing, response=response, bits=bits, ambient=0.01, seed=2)
@@ -204,7 +203,6 @@ def compensated(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> float:
 
 
 def claims(found: list[Found]) -> list[Claim]:
-    """What has to hold of each acquisition."""
     listed = []
     for one in found:
         ratios = ", ".join(f"{ratio:.2f}" for ratio in one.bounces[1:])
@@ -223,7 +221,6 @@ def claims(found: list[Found]) -> list[Claim]:
 
 
 def of_cost(costs: list[Cost], largest: int) -> list[Claim]:
-    """What has to hold of photographs."""
     cost = {one.strategy: one.photographs for one in costs if one.pixels == largest}
     over = max(one.photographs / one.planned for one in costs)
     fifth = "an adaptive scan takes a fifth of the photographs of one pixel at a time"

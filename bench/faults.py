@@ -284,7 +284,6 @@ def main() -> None:
 
 
 def draw(shares: dict[str, tuple[float, float]]) -> Figure:
-    """Bars of what was refused, and named, of each kind."""
     figure = Figure(figsize=(9, 4), dpi=120, layout="constrained")
     axes, places = figure.subplots(), range(len(shares))
     refused, named = zip(*shares.values(), strict=True)

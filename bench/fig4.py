@@ -81,7 +81,6 @@ def bounce_error(found: Series) -> float:
 
 
 def claims(found: Series) -> list[Claim]:
-    """What the paper says of the figure."""
     alternate = (-1.0) ** np.arange(11)
     right = np.mean(np.sign(found.terms[:11]) == alternate[:, None, None])
     before, after = cast(found.scene, found.sums[0]), cast(found.scene, found.sums[-1])
@@ -167,7 +166,7 @@ def main() -> None:
     scene, l_d = boxes.coloured_box(4 if given.smoke else 16)
     T = scene.transport(first_bounce=scene.first_bounce, device=given.device)
     l_out = boxes.all_bounces(scene, l_d)
-    series = np.stack([boxes.terms(S, l, TERMS) for S, l in zip(T.systems, l_out, strict=True)], axis=1)
+    series = boxes.terms(T.systems, l_out, TERMS)
     found = Series(scene, l_d, series, np.cumsum(series, axis=0))
     facts = {
         "patches": l_d.shape[1],

@@ -39,9 +39,9 @@ SHADES = ("#8bd17c", "#5cc8ff", "#c792ea", "#ffd166", "#ffb347", "#ff5d5d")
 def swings(n: int, device: ltcl.Device) -> dict[str, np.ndarray]:
     """Sums of 0 .. ORDERS terms over the truth, red light, at three patches of the floor of figure 4."""
     scene, l_d = boxes.coloured_box(n)
-    S = scene.transport(first_bounce=scene.first_bounce, device=device).systems[0]
-    sums = np.cumsum(boxes.terms(S, boxes.all_bounces(scene, l_d)[0], ORDERS), axis=0)
-    floor = (sums / l_d[0]).reshape(-1, n, 6, n)[:, :, FLOOR]
+    systems = scene.transport(first_bounce=scene.first_bounce, device=device).systems[:1]
+    series = boxes.terms(systems, boxes.all_bounces(scene, l_d)[:1], ORDERS)[:, 0]
+    floor = (np.cumsum(series, axis=0) / l_d[0]).reshape(-1, n, 6, n)[:, :, FLOOR]
     return {"corner": floor[:, 0, 0], "edge": floor[:, n // 2, 0], "centre": floor[:, n // 2, n // 2]}
 
 
@@ -78,7 +78,6 @@ def measure(n: int, device: ltcl.Device) -> Found:
 
 
 def claims(found: Found) -> list[Claim]:
-    """(a) to (d)."""
     signs = np.array([np.sign(swing[:9] - 1) for swing in found.swings.values()])
     left = {name: abs(swing[8] - 1) / abs(swing[4] - 1) for name, swing in found.swings.items()}
     is_alike = (signs == (-1.0) ** np.arange(9)).all() and max(left.values()) < 1.1 * min(left.values())
@@ -124,7 +123,6 @@ def claims(found: Found) -> list[Claim]:
 
 
 def draw(found: Found) -> Figure:
-    """The four graphs."""
     figure = figures.page(
         900,
         "Figure 5: when the inverse series converges, and where it does not",

@@ -78,20 +78,11 @@ class Recovery:
         return max(ltcl.solve(S, l, "chebyshev", rtol=RTOL).products for S, l in pairs)
 
 
-def sums(systems: tuple[Any, ...], l_out: np.ndarray) -> np.ndarray:
-    """Of 0 .. MOST terms of the series, (MOST + 1, 3, unknowns)."""
-    series = [boxes.terms(S, l, MOST) for S, l in zip(systems, l_out, strict=True)]
-    return np.cumsum(np.stack(series, axis=1), axis=0)
-
-
 def with_shadows(n: int, device: ltcl.Device) -> Recovery:
-    """The box with the block."""
     room = box(n, 5, SHADED, occluder=BLOCK, device=device)
-    scene = boxes.from_the_front(room)
-    l_d = scene.albedo * scene.irradiance(LAMP).reshape(-1)
-    systems = scene.transport(scene.first_bounce, device).systems
-    found = sums(systems, boxes.all_bounces(scene, l_d))
-    return Recovery(scene, l_d, found, systems, tuple(scene.A), scene.picture)
+    scene, l_d, systems, l_out = boxes.lit(room, LAMP, device)
+    sums = np.cumsum(boxes.terms(systems, l_out, MOST), axis=0)
+    return Recovery(scene, l_d, sums, systems, tuple(scene.A), scene.picture)
 
 
 def with_gloss(n: int, smoke: bool) -> Recovery:
@@ -100,8 +91,8 @@ def with_gloss(n: int, smoke: bool) -> Recovery:
     l_d = np.stack([K @ (scene.Q @ np.ones(scene.Q.shape[1])) for K in scene.K])
     systems = tuple(map(LightField, scene.A))
     l_out = np.stack([S @ l for S, l in zip(systems, l_d, strict=True)])
-    found, seen = sums(systems, l_out), lambda l: scene.picture(l @ scene.P.T)
-    return Recovery(scene.matte, l_d, found, systems, scene.A, seen)
+    sums, seen = np.cumsum(boxes.terms(systems, l_out, MOST), axis=0), lambda l: scene.picture(l @ scene.P.T)
+    return Recovery(scene.matte, l_d, sums, systems, scene.A, seen)
 
 
 def glossy_box(n: int, smoke: bool) -> Any:
@@ -126,12 +117,6 @@ class LightField(scipy.sparse.linalg.LinearOperator):
         return total
 
 
-def one_camera(smoke: bool, device: ltcl.Device) -> ltcl.Analysis:
-    """What `analyze` says of T as one camera and one projector measure it in a smaller glossy box."""
-    scene = glossy_box(4 if smoke else 6, smoke)
-    return ltcl.analyze(scene.transport(scene.first_bounce, device, on_dark="mask"))
-
-
 def in_shadow(found: Recovery) -> np.ndarray:
     """Light where the lamp casts none, relative to where it does, for each sum."""
     dark = found.l_d.sum(axis=0) == 0
@@ -139,7 +124,6 @@ def in_shadow(found: Recovery) -> np.ndarray:
 
 
 def claims(shade: Recovery, gloss: Recovery, camera: float) -> list[Claim]:
-    """Of both boxes."""
     dark, (shade_products, gloss_products) = in_shadow(shade), (shade.chebyshev(), gloss.chebyshev())
     shadows = f"light in them {dark[0]:.0%} of that outside, after 10 iterations {dark[10]:.1g}"
     products = f"shadows {shade_products}, gloss {gloss_products} products to 1 %"
@@ -173,7 +157,6 @@ def draw_row(figure: Figure, found: Recovery, top: float, shown: tuple[int, ...]
 
 
 def draw(shade: Recovery, gloss: Recovery) -> Figure:
-    """Both boxes, and their errors."""
     figure = figures.page(
         900,
         "Figure 6: the inverse series undoes shadowed and glossy scenes alike",
@@ -197,7 +180,9 @@ def main() -> None:
     given = options(__doc__ or "")
     shade = with_shadows(4 if given.smoke else 14, given.device)
     gloss = with_gloss(4 if given.smoke else 12, given.smoke)
-    camera = max(channel.spectral_radius for channel in one_camera(given.smoke, given.device).channels)
+    scene = glossy_box(4 if given.smoke else 6, given.smoke)  # smaller, as one camera and projector see it
+    T = scene.transport(scene.first_bounce, given.device, on_dark="mask")
+    camera = max(channel.spectral_radius for channel in ltcl.analyze(T).channels)
     errors = [[float(f"{e:.3g}") for e in found.errors] for found in (shade, gloss)]
     facts = {
         "unknowns": [found.l_d.shape[1] for found in (shade, gloss)],

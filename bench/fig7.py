@@ -11,7 +11,7 @@ converges. Four ways, the first also by the BLAS of NumPy, each to an error of a
 
 The last two keep the largest numbers that 0.7 % need, in 16 bits each. Timed is all from the picture on the
 host to l_d on the host, once R is in the form that the method wants. Dense R is (I - A)^-1 - I by
-factorization (`_corner.py`). Both compressed forms come from C of R = W^T C W, which eq. 21 makes on
+factorization (`_coefficients.py`). Both compressed forms come from C of R = W^T C W, which eq. 21 makes on
 coefficients from rows of A that stream by, as in `resolution131k.py`; rows in wavelets are R W^T = W^T C.
 Each method goes as far as memory, and some minutes, allow. The truth needs no inverse: l_d = l_out - A l_out,
 A by exact rows.
@@ -31,8 +31,7 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, fewest, note, relative
-from _corner import interreflection
+from _coefficients import analysis, fewest, interreflection, note, relative
 from _figures import Claim
 from _harness import Options, options, seconds
 from ltcl import checks
@@ -98,14 +97,12 @@ class Way:
 
 
 def problem(n: int) -> Problem:
-    """The corner under a landscape."""
     rows = CornerRows(n, ALBEDO)
     l_out = 0.05 + 0.4 * landscape(*rows.grid).mean(axis=2).reshape(-1)
     return Problem(rows, l_out, l_out - rows.matmat(l_out))
 
 
 def iterated(S: IdentityPlus, at: Problem, rtol: float) -> ltcl.Solution:
-    """Eq. 20."""
     return ltcl.solve(S, at.l_out, "jacobi", rtol=rtol)
 
 
@@ -288,7 +285,6 @@ def claims(points: list[Point], laws: dict[str, Law]) -> list[Claim]:
 
 
 def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
-    """Time over N, with the fitted laws."""
     figure = figures.page(
         600,
         "Figure 7: what the direct light takes, to 1 %",

@@ -50,11 +50,8 @@ class Inversion:
 
 
 def prepare(n: int, device: ltcl.Device) -> Inversion:
-    """The box and its light."""
-    scene = boxes.from_the_front(box(n, sides=5, albedo=ALBEDO))
-    l_d = scene.albedo[0] * scene.irradiance(LAMP).reshape(-1)
-    (S,) = scene.transport(scene.first_bounce, device).systems
-    return Inversion(scene, S, boxes.all_bounces(scene, l_d[None])[0], l_d)
+    scene, (l_d,), (S,), (l_out,) = boxes.lit(box(n, sides=5, albedo=ALBEDO), LAMP, device)
+    return Inversion(scene, S, l_out, l_d)
 
 
 def slope(errors: np.ndarray) -> tuple[float, float]:
@@ -65,7 +62,6 @@ def slope(errors: np.ndarray) -> tuple[float, float]:
 
 
 def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
-    """Of the curves, and of 30 samples."""
     plain, gathered = (found.error(found.run(FEW, 0, kind)) for kind in ("plain", "final gather"))
     many, due = found.error(found.run(MANY, 0, "plain")), (FEW / MANY) ** 0.5
     value, half = slope(errors["plain"])
@@ -82,7 +78,6 @@ def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
 
 
 def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
-    """Pictures above, curves below."""
     figure = figures.page(
         640,
         f"Figure 8: {len(found.l_d)} pixels inverted by random walks",

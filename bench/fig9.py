@@ -59,7 +59,6 @@ class Parts:
 
 
 def diffuse(n: int, device: ltcl.Device) -> Parts:
-    """The dihedral, and its separation."""
     scene = dihedral(n, albedo=WHITE)
     pattern = np.zeros((*scene.grid, 3))
     pattern[:, :n] = GREEN
@@ -96,7 +95,6 @@ def highlight(parts: Parts) -> np.ndarray:
 
 
 def claims(plain: Parts, board: Parts) -> list[Claim]:
-    """Of both scenes."""
     turns, least = plain.walls.min(), board.walls.min()
     total = plain.found.sum(axis=0) + plain.separation.rest
     left = float(np.abs(total - plain.picture).max() / plain.picture.max())
@@ -139,7 +137,6 @@ def draw_parts(figure: Figure, parts: Parts, top: float, text: str) -> None:
 
 
 def draw(plain: Parts, board: Parts) -> Figure:
-    """The page."""
     figure = figures.page(
         965,
         "Figure 9: a picture taken apart into its bounces of light",

@@ -84,7 +84,6 @@ def settles(T: np.ndarray, F: np.ndarray, l_in: np.ndarray) -> tuple[float, int 
 
 
 def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device: ltcl.Device) -> Case:
-    """Everything about one scene."""
     n, F = scene.grid[0], scene.first_bounce
     pattern = np.zeros(scene.grid)
     pattern[:, :n] = 1.0
@@ -121,7 +120,6 @@ def _digits(values: Any) -> Any:
 
 
 def cases(given: Options) -> list[Case]:
-    """All scenes."""
     n, directions = (4, 16) if given.smoke else (10, 64)
     shares = (0.0, 0.1, 0.2, 0.4) if given.smoke else (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
     found, place = [], {"projector": PROJECTOR, "directions": directions}

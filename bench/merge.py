@@ -37,7 +37,6 @@ def scene(n: int) -> np.ndarray:
 
 
 def photographs(light: np.ndarray, levels: int) -> list[np.ndarray]:
-    """Codes of all exposures."""
     rng, kind = np.random.default_rng(0), np.uint8 if levels == 256 else np.uint16
     shots = []
     for t in SECONDS:
@@ -53,7 +52,6 @@ def error(found: np.ndarray, true: np.ndarray) -> float:
 
 
 def speeds(given: Options, n: int) -> list[Row]:
-    """Merging, ours and theirs in turn."""
     light = scene(n)
     shots = {levels: photographs(light, levels) for levels in (256, 4096)}
     response, noise = Response(from_srgb(np.linspace(0, 1, 4097))), NoiseModel(ELECTRONS, READ, BLACK)

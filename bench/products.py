@@ -21,8 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import _figures as figures
-from _coefficients import ROWS, analysis, largest, note, relative
-from _corner import interreflection
+from _coefficients import ROWS, analysis, interreflection, largest, note, relative
 from _harness import Options, Row, options, product, report, seconds, triad
 from _peers import missing, sparse_products
 from ltcl.compression.coefficients import coefficients
@@ -90,7 +89,6 @@ class Point:
 
 
 def problem(smoke: bool) -> Problem:
-    """The corner under a landscape."""
     n = 8 if smoke else 96
     note(f"R of {2 * n * n} pixels")
     R = interreflection(n, ALBEDO, note)
@@ -158,7 +156,6 @@ def compare(at: Problem, points: list[Point], ms: dict[str, float]) -> list[Row]
 
 
 def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
-    """Error over bytes, and error over time."""
     figure = figures.page(
         470,
         "What a product with a smooth R takes",

@@ -27,7 +27,6 @@ PYAMG_DENSE = 6.0
 
 
 def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
-    """Rows for one matrix."""
     sparse = scipy.sparse.issparse(R)
     S = IdentityPlus(CSR(given.device, R) if sparse else Dense(given.device, R))
     n = S.shape[0]

@@ -172,7 +172,6 @@ def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
 
 
 def claims(found: Pictures, ms: dict[str, float], smoke: bool) -> list[Claim]:
-    """Errors of every picture, and time."""
     if smoke:
         return []
     names = ["pattern", "direct", *(f"bounce {k + 1}" for k in range(BOUNCES))]

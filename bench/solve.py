@@ -91,7 +91,6 @@ def scipy_gmres(problem: Problem, full: Any) -> tuple[np.ndarray, int]:
 
 
 def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
-    """Products and times of one problem."""
     R, identity = problem.R, scipy.sparse.eye_array(problem.R.shape[0]).astype(np.float32)
     full = scipy.sparse.csr_array(identity + R) if scipy.sparse.issparse(R) else R + identity.toarray()
     first = 1e3 * ltcl.solve(problem.S, problem.b, rtol=RTOL).seconds  # builds kernels, tunes

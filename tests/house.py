@@ -46,7 +46,7 @@ _TESTS = (
 )
 _OTHERS = {"acquisition": 6500, "store": 1200, "images": 500, "batch": 500, "cli": 2130, "scenes": 3000}
 _BENCHES = (
-    "_boxes _coefficients _corner _harness _peers claims csr dense4k launches products relax "
+    "_boxes _coefficients _harness _peers claims csr dense4k launches products relax "
     "resolution131k solve video walk"
 )
 BESIDE: dict[str, tuple[int, list[str]]] = {
