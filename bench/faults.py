@@ -34,6 +34,7 @@ from rich.progress import track
 
 import _figures as figures
 import ltcl
+from _coefficients import relative
 from _figures import Claim
 from _harness import options
 from ltcl import scenes
@@ -225,9 +226,8 @@ class Scan:
                 named = early and any(first <= number <= last for number in numbers(str(error)))
                 results.append(Outcome(kind, name, at, count, np.nan, early, named, str(error)))
                 continue
-            both = known & seen
-            change = np.linalg.norm((shown - clean)[:, both], axis=1) / np.linalg.norm(clean[:, both], axis=1)
-            results.append(Outcome(kind, name, at, count, float(change.max()), False, False, ""))
+            change = relative(shown[:, known & seen].T, clean[:, known & seen].T)
+            results.append(Outcome(kind, name, at, count, change, False, False, ""))
         return results
 
 

@@ -42,7 +42,7 @@ from _figures import Claim
 from _harness import Options, options
 from acquire import corner, held
 from ltcl.acquisition import Calibration, MitsubaRig, Report, VirtualRig, acquire, camera_map
-from ltcl.acquisition.geometry import Correspondence, decode
+from ltcl.acquisition.geometry import decode
 from ltcl.device import Device
 from ltcl.images import to_srgb
 
@@ -154,11 +154,11 @@ def placed(given: Options) -> list[Found]:
 
 @dataclass(frozen=True)
 class Loop:
-    """Errors of T p over held patterns, and pictures of the camera (H, W), linear, 1 is the brightest."""
+    """Largest error of T p of held patterns; pictures of the camera (H, W), linear, 1 is the brightest."""
 
-    errors: np.ndarray
+    error: float
     photographs: int
-    decibels: tuple[float, float]
+    decibels: list[float]
     before: np.ndarray
     after: np.ndarray
     desired: np.ndarray
@@ -167,53 +167,33 @@ class Loop:
 
 def rendered(n: int, samples: int, patterns: np.ndarray, device: Device) -> Loop:
     """Acquire a corner of 3 n / 4 x n pixels, and compensate a picture on it."""
-    grid = patterns.shape[1:]
-    camera = (round(SIZE * grid[0]), round(SIZE * n))
+    h, w = grid = patterns.shape[1:]
     common: dict[str, Any] = {"channels": 1, "albedo": ALBEDO}
-    place = {"camera_grid": camera, "baseline": BASELINE}
+    place = {"camera_grid": (round(SIZE * h), round(SIZE * n)), "baseline": BASELINE}
     rig = MitsubaRig("dihedral", grid, samples=samples, bits=12, **place, **common)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "T.zarr"
         T = acquire(rig, strategy="pixel", store=path, device=device)
-        found = Calibration.of(path)
+        found, photographs = Calibration.of(path), Report.of(path).photographs
         linear = {"projector_response": "linear", "sensitivity": rig.describe()["sensitivity"]}
         truth = MitsubaRig("dihedral", grid, samples=FINE, seed=9, **linear, **common)
         inner = scipy.ndimage.binary_erosion(found.resampling.coverage > 0.8, np.ones((3, 3)))
-        unit = _unit(T, truth, inner)
+        white = np.ones(grid, np.float32)
+        ours, theirs = np.asarray(T @ white, np.float64)[inner], truth.radiance(white)[inner]
+        unit = ours @ theirs / (ours @ ours)
         errors = [relative(unit * np.asarray(T @ p)[inner], truth.radiance(p)[inner]) for p in patterns]
-        photographs = Report.of(path).photographs
-        return Loop(np.array(errors), photographs, *_compensated(T, rig, found, truth, inner))
+        y, x = np.mgrid[:h, :w] / w
+        desired, level = 0.55 + 0.45 * np.sin(19 * np.hypot(x - 0.5, y - 0.37)), 0.7 * np.quantile(ours, 0.05)
+        pattern = ltcl.compensate(T, (level * desired).astype(np.float32), rtol=1e-3).pattern
+    both = desired * level / np.median(ours), np.clip(np.asarray(pattern, np.float64), 0.0, 1.0)
+    decibels = [_decibels(truth.radiance(p)[inner], desired[inner]) for p in both]
+    views = np.stack([rig.radiance(found.projector.codes(p)) for p in both])
+    views /= np.quantile(views, 0.995, axis=(1, 2)).max()
+    return Loop(max(errors), photographs, decibels, *views, desired, both[1])
 
 
-def _unit(T: ltcl.Transport, truth: MitsubaRig, inner: np.ndarray) -> float:
-    white = np.ones(T.grid, np.float32)
-    ours, theirs = np.asarray(T @ white, np.float64)[inner], truth.radiance(white)[inner]
-    return float(ours @ theirs / (ours @ ours))
-
-
-def _compensated(
-    T: ltcl.Transport, rig: MitsubaRig, found: Calibration, truth: MitsubaRig, inner: np.ndarray
-) -> tuple[tuple[float, float], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Peak signal over noise before and after, and the pictures."""
-    h, w = T.grid
-    y, x = np.mgrid[:h, :w] / w
-    desired = 0.55 + 0.45 * np.sin(19 * np.hypot(x - 0.5, y - 0.37))
-    white = np.asarray(T @ np.ones(T.grid, np.float32), np.float64)
-    level = 0.7 * np.quantile(white[inner], 0.05)
-    pattern = ltcl.compensate(T, (level * desired).astype(np.float32), rtol=1e-3).pattern
-    pattern = np.clip(np.asarray(pattern, np.float64), 0.0, 1.0)
-    plain = desired * level / np.median(white[inner])
-    shown = [truth.radiance(p) for p in (plain, pattern)]
-    views = [rig.radiance(found.projector.codes(p)) for p in (plain, pattern)]
-    top = max(float(np.quantile(view, 0.995)) for view in views)
-    before, after = (view / top for view in views)
-    decibels = (_decibels(shown[0], desired, inner), _decibels(shown[1], desired, inner))
-    return decibels, before, after, desired, pattern
-
-
-def _decibels(shown: np.ndarray, desired: np.ndarray, where: np.ndarray) -> float:
-    """Peak signal over noise at the best scale."""
-    a, b = shown[where], desired[where]
+def _decibels(a: np.ndarray, b: np.ndarray) -> float:
+    """Peak signal b over noise of a, at the best scale."""
     return float(10 * np.log10(b.max() ** 2 / np.mean((a * (a @ b) / (a @ a) - b) ** 2)))
 
 
@@ -223,11 +203,16 @@ def photographed(folder: Path = FOLDER) -> dict[str, float | str]:
         return {"real photographs": f"left out, {folder.name} is not beside the checkout"}
     paths = sorted(folder.glob("graycode_*.png"))
     photographs = [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in paths]
-    found = decode(photographs, BOARD_GRID)
-    lit = photographs[-2].astype(np.float32) - photographs[-1] > LIT
-    board = found.valid & _board(photographs[-2])
-    distance = _from_homography(found, board)
-    back, ahead = _reprojected(found, board, folder)
+    found, white = decode(photographs, BOARD_GRID), photographs[-2]
+    lit = white.astype(np.float32) - photographs[-1] > LIT
+    _, corners = cv2.findChessboardCorners(white, (7, 9))
+    hull = cv2.convexHull(corners.astype(np.float32)).astype(np.int32)
+    board = found.valid & (cv2.fillConvexPoly(np.zeros(white.shape, np.uint8), hull, (1,)) > 0)
+    camera = np.stack(np.nonzero(board)[::-1], axis=1).astype(np.float64)
+    projector = np.stack([found.x[board], found.y[board]], axis=1).astype(np.float64)
+    H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
+    distance = np.linalg.norm(cv2.perspectiveTransform(camera[:, None], H)[:, 0] - projector, axis=1)
+    back, ahead = _reprojected(camera[::20], STEP * projector[::20], folder)
     return {
         "real photographs, lit pixels decoded": float(found.valid[lit].mean()),
         "real, from a homography on the board, median of projector pixels": float(np.median(distance)),
@@ -237,40 +222,20 @@ def photographed(folder: Path = FOLDER) -> dict[str, float | str]:
     }
 
 
-def _from_homography(found: Correspondence, board: np.ndarray) -> np.ndarray:
-    """Projector pixels between each pixel of the board and the homography that fits them best."""
-    camera = np.stack(np.nonzero(board)[::-1], axis=1).astype(np.float64)
-    projector = np.stack([found.x[board], found.y[board]], axis=1).astype(np.float64)
-    H, _ = cv2.findHomography(camera, projector, cv2.RANSAC, 1.0)
-    return np.linalg.norm(cv2.perspectiveTransform(camera[:, None], H)[:, 0] - projector, axis=1)
-
-
-def _board(white: np.ndarray) -> np.ndarray:
-    """Pixels inside the corners of the chessboard."""
-    _, corners = cv2.findChessboardCorners(white, (7, 9))
-    hull = cv2.convexHull(corners.astype(np.float32)).astype(np.int32)
-    return cv2.fillConvexPoly(np.zeros(white.shape, np.uint8), hull, (1,)) > 0
-
-
-def _reprojected(found: Correspondence, board: np.ndarray, folder: Path) -> tuple[float, float]:
+def _reprojected(camera: np.ndarray, projector: np.ndarray, folder: Path) -> list[float]:
     """Points triangulated by the calibration, back in the projector and in the camera: rms distances."""
     file = cv2.FileStorage(str(folder / "calibration_result.xml"), cv2.FILE_STORAGE_READ)
     names = ("cam_int", "cam_dist", "proj_int", "proj_dist", "roration", "translation")
     K, D, P, E, R, t = (file.getNode(name).mat() for name in names)
-    v, u = np.nonzero(board)
-    camera = np.stack([u, v], axis=1)[::20].astype(np.float64)
-    projector = STEP * np.stack([found.x[board], found.y[board]], axis=1)[::20].astype(np.float64)
     lenses = ((camera, (K, D)), (projector, (P, E)))
     rays = [cv2.undistortPoints(seen[:, None], *lens)[:, 0] for seen, lens in lenses]
     X = cv2.triangulatePoints(np.eye(3, 4), np.hstack([R, t.reshape(3, 1)]), rays[0].T, rays[1].T)
-    X = (X[:3] / X[3]).T
-    turn = cv2.Rodrigues(R)[0]
+    X, still = (X[:3] / X[3]).T, np.zeros(3)
     off = (
-        cv2.projectPoints(X, turn, t, P, E)[0][:, 0] - projector,
-        cv2.projectPoints(X, np.zeros(3), np.zeros(3), K, D)[0][:, 0] - camera,
+        cv2.projectPoints(X, cv2.Rodrigues(R)[0], t, P, E)[0][:, 0] - projector,
+        cv2.projectPoints(X, still, still, K, D)[0][:, 0] - camera,
     )
-    back, ahead = (float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) for part in off)
-    return back, ahead
+    return [float(np.sqrt(np.mean(np.sum(distance**2, axis=1)))) for distance in off]
 
 
 def claims(found: list[Found], cameras: list[Found], loop: Loop | None) -> list[Claim]:
@@ -284,7 +249,7 @@ def claims(found: list[Found], cameras: list[Found], loop: Loop | None) -> list[
     measured = f"median {np.median(worst):.2%}, worst {max(worst):.2%}"
     listed.append(Claim(text, measured, "at most 1 %, each", max(worst) <= AT_RANDOM))
     if loop is not None:
-        (before, after), error = loop.decibels, float(loop.errors.max())
+        (before, after), error = loop.decibels, loop.error
         text = "T p on a rendered corner, against renders from the projector's place"
         listed.append(Claim(text, f"{error:.2%}", "at most 4 %", error <= RENDERED))
         text = "a picture compensated on it comes nearer to what was asked for"

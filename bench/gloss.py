@@ -93,25 +93,16 @@ def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device
     picture = T @ pattern
     found, warned = separated(T, picture)
     by_diagonal, _ = separated(ltcl.Transport(matrix, scene.grid, device=device), picture)
+    error, size = norms(found - truth), norms(truth)
+    negative = -np.minimum(found, 0).sum(axis=(1, 2)) / np.abs(found).sum(axis=(1, 2))
+    errors = error / size, error / np.linalg.norm(picture), norms(by_diagonal - truth) / size, negative
+    reported = T.reciprocity_defect, max(T.negative_bounces)
     desired = T @ np.random.default_rng(0).uniform(0.2, 0.8, scene.grid)
     compensation = ltcl.compensate(T, desired, method="direct")
     radius, iterations = settles(matrix, F, pattern.ravel())
-    return Case(
-        room=room,
-        exponent=exponent,
-        gloss=gloss,
-        off=_digits(norms(found - truth) / norms(truth)),
-        off_picture=_digits(norms(found - truth) / np.linalg.norm(picture)),
-        off_diagonal=_digits(norms(by_diagonal - truth) / norms(truth)),
-        negative=_digits(-np.minimum(found, 0).sum(axis=(1, 2)) / np.abs(found).sum(axis=(1, 2))),
-        defect=_digits(T.reciprocity_defect),
-        taken=_digits(max(T.negative_bounces)),
-        warned=warned,
-        radius=_digits(radius),
-        iterations=iterations,
-        compensation=_digits(compensation.error),
-        clipped=compensation.clipped,
-    )
+    rounded = [_digits(value) for value in (*errors, *reported)]
+    last = _digits(compensation.error), compensation.clipped
+    return Case(room, exponent, gloss, *rounded, warned, _digits(radius), iterations, *last)
 
 
 def _digits(values: Any) -> Any:

@@ -49,7 +49,7 @@ TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
 
 @dataclass(frozen=True)
 class Corner:
-    """Rows of A of a reference albedo; A of a channel is a multiple of it."""
+    """Rows of A of a reference albedo; A of a channel is a multiple of it. Light is (N, 3) float64."""
 
     rows: CornerRows
 
@@ -59,12 +59,8 @@ class Corner:
         return 0.05 + 0.4 * landscape(*self.rows.grid).astype(np.float64)
 
     def bounce(self, light: np.ndarray) -> np.ndarray:
-        """A_c l_c of every channel, (N, 3) float64, with every number of A."""
+        """A_c l_c of every channel, with every number of A; the direct light of a picture l is l - A l."""
         return self.rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
-
-    def direct(self, light: np.ndarray) -> np.ndarray:
-        """Direct light of a picture, (N, 3) float64, in every channel."""
-        return light - self.bounce(light)
 
 
 class Stopwatch(dict[str, float]):
@@ -116,7 +112,7 @@ def enough(given: Options, corner: Corner, cores: list[Any]) -> list[Any]:
     """The largest numbers of R, with which the direct light of another picture is off by 0.6 %."""
     W, (h, w) = Wavelet(given.device, corner.rows.grid, "db2"), corner.rows.grid
     grey = np.roll(corner.picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
-    exact, found = corner.direct(grey[:, None]), []
+    exact, found = grey[:, None] - corner.bounce(grey[:, None]), []
     for channel, C in enumerate(cores):
 
         def error(core: Any, truth: np.ndarray = exact[:, channel]) -> float:
@@ -145,7 +141,8 @@ def pictures(corner: Corner, built: Built) -> Pictures:
         pattern = built.compensate(wanted).pattern
     with built.spent("separate, first call"):
         separation = ltcl.separate(built.T, wanted, BOUNCES, rtol=SEPARATION)
-    exact = [corner.direct(wanted.reshape(-1, 3))]
+    l_out = wanted.reshape(-1, 3)
+    exact = [l_out - corner.bounce(l_out)]
     for _ in range(BOUNCES):
         exact.append(corner.bounce(exact[-1]))
     parts = [separation.direct, *separation.bounces]
