@@ -202,14 +202,20 @@ def compensated(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> float:
     return float(10 * np.log10(desired.max() ** 2 / np.mean(error**2)))
 
 
-def claims(found: list[Found]) -> list[Claim]:
-    listed = []
+def claims(found: list[Found], costs: list[Cost], largest: int) -> list[Claim]:
+    """Of photographs, and of each acquisition."""
+    cost = {one.strategy: one.photographs for one in costs if one.pixels == largest}
+    over = max(one.photographs / one.planned for one in costs)
+    fifth = "an adaptive scan takes a fifth of the photographs of one pixel at a time"
+    counts, is_fifth = f"{cost['adaptive']} of {cost['pixel']}", 5 * cost["adaptive"] <= cost["pixel"]
+    listed = [
+        Claim(fifth, counts, "at most 1 / 5", is_fifth),
+        Claim("photographs over what the plan said, at most", f"{over:.3f}", "at most 1", over <= 1),
+    ]
     for one in found:
         ratios = ", ".join(f"{ratio:.2f}" for ratio in one.bounces[1:])
-        bounces, inside = (
-            f"{one.name}: bounces 1 to 3, error over std",
-            f"{one.inside:.1%} within 3 deviations",
-        )
+        bounces = f"{one.name}: bounces 1 to 3, error over std"
+        inside = f"{one.inside:.1%} within 3 deviations"
         listed += [
             Claim(f"{one.name}: T p of held patterns", f"{one.held:.2%}", "at most 2 %", one.held <= 0.02),
             Claim(f"{one.name}: row sum furthest off", f"{one.sums:.2%}", "at most 2 %", one.sums <= 0.02),
@@ -218,17 +224,6 @@ def claims(found: list[Found]) -> list[Claim]:
             Claim(bounces, f"{ratios}; {inside}", "at most 2", max(one.bounces[1:]) <= 2),
         ]
     return listed
-
-
-def of_cost(costs: list[Cost], largest: int) -> list[Claim]:
-    cost = {one.strategy: one.photographs for one in costs if one.pixels == largest}
-    over = max(one.photographs / one.planned for one in costs)
-    fifth = "an adaptive scan takes a fifth of the photographs of one pixel at a time"
-    counts, is_fifth = f"{cost['adaptive']} of {cost['pixel']}", 5 * cost["adaptive"] <= cost["pixel"]
-    return [
-        Claim(fifth, counts, "at most 1 / 5", is_fifth),
-        Claim("photographs over what the plan said, at most", f"{over:.3f}", "at most 1", over <= 1),
-    ]
 
 
 def draw(costs: list[Cost]) -> Figure:
@@ -287,7 +282,7 @@ def main() -> None:
     for cost in costs:
         name = f"{cost.strategy}, {cost.pixels} pixels, photographs over plan"
         facts[name] = cost.photographs / cost.planned
-    listed = of_cost(costs, sides[-1] ** 2) + claims(found)
+    listed = claims(found, costs, sides[-1] ** 2)
     if given.smoke:  # so few pixels show that it runs, not how few photographs a larger one takes
         listed = listed[1:2]
     figures.conclude(given, "A transport from photographs", listed, facts, partial(draw, costs))

@@ -58,6 +58,7 @@ FAULTS, CLEAN = 100, 200
 VIEWS = 10
 HARM = 0.01
 PROCESSES = 2
+opened = cache(ltcl.open_device)  # of each process
 
 
 @cache
@@ -153,15 +154,11 @@ class Person:
         if kind == "a third of a stop" and n == at:
             return self._rig.photograph(codes, seconds * 2.0 ** (1 / 3))
         image = self._rig.photograph(codes, seconds)
-        return jpeg(image, self.bits) if kind == "JPEG from one on" else image
-
-
-def jpeg(image: np.ndarray, bits: int | None) -> np.ndarray:
-    """The photograph as a JPEG of quality 70."""
-    shift = (bits or 8) - 8
-    _, data = cv2.imencode(".jpg", (image >> shift).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 70])
-    decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    return np.asarray(decoded).astype(image.dtype) << shift
+        if kind == "JPEG from one on":
+            shift, quality = (self.bits or 8) - 8, [cv2.IMWRITE_JPEG_QUALITY, 70]
+            _, data = cv2.imencode(".jpg", (image >> shift).astype(np.uint8), quality)
+            return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)).astype(image.dtype) << shift
+        return image
 
 
 @dataclass(frozen=True)
@@ -243,13 +240,7 @@ def numbers(text: str) -> set[int]:
 def run(job: tuple[int, Sequence[str]]) -> list[Outcome]:
     """One scan and its faults, in a process of its own."""
     number, kinds = job
-    return Scan(number).outcomes(kinds, device())
-
-
-@cache
-def device() -> Device:
-    """That of this process."""
-    return ltcl.open_device()
+    return Scan(number).outcomes(kinds, opened())
 
 
 def main() -> None:

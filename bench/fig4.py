@@ -70,21 +70,15 @@ def contents(n: int, bounces: int) -> np.ndarray:
     return np.cumsum(bounce_coefficients(n, bounces))
 
 
-def bounce_error(found: Series) -> float:
-    """Largest relative difference of sums of 1 .. ORDERS terms from `contents` of A^j l_d in float64."""
-    bounces = [found.l_d]
-    for _ in range(99):
-        bounces.append(boxes.bounce(found.scene, bounces[-1]))
-    expected = [np.tensordot(contents(n, 99), bounces, 1) for n in range(1, ORDERS + 1)]
-    off = np.linalg.norm(found.sums[1 : ORDERS + 1] - expected, axis=(1, 2))
-    return float(off.max() / np.linalg.norm(found.l_d))
-
-
 def claims(found: Series) -> list[Claim]:
     alternate = (-1.0) ** np.arange(11)
     right = np.mean(np.sign(found.terms[:11]) == alternate[:, None, None])
     before, after = cast(found.scene, found.sums[0]), cast(found.scene, found.sums[-1])
-    off, errors = bounce_error(found), found.errors
+    bounces, errors = [found.l_d], found.errors
+    for _ in range(99):
+        bounces.append(boxes.bounce(found.scene, bounces[-1]))
+    expected = [np.tensordot(contents(n, 99), bounces, 1) for n in range(1, ORDERS + 1)]
+    off = np.linalg.norm(found.sums[1 : ORDERS + 1] - expected, axis=(1, 2)).max() / np.linalg.norm(found.l_d)
     absent = not any(contents(n, n)[1:].any() for n in range(1, ORDERS + 1))
     closer = int(np.argmin(np.diff(errors[:21]) < 0)) or 20
     listed = [Claim("terms alternate in sign", f"in {right:.0%} of values of 11 terms", "100%", right == 1)]
@@ -95,13 +89,13 @@ def claims(found: Series) -> list[Claim]:
         measured = f"beside the {own} wall, {own} over {other} and blue: {shown} ..."
         listed.append(Claim(text, measured, "+ - + - ...", (excess * alternate > 0).all()))
     colour = f"colour cast of neutral walls {before:.0%}, after {TERMS} terms {after:.1g}"
-    bounces = f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}"
+    removes = f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}"
     error = f"error {errors[0]:.2g}, after {TERMS} terms {errors[-1]:.1g}; each of the first {closer} closer"
     removed, converges = absent and off < 1e-5, errors[-1] < 1e-3 and closer == 20
     return [
         *listed,
         Claim("in the end no colour bleeds", colour, "below 1e-3", after < 1e-3 < before),
-        Claim("n terms remove the bounces 1 .. n (eq. 12, 13)", bounces, "0; below 1e-5", removed),
+        Claim("n terms remove the bounces 1 .. n (eq. 12, 13)", removes, "0; below 1e-5", removed),
         Claim("the series converges to the direct light", error, "below 1e-3; 20", converges),
     ]
 
@@ -173,9 +167,8 @@ def main() -> None:
         "largest albedo": float(scene.albedo.max()),
         "relative error after n terms": [float(f"{error:.3g}") for error in found.errors],
     }
-    figures.conclude(
-        given, "Figure 4: terms of the inverse series", claims(found), facts, lambda: draw(found)
-    )
+    title = "Figure 4: terms of the inverse series"
+    figures.conclude(given, title, claims(found), facts, lambda: draw(found))
 
 
 if __name__ == "__main__":

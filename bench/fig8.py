@@ -49,22 +49,12 @@ class Inversion:
         return np.array([[self.error(self.run(int(n), s, kind)) for s in range(SEEDS)] for n in COUNTS])
 
 
-def prepare(n: int, device: ltcl.Device) -> Inversion:
-    scene, (l_d,), (S,), (l_out,) = boxes.lit(box(n, sides=5, albedo=ALBEDO), LAMP, device)
-    return Inversion(scene, S, l_out, l_d)
-
-
-def slope(errors: np.ndarray) -> tuple[float, float]:
-    """Of log variance over log samples, and half its 99 % confidence interval."""
-    samples = np.repeat(np.log(COUNTS), SEEDS)
-    fit: Any = scipy.stats.linregress(samples, 2 * np.log(errors.ravel()))
-    return float(fit.slope), float(fit.stderr * scipy.stats.t.ppf(0.995, len(samples) - 2))
-
-
 def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
     plain, gathered = (found.error(found.run(FEW, 0, kind)) for kind in ("plain", "final gather"))
     many, due = found.error(found.run(MANY, 0, "plain")), (FEW / MANY) ** 0.5
-    value, half = slope(errors["plain"])
+    samples = np.repeat(np.log(COUNTS), SEEDS)
+    fit: Any = scipy.stats.linregress(samples, 2 * np.log(errors["plain"].ravel()))
+    value, half = fit.slope, fit.stderr * scipy.stats.t.ppf(0.995, len(samples) - 2)
     variance, slopes = "variance falls as one over the samples", f"slope {value:.3f} +- {half:.3f}"
     gather = f"{FEW} samples a pixel suffice with final gather"
     few = f"error {gathered:.1%}, without {plain:.0%}"
@@ -103,7 +93,9 @@ def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
 
 def main() -> None:
     given = options(__doc__ or "")
-    found = prepare(6 if given.smoke else 32, given.device)
+    room = box(6 if given.smoke else 32, sides=5, albedo=ALBEDO)
+    scene, (l_d,), (S,), (l_out,) = boxes.lit(room, LAMP, given.device)
+    found = Inversion(scene, S, l_out, l_d)
     errors = {kind: found.errors(kind) for kind in KINDS}
     facts = {"pixels": len(found.l_d), "albedo": ALBEDO, "samples": COUNTS.tolist()}
     for kind, values in errors.items():

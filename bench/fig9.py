@@ -85,20 +85,14 @@ def with_board(n: int, smoke: bool, device: ltcl.Device) -> Parts:
     return Parts(scene.matte, picture, separation, scene.bounces(pattern, BOUNCES))
 
 
-def highlight(parts: Parts) -> np.ndarray:
-    """Light where the board has its highlight over that on the rest of it, for direct light and bounces."""
-    n = parts.scene.grid[0]
-    board = parts.found.mean(axis=-1)[:, :, 2 * n :]
-    there = parts.truth[0].mean(axis=-1)[:, 2 * n :]
-    there = there > there.max() / 2
-    return board[:, there].mean(axis=1) / board[:, ~there].mean(axis=1)
-
-
 def claims(plain: Parts, board: Parts) -> list[Claim]:
     turns, least = plain.walls.min(), board.walls.min()
     total = plain.found.sum(axis=0) + plain.separation.rest
     left = float(np.abs(total - plain.picture).max() / plain.picture.max())
-    bright, off = highlight(board), board.off
+    n, off = board.scene.grid[0], board.off
+    there, light = (each.mean(axis=-1)[..., 2 * n :] for each in (board.truth[0], board.found))
+    there = there > there.max() / 2  # on the board, where the direct light has its highlight
+    bright = light[:, there].mean(axis=1) / light[:, ~there].mean(axis=1)
     beside = "beside a glossy board they still do so in turn"
     in_turn = f"at least {turns:.2%} of each on its wall"
     times = f"{bright[0]:.1f} times the rest of the board; in bounces {_list(bright[1:], '.2f')}"

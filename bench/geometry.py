@@ -25,6 +25,7 @@ import importlib.util
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -39,7 +40,7 @@ import _figures as figures
 import ltcl
 from _coefficients import relative
 from _figures import Claim
-from _harness import Options, options
+from _harness import options
 from acquire import corner, held
 from ltcl.acquisition import Calibration, MitsubaRig, Report, VirtualRig, acquire, camera_map
 from ltcl.acquisition.geometry import decode
@@ -116,40 +117,22 @@ def at_random(seed: int) -> View:
     return View(float(size), place, (H, W), seed)
 
 
-def measured(given: Options, truth: np.ndarray, view: View, camera: str, noise: str) -> Found:
+def measured(device: Device, truth: np.ndarray, view: View, camera: str, noise: str) -> Found:
     (response, bits), (electrons, read) = CAMERAS[camera], NOISES[noise]
     C = camera_map(view.place, view.grid, (N, N), points=16)
     common: dict[str, Any] = {"response": response, "bits": bits, "gain": electrons, "read": read}
     common |= {"camera_grid": view.grid, "camera_map": C, "ambient": 0.01, "seed": view.seed}
     rig = VirtualRig(truth, (N, N), **common)
     with TemporaryDirectory() as folder:
-        T = acquire(rig, strategy="pixel", store=Path(folder) / "T.zarr", device=given.device)
+        T = acquire(rig, strategy="pixel", store=Path(folder) / "T.zarr", device=device)
         P, seen = held(N), ~T.masked
         ours = np.asarray(T @ P.T.reshape(-1, N, N), np.float64).reshape(P.shape[1], -1).T[seen]
         white = np.asarray(T @ np.ones((N, N)), np.float64).ravel()[seen]
     theirs = truth.sum(axis=1)[seen]
     wanted = (truth @ P)[seen]
-    off = np.linalg.norm((white @ theirs) / (white @ white) * ours - wanted, axis=0)
-    relative = off / np.linalg.norm(wanted, axis=0)
-    errors = {name: float(relative[part].max()) for name, part in KINDS.items()}
+    ours *= (white @ theirs) / (white @ white)
+    errors = {name: relative(ours[:, some], wanted[:, some]) for name, some in KINDS.items()}
     return Found(view.size, camera, noise, errors, int(np.count_nonzero(~seen)))
-
-
-def virtual(given: Options) -> list[Found]:
-    """All sizes with the least noise, and more noise with three camera pixels to a projector pixel."""
-    truth, quiet = corner(N), next(iter(NOISES))
-    cameras = list(CAMERAS)[:1] if given.smoke else list(CAMERAS)
-    sizes = CLAIMED[:1] if given.smoke else SIZES
-    found = [measured(given, truth, askance(size), camera, quiet) for camera in cameras for size in sizes]
-    louder = () if given.smoke else list(NOISES)[1:]
-    return found + [measured(given, truth, askance(3.0), cameras[-1], noise) for noise in louder]
-
-
-def placed(given: Options) -> list[Found]:
-    """Cameras at random, of 12 bits and with the least noise."""
-    truth, camera, quiet = corner(N), list(CAMERAS)[-1], next(iter(NOISES))
-    seeds = range(2 if given.smoke else PLACES)
-    return [measured(given, truth, at_random(seed), camera, quiet) for seed in seeds]
 
 
 @dataclass(frozen=True)
@@ -326,7 +309,14 @@ def _percent(axes: Axes) -> None:
 
 def main() -> None:
     given = options(__doc__ or "")
-    found, cameras, loop = virtual(given), placed(given), None
+    run, loop = partial(measured, given.device, corner(N)), None
+    kinds, quiet = list(CAMERAS), next(iter(NOISES))
+    seen, sizes, louder, seeds = kinds, SIZES, list(NOISES)[1:], range(PLACES)
+    if given.smoke:
+        seen, sizes, louder, seeds = kinds[:1], CLAIMED[:1], (), range(2)
+    found = [run(askance(size), camera, quiet) for camera in seen for size in sizes]
+    found += [run(askance(3.0), kinds[-1], noise) for noise in louder]
+    cameras = [run(at_random(seed), kinds[-1], quiet) for seed in seeds]
     if importlib.util.find_spec("mitsuba") is not None:
         n = 12 if given.smoke else 24
         patterns = held(n).T.reshape(-1, n, n)[:, : 3 * n // 4].astype(np.float32)

@@ -28,13 +28,6 @@ GO_ON = 0.5
 STEPS = 1.0 / (1.0 - GO_ON)  # of a walk, in the mean
 
 
-def signed(n: int, per_row: int) -> Any:
-    """R of n pixels, entries of row sums around 0.45 at random places, a fifth of them negative."""
-    R = matrix(n, per_row, 1)
-    R.data = (np.random.default_rng(0).uniform(-0.3, 1.2, R.nnz) / per_row).astype(np.float32)
-    return R
-
-
 def numba_walker(R: Any, b: np.ndarray, made: Tables, samples: int) -> Callable[[], np.ndarray] | None:
     """The same by alias tables, or None where Numba is not installed (the extra `bench` brings it)."""
     if "numba" in missing():
@@ -93,7 +86,9 @@ def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
 def main() -> None:
     given = options(__doc__ or "")
     n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
-    R, b = signed(n, per_row), np.random.default_rng(2).random(n, dtype=np.float32)
+    R, b = matrix(n, per_row, 1), np.random.default_rng(2).random(n, dtype=np.float32)
+    values = np.random.default_rng(0).uniform(-0.3, 1.2, R.nnz)  # a fifth negative; row sums around 0.45
+    R.data = (values / per_row).astype(np.float32)
     made, light, pixels = Tables(CSR(given.device, R)), given.device.upload(b), np.arange(n)
     walker = Walker(made, Lengths.geometric(GO_ON, -1.0), 0)
     actions: dict[str, Callable[[], Any]] = {"ours": lambda: walker.rows(light, pixels, samples).mean}
