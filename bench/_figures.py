@@ -23,9 +23,7 @@ from ltcl.images import from_srgb, to_srgb
 from ltcl.plots.page import FAINT, GRID, PAPER, axes_at, figure_of, heading, label_at
 from ltcl.scenes import Scene
 
-Box = tuple[float, float, float, float]
-"""Left, top, width and height in pixels, from the top left corner of the page."""
-
+Box = tuple[float, float, float, float]  # left, top, width and height in pixels, from the top left corner
 WIDTH, MARGIN, SIZE = 1000, 30, 400  # pixels of the page, and of a view
 
 
@@ -88,19 +86,15 @@ def columns(count: int, gap: int = 14) -> tuple[list[float], float]:
 
 def picture(
     figure: Figure, place: tuple[float, float, float], image: np.ndarray, label: str, note: str = ""
-) -> float:
-    """Draw an image (h, w, 3), sRGB in [0, 1], with a label above and a note below; return its height.
-
-    `place` is left, top and width in pixels; the label takes 20 pixels above the top.
-    """
-    left, top, width = place
+) -> None:
+    """Draw an image (h, w, 3), sRGB in [0, 1], with a label of 20 pixels above and a note below."""
+    left, top, width = place  # in pixels
     height = width * image.shape[0] / image.shape[1]
     label_at(figure, left, top - 6, label, size=10.5, fontweight="bold", va="bottom")
     axes = axes_at(figure, (left, top, width, height))
     axes.imshow(image, interpolation="antialiased", aspect="auto")
     axes.axis("off")
     label_at(figure, left, top + height + 5, note, size=9.5, color=FAINT, linespacing=1.35)
-    return height
 
 
 def pictures(figure: Figure, top: float, shown: Sequence[tuple[Any, ...]], gap: int = 14) -> None:

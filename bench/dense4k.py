@@ -25,8 +25,7 @@ def main() -> None:
     T = scene.transport(device=given.device)
     S = T.systems[0]
     dense = S.to_dense()
-    pattern = np.random.default_rng(0).random(T.shape[1])
-    l_d = T.first_bounce * pattern
+    l_d = T.first_bounce * np.random.default_rng(0).random(T.shape[1])
     l_out = dense @ l_d
     l_out32, factors32 = l_out.astype(np.float32), scipy.linalg.lu_factor(dense.astype(np.float32))
     A = np.eye(len(dense)) - np.linalg.inv(dense)
@@ -41,8 +40,7 @@ def main() -> None:
         "inverse": lambda: inverse.solve(l_out),
     }
     times = seconds(actions, repeats=5)
-    question = f"direct part at N = {T.shape[0]}"
-    kept = "LU kept, float32 (ours: an inverse kept)"
+    question, kept = f"direct part at N = {T.shape[0]}", "LU kept, float32 (ours: an inverse kept)"
     rows = [
         Row.of_times(question, "numpy.linalg.solve, float64", times["float64"], times["ours"], "s", 51.0),
         Row.of_times(question, kept, times["kept32"], times["inverse"], "s", 1.0),

@@ -102,17 +102,16 @@ def problem(n: int) -> Problem:
     return Problem(rows, l_out, l_out - rows.matmat(l_out))
 
 
-def iterated(S: IdentityPlus, at: Problem, rtol: float) -> ltcl.Solution:
-    return ltcl.solve(S, at.l_out, "jacobi", rtol=rtol)
-
-
 def by_steps(S: IdentityPlus, at: Problem, kept: float) -> Way:
     """The iteration, with the loosest tolerance whose error is small enough."""
-    enough = (t for t in TOLERANCES if relative(iterated(S, at, t).x, at.l_d) <= ERROR)
+
+    def solve(rtol: float) -> ltcl.Solution:
+        return ltcl.solve(S, at.l_out, "jacobi", rtol=rtol)
+
+    enough = (t for t in TOLERANCES if relative(solve(t).x, at.l_d) <= ERROR)
     rtol = float(next(enough, TOLERANCES[-1]))
-    s = iterated(S, at, rtol)
-    error = relative(s.x, at.l_d)
-    return Way(lambda: iterated(S, at, rtol).x, error, s.seconds, s.products, S.nbytes, kept)
+    s = solve(rtol)
+    return Way(lambda: solve(rtol).x, relative(s.x, at.l_d), s.seconds, s.products, S.nbytes, kept)
 
 
 def by_numpy(S: IdentityPlus, steps: int) -> np.ndarray:
@@ -162,7 +161,8 @@ def by_wavelets(given: Options, at: Problem, C: Any, both: bool) -> Way:
         return IdentityPlus(Compressed(core, V if both else None, V))
 
     def error(core: Any) -> float:
-        return relative(iterated(system(CSR(given.device, core)), at, DROPPED / 10).x, at.l_d)
+        S = system(CSR(given.device, core))
+        return relative(ltcl.solve(S, at.l_out, "jacobi", rtol=DROPPED / 10).x, at.l_d)
 
     kept = fewest(C, error, DROPPED)
     core, V = restrict_to_support(kept, W) if both else (kept, W)

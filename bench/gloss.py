@@ -55,9 +55,7 @@ class Case:
     compensation: float  # ||T p - desired|| / ||desired||
     clipped: float
 
-    @property
-    def name(self) -> str:
-        """For the report."""
+    def __str__(self) -> str:
         return f"{self.room}, exponent {self.exponent:g}, gloss {self.gloss:g}"
 
 
@@ -165,34 +163,29 @@ def draw(found: Sequence[Case]) -> Figure:
         "Errors are those of separated bounces against $P A^k F Q$ of the full light field (eq. 29).",
     )
     size, (left, right), (above, below) = (410, 240), (80, 560), (150, 490)
-    dotted = {"color": INK, "lw": 1, "ls": ":"}
+    xlabel, dotted = "share of gloss", {"color": INK, "lw": 1, "ls": ":"}
     for k, place in ((1, left), (2, right)):
-        axes = _graph(figure, (place, above, *size), f"Bounce {k} of the separation", "relative error")
+        box, title = (place, above, *size), f"Bounce {k} of the separation"
+        axes = figures.graph(figure, box, title, xlabel, "relative error")
         _curves(axes, found, lambda case, k=k: case.off[k])
         axes.set_ylim(3e-3, 30)
         axes.axhline(1, color=FAINT, lw=1, ls=":")
         axes.legend(frameon=False, labelcolor="linecolor", fontsize=9, loc="lower right")
     title = "Reciprocity defect \u25cf, light a bounce takes away \u25bc"
-    axes = _graph(figure, (left, below, *size), title, "share", "linear")
+    axes = figures.graph(figure, (left, below, *size), title, xlabel, "share", "linear")
     axes.set_ylim(0, 0.4)
     _curves(axes, found, lambda case: case.defect)
     _curves(axes, found, lambda case: case.taken, marker="v", lw=1, alpha=0.7)
     axes.axhline(LARGEST_NEGATIVE, **dotted)
     axes.text(0.79, LARGEST_NEGATIVE, "warning above", color=INK, fontsize=9, ha="right", va="bottom")
     title = "Plain series: iterations to 1 % of the direct light"
-    axes = _graph(figure, (right, below, *size), title, "iterations", "linear")
+    axes = figures.graph(figure, (right, below, *size), title, xlabel, "iterations", "linear")
     _curves(axes, found, lambda case: np.nan if case.iterations is None else case.iterations)
     axes.set_ylim(0, 30)
     axes.axhline(20, **dotted)
     axes.text(0.02, 20.4, "the paper's glossy scene", color=INK, fontsize=9)
     axes.text(0.02, 28, "curves end where it diverges", color=FAINT, fontsize=9)
     return figure
-
-
-def _graph(figure: Figure, box: figures.Box, title: str, ylabel: str, scale: str = "log") -> Axes:
-    axes = figures.graph(figure, box, title, "share of gloss", ylabel, scale)
-    axes.set_xlim(0, 0.8)
-    return axes
 
 
 def _curves(axes: Axes, found: Sequence[Case], value: Callable[[Case], float], **style: Any) -> None:
@@ -202,13 +195,14 @@ def _curves(axes: Axes, found: Sequence[Case], value: Callable[[Case], float], *
             label = f"exponent {exponent:g}" if line == "-" else None
             look = {"marker": "o", "lw": 2, "ms": 4, "color": SHADES[exponent], "ls": line} | style
             axes.plot([case.gloss for case in some], [value(case) for case in some], label=label, **look)
+    axes.set_xlim(0, 0.8)
 
 
 def main() -> None:
     given = options(__doc__ or "")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # the warning is among what is measured
     found = cases(given)
-    facts = {case.name: asdict(case) for case in found}
+    facts = {str(case): asdict(case) for case in found}
     title = "The single-view approximation (eq. 28, 29)"
     figures.conclude(given, title, claims(found), facts, lambda: draw(found))
 

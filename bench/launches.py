@@ -9,6 +9,7 @@ counted from an operator that nothing is known of: row sums, survey and tables i
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -69,17 +70,6 @@ def counted() -> Iterator[Traffic]:
         yield traffic
 
 
-def count_step(events: list[str], products: int) -> tuple[int, int]:
-    """Kernels and waits of a step of so many products: medians from one product to another.
-
-    Residuals are read every few steps only, and so are not counted where nothing else waits.
-    """
-    marks = [i for i, event in enumerate(events) if "matvec" in event]
-    spans = [events[i:j] for i, j in zip(marks, marks[products:], strict=False)]
-    waits = np.array([span.count(WAIT) for span in spans])
-    return round(np.median([len(span) for span in spans] - waits)), round(np.median(waits))
-
-
 def operators(given: Options) -> dict[str, Any]:
     """R of one kind each, made anew at every call: the mean of two neighbours.
 
@@ -120,7 +110,11 @@ def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int)
     with counted() as traffic:
         iterations = run(S).iterations
     allocations = device.allocations - before
-    launches, waits = count_step(traffic.events, products)
+    # Residuals are read every few steps only, and so are not counted where nothing else waits.
+    marks = [i for i, event in enumerate(traffic.events) if "matvec" in event]
+    spans = [traffic.events[i:j] for i, j in zip(marks, marks[products:], strict=False)]
+    waits = np.array([span.count(WAIT) for span in spans])
+    launches, waits = round(np.median([len(span) for span in spans] - waits)), round(np.median(waits))
     pixels = method == "bounded" and "wavelets" in kind  # bounds are of pixels: transforms in every product
     hit = launches <= target and waits <= waits_most and allocations == 0
     return {
@@ -142,12 +136,8 @@ def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int)
 
 def main() -> None:
     given = options(__doc__ or "")
-    rows = [
-        row(given.device, kind, make, method, k)
-        for kind, make in operators(given).items()
-        for method in TARGETS
-        for k in (1, 3)
-    ]
+    kinds = itertools.product(operators(given).items(), TARGETS, (1, 3))
+    rows = [row(given.device, kind, make, method, k) for (kind, make), method, k in kinds]
     misses = sum(one["verdict"] == "MISS" for one in rows)
     table = Table(*rows[0], caption=f"{misses} of {len(rows)} targets missed")
     for one in rows:

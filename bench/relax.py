@@ -34,9 +34,8 @@ def compare(given: Options, name: str, R: Any, theirs: Any) -> list[Row]:
     on_device, host = given.device.upload(b), np.zeros(n, np.float32)
     relax = relaxation(S, "gauss_seidel")
     block = relaxation(S, BlockGaussSeidel.name, BlockGaussSeidel().block, None)
-    sweeps, blocks = (
-        Sweeps(how, given.device.upload(host), on_device, on_device.like()) for how in (relax, block)
-    )
+    upload = given.device.upload
+    sweeps, blocks = (Sweeps(how, upload(host), on_device, on_device.like()) for how in (relax, block))
     full = scipy.sparse.csr_array(scipy.sparse.eye_array(n) + scipy.sparse.csr_array(R)).astype(np.float32)
 
     def sweep(ours: Sweeps = sweeps) -> None:

@@ -102,40 +102,23 @@ def build(given: Options, corner: Corner) -> Built:
         with spent(f"R of albedo {albedo:g}"):
             C = (A.core * np.float32(albedo / REFERENCE)).astype(np.float32)
             found.append(invert_coefficients(-C, rtol=RTOL))
-    cores = [-one.D for one in found]
-    with spent("what a pattern needs of R"):
-        fewer = enough(given, corner, cores)
+    cores, fewer, (h, w) = [-one.D for one in found], [], corner.rows.grid
+    with spent("what a pattern needs of R"):  # that the direct light of another picture is off by 0.6 %
+        grey = np.roll(corner.picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
+        exact = grey[:, None] - corner.bounce(grey[:, None])
+        for C, truth in zip(cores, exact.T, strict=True):
+
+            def error(core: Any, truth: np.ndarray = truth) -> float:
+                core, V = restrict_to_support(core, W)
+                S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
+                return relative(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
+
+            fewer.append(fewest(C, error, SHARE * ERROR))
     return Built(A, found, fewer, transport(W, cores, ALBEDO), transport(W, fewer, ALBEDO), spent)
 
 
-def enough(given: Options, corner: Corner, cores: list[Any]) -> list[Any]:
-    """The largest numbers of R, with which the direct light of another picture is off by 0.6 %."""
-    W, (h, w) = Wavelet(given.device, corner.rows.grid, "db2"), corner.rows.grid
-    grey = np.roll(corner.picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
-    exact, found = grey[:, None] - corner.bounce(grey[:, None]), []
-    for channel, C in enumerate(cores):
-
-        def error(core: Any, truth: np.ndarray = exact[:, channel]) -> float:
-            core, V = restrict_to_support(core, W)
-            S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
-            return relative(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
-
-        found.append(fewest(C, error, SHARE * ERROR))
-    return found
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """(h, w, 3) each; errors are of the pattern and the parts."""
-
-    wanted: np.ndarray
-    pattern: np.ndarray
-    parts: list[np.ndarray]
-    errors: list[float]
-
-
-def pictures(corner: Corner, built: Built) -> Pictures:
-    """Compensate and separate a landscape, and compare with the truth."""
+def pictures(corner: Corner, built: Built) -> tuple[list[np.ndarray], list[float]]:
+    """A landscape, its pattern, direct light and bounces, (h, w, 3) each; errors of all but the first."""
     wanted = corner.picture
     with built.spent("compensate, first call"):
         pattern = built.compensate(wanted).pattern
@@ -147,7 +130,7 @@ def pictures(corner: Corner, built: Built) -> Pictures:
         exact.append(corner.bounce(exact[-1]))
     parts = [separation.direct, *separation.bounces]
     pairs = zip([pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
-    return Pictures(wanted, pattern, parts, [relative(part.reshape(-1, 3), truth) for part, truth in pairs])
+    return [wanted, pattern, *parts], [relative(part.reshape(-1, 3), truth) for part, truth in pairs]
 
 
 def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
@@ -168,32 +151,16 @@ def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
     return {name: 1e3 * spent for name, spent in seconds(actions).items()}
 
 
-def claims(found: Pictures, ms: dict[str, float], smoke: bool) -> list[Claim]:
-    if smoke:
-        return []
-    names = ["pattern", "direct", *(f"bounce {k + 1}" for k in range(BOUNCES))]
-    listed, limit = [], f"at most {ERROR:.0%}"
-    for name, error in zip(names, found.errors, strict=True):
-        text = f"{name} of 131072 pixels in colour"
-        listed.append(Claim(text, f"error {error:.2%}", limit, error <= ERROR))
-    for name, most in TARGETS.items():
-        listed.append(Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most))
-    return listed
-
-
-def draw(found: Pictures) -> Figure:
+def draw(names: list[str], images: list[np.ndarray]) -> Figure:
     """The picture wanted, the pattern for it and where its light comes from."""
     figure = figures.page(
         270,
         "131072 pixels, each of which lights every other",
         "A picture on a corner of two walls, the pattern that makes it, and its light by bounces (4 times).",
     )
-    walls = dihedral(2)
-    shown = [("wanted", found.wanted, 1.0), ("pattern", found.pattern, 0.6), ("direct", found.parts[0], 1.0)]
-    shown += [(f"bounce {k + 1}", part, 4.0) for k, part in enumerate(found.parts[1:])]
-    views = []
-    for label, picture, gain in shown:
-        view = draw_view(walls.viewer, walls.walls, picture.astype(np.float32), 400, 2)
+    walls, gains, views = dihedral(2), (1.0, 0.6, 1.0, *(BOUNCES * [4.0])), []
+    for label, image, gain in zip(["wanted", *names], images, gains, strict=True):
+        view = draw_view(walls.viewer, walls.walls, image.astype(np.float32), 400, 2)
         views.append((to_srgb(np.clip(gain * view, 0, 1)), label))
     figures.pictures(figure, 110, views)
     return figure
@@ -203,8 +170,8 @@ def main() -> None:
     given = options(__doc__ or "")
     corner = Corner(CornerRows(8 if given.smoke else 256, REFERENCE))
     built = build(given, corner)
-    found = pictures(corner, built)
-    ms = times(built, found.wanted)
+    images, errors = pictures(corner, built)
+    ms = times(built, images[0])
     n = corner.rows.shape[0]
     facts: dict[str, Any] = {
         "pixels": n,
@@ -221,8 +188,15 @@ def main() -> None:
         "peak memory, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "largest buffer allowed, MB": given.device.max_allocation / 2**20,
     }
-    claimed = claims(found, ms, given.smoke)
-    figures.conclude(given, "131072 pixels in colour", claimed, facts, lambda: draw(found))
+    names = ["pattern", "direct", *(f"bounce {k + 1}" for k in range(BOUNCES))]
+    claims, limit = [], f"at most {ERROR:.0%}"
+    for name, error in zip(names, errors, strict=True):
+        text = f"{name} of 131072 pixels in colour"
+        claims.append(Claim(text, f"error {error:.2%}", limit, error <= ERROR))
+    for name, most in TARGETS.items():
+        claims.append(Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most))
+    title = "131072 pixels in colour"
+    figures.conclude(given, title, [] if given.smoke else claims, facts, lambda: draw(names, images))
 
 
 if __name__ == "__main__":
