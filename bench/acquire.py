@@ -54,9 +54,14 @@ LINES = {
 
 
 @dataclass(frozen=True)
-class Cost:
-    """Of one acquisition: photographs and seconds of exposure, as planned and as taken; seconds it ran."""
+class Found:
+    """One acquisition: photographs and seconds of exposure, as planned and as taken; seconds it ran.
 
+    `bounces`: error over `std` of bounces 0 to 3; `inside`: within 3 deviations. `far` is the error of far
+    light row by row, `weak` that of all of it, which noise hardly changes.
+    """
+
+    name: str
     strategy: str
     pixels: int
     planned: int
@@ -64,18 +69,6 @@ class Cost:
     planned_exposure: float
     exposure: float
     seconds: float
-
-
-@dataclass(frozen=True)
-class Found:
-    """One acquisition. `bounces`: error over `std` of bounces 0 to 3; `inside`: within 3 deviations.
-
-    `far` is the error of far light row by row, `weak` that of all of it, which noise hardly changes.
-    """
-
-    name: str
-    strategy: str
-    cost: Cost
     held: float
     sums: float
     sum_deviation: float
@@ -144,23 +137,17 @@ def measured(truth: Truth, camera: str, strategy: str, device: Device, name: str
         T = acquire(rig, geometry="aligned", strategy=strategy, store=path, device=device)
         seconds, report = time.perf_counter() - start, Report.of(path)
         plan = BlockStore.open(path).attributes["plan"]
-        cost = Cost(strategy, truth.n**2, plan["photographs"], report.photographs, plan["seconds"],
-                    report.patterns * sum(report.exposures), seconds)  # fmt: skip
-        unit, sums = rows(T, truth)
+        exposures = plan["seconds"], report.patterns * sum(report.exposures)
+        white = np.ones((truth.n**2, 1, truth.channels))
+        ours, theirs = shown(T, white)[:, 0], truth.seen(white)[:, 0]
+        unit = np.sum(ours * theirs, axis=0) / np.sum(ours**2, axis=0)  # of light, of each channel
+        sums = float(np.max(np.abs(unit * ours / theirs - 1)))
         P = np.repeat(held(truth.n)[..., None], truth.channels, axis=-1)
-        ratios, inside = of_bounces(T, truth)
         return Found(
-            name, strategy, cost, relative(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
-            *far(T, truth, unit), compensated(T, truth, unit), ratios, inside,
+            name, strategy, truth.n**2, plan["photographs"], report.photographs, *exposures, seconds,
+            relative(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
+            *far(T, truth, unit), compensated(T, truth, unit), *of_bounces(T, truth),
         )  # fmt: skip
-
-
-def rows(T: ltcl.Transport, truth: Truth) -> tuple[np.ndarray, float]:
-    """The unit of light of each channel, and the row sum that is furthest off in it."""
-    white = np.ones((truth.n**2, 1, truth.channels))
-    ours, theirs = shown(T, white)[:, 0], truth.seen(white)[:, 0]
-    unit = np.sum(ours * theirs, axis=0) / np.sum(ours**2, axis=0)
-    return unit, float(np.max(np.abs(unit * ours / theirs - 1)))
 
 
 def far(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> tuple[float, float]:
@@ -202,8 +189,7 @@ def compensated(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> float:
     return float(10 * np.log10(desired.max() ** 2 / np.mean(error**2)))
 
 
-def claims(found: list[Found], costs: list[Cost], largest: int) -> list[Claim]:
-    """Of photographs, and of each acquisition."""
+def claims(found: list[Found], costs: list[Found], largest: int) -> list[Claim]:
     cost = {one.strategy: one.photographs for one in costs if one.pixels == largest}
     over = max(one.photographs / one.planned for one in costs)
     fifth = "an adaptive scan takes a fifth of the photographs of one pixel at a time"
@@ -226,8 +212,7 @@ def claims(found: list[Found], costs: list[Cost], largest: int) -> list[Claim]:
     return listed
 
 
-def draw(costs: list[Cost]) -> Figure:
-    """Photographs, time of exposure and time of computing against pixels; dashed what plans said."""
+def draw(costs: list[Found]) -> Figure:
     figure = figures.page(
         440,
         "What it takes to measure a transport",
@@ -267,14 +252,14 @@ def main() -> None:
     found = [run(truth, camera, k, name=f"{k}, {camera}") for camera in cameras for k in STRATEGIES]
     costs = []
     for n, k in itertools.product(sides[:-1], STRATEGIES):
-        costs.append(run(Truth([corner(n)]), "film, 12 bits", k, name=f"{k}, {n}").cost)
-    costs += [one.cost for one in found if "film" in one.name]
+        costs.append(run(Truth([corner(n)]), "film, 12 bits", k, name=f"{k}, {n}"))
+    costs += [one for one in found if "film" in one.name]
     colour = Truth([corner(8 if given.smoke else 32, albedo) for albedo in COLOURS], MIXING)
     found += [run(colour, "srgb, 8 bits", k, name=f"{k}, colours") for k in STRATEGIES[:2]]
     facts: dict[str, Any] = {"pixels": sides[-1] ** 2}
     for one in found:
-        facts[f"{one.name}, seconds"] = one.cost.seconds
-        facts[f"{one.name}, photographs"] = one.cost.photographs
+        facts[f"{one.name}, seconds"] = one.seconds
+        facts[f"{one.name}, photographs"] = one.photographs
         facts[f"{one.name}, far light row by row"] = one.far
         facts[f"{one.name}, direct part, error over std"] = one.bounces[0]
         if one.strategy != "adaptive":

@@ -39,7 +39,6 @@ from _figures import Claim
 from _harness import options
 from ltcl import scenes
 from ltcl.acquisition import VirtualRig, acquire, camera_map
-from ltcl.device import Device
 from ltcl.errors import AcquisitionError, ScanRefused
 
 N, SIZE = 8, 3.0  # projector pixels along a wall; camera pixels to one
@@ -132,32 +131,26 @@ class Person:
         self.number += 1
         if self._list and self._list[0][1] == seconds and np.array_equal(self._list[0][0], codes):
             self._list.popleft()
-        self._last = self._image(codes, seconds)
-        return self._last
-
-    def _image(self, codes: np.ndarray, seconds: float) -> np.ndarray:
-        n, at, kind = self.number, self.at, self.kind
-        following = self._list[0] if self._list else (codes, seconds)
-        if kind is None or n < at:
-            return self._rig.photograph(codes, seconds)
-        if kind == "two exchanged" and n == at:
-            self._put_off = codes, seconds
-            return self._rig.photograph(*following)
-        if kind == "two exchanged" and n == at + 1:
-            return self._rig.photograph(*self._put_off)
+        n, at, kind, rig, shot = self.number, self.at, self.kind or "", self._rig, (codes, seconds)
+        following = self._list[0] if self._list else shot
         if kind == "one repeated" and n == at and self._last is not None:
             return self._last
-        if kind == "one missing":
-            return self._rig.photograph(*following)
-        if kind.startswith("moved") or (kind == "light on in one" and n == at):
-            return self._faulty_rig.photograph(codes, seconds)
-        if kind == "a third of a stop" and n == at:
-            return self._rig.photograph(codes, seconds * 2.0 ** (1 / 3))
-        image = self._rig.photograph(codes, seconds)
-        if kind == "JPEG from one on":
+        if kind == "two exchanged" and n == at:
+            self._put_off, shot = shot, following
+        elif kind == "two exchanged" and n == at + 1:
+            shot = self._put_off
+        elif kind == "one missing" and n >= at:
+            shot = following
+        elif kind == "a third of a stop" and n == at:
+            shot = codes, seconds * 2.0 ** (1 / 3)
+        elif (kind.startswith("moved") and n >= at) or (kind == "light on in one" and n == at):
+            rig = self._faulty_rig
+        image = rig.photograph(*shot)
+        if kind == "JPEG from one on" and n >= at:
             shift, quality = (self.bits or 8) - 8, [cv2.IMWRITE_JPEG_QUALITY, 70]
             _, data = cv2.imencode(".jpg", (image >> shift).astype(np.uint8), quality)
-            return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)).astype(image.dtype) << shift
+            image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)).astype(image.dtype) << shift
+        self._last = image
         return image
 
 
@@ -180,52 +173,22 @@ class Outcome:
         return f"{self.scan}, photograph {self.at} of {self.count}"
 
 
-@dataclass(frozen=True)
-class Scan:
-    """What is scanned, and how: the same number is the same scan, to the noise."""
+def acquired(number: int, kind: str | None = None, at: int = 0) -> tuple[np.ndarray, np.ndarray, int]:
+    """T p of some patterns, which pixels are known, photographs; one number is one scan, to the noise."""
+    name, camera, strategy = names(number)
+    rig = Person(name, camera, number, kind, at)
+    with TemporaryDirectory() as folder:
+        T = acquire(rig, strategy=strategy, store=Path(folder) / "T.zarr", device=opened())
+        y, x = np.mgrid[: T.grid[0], : T.grid[1]] / max(T.grid)
+        rng = np.random.default_rng(3)
+        P = [rng.random(T.grid), rng.random(T.grid) < 0.5, 0.5 + 0.5 * np.sin(9 * x + 5 * y), x > y]
+        shown = np.asarray(T @ np.stack(P).astype(np.float32), np.float64).reshape(len(P), -1)
+        return shown, ~np.asarray(T.masked).ravel(), rig.number
 
-    number: int
 
-    @property
-    def names(self) -> tuple[str, str, str]:
-        """Scene, camera, strategy."""
-        k = self.number
-        return SCENES[k % 5], list(CAMERAS)[k // 5 % 3], STRATEGIES[(k // 15 + k) % 3]
-
-    def acquired(self, device: Device, kind: str | None = None, at: int = 0) -> tuple[Any, Any, int]:
-        """T p of some patterns, which pixels are known, photographs."""
-        name, camera, strategy = self.names
-        rig = Person(name, camera, self.number, kind, at)
-        with TemporaryDirectory() as folder:
-            T = acquire(rig, strategy=strategy, store=Path(folder) / "T.zarr", device=device)
-            y, x = np.mgrid[: T.grid[0], : T.grid[1]] / max(T.grid)
-            rng = np.random.default_rng(3)
-            P = [rng.random(T.grid), rng.random(T.grid) < 0.5, 0.5 + 0.5 * np.sin(9 * x + 5 * y), x > y]
-            shown = np.asarray(T @ np.stack(P).astype(np.float32), np.float64).reshape(len(P), -1)
-            return shown, ~np.asarray(T.masked).ravel(), rig.number
-
-    def outcomes(self, kinds: Sequence[str], device: Device) -> list[Outcome]:
-        """The scan without a fault, and with one of each kind."""
-        name = " ".join(self.names)
-        try:
-            clean, known, count = self.acquired(device)
-        except AcquisitionError as error:
-            return [Outcome(None, name, 0, 0, 0.0, True, False, str(error))]
-        results = [Outcome(None, name, 0, count, 0.0, False, False, "")]
-        for kind in kinds:
-            at = int(np.random.default_rng((self.number, KINDS.index(kind))).integers(2, count - 1))
-            try:
-                shown, seen, _ = self.acquired(device, kind, at)
-            except AcquisitionError as error:
-                early = not isinstance(error, ScanRefused)  # before anything was kept
-                first = at - 1 if kind == "one repeated" else at
-                last = count if kind.startswith("JPEG") else at + 1
-                named = early and any(first <= number <= last for number in numbers(str(error)))
-                results.append(Outcome(kind, name, at, count, np.nan, early, named, str(error)))
-                continue
-            change = relative(shown[:, known & seen].T, clean[:, known & seen].T)
-            results.append(Outcome(kind, name, at, count, change, False, False, ""))
-        return results
+def names(k: int) -> tuple[str, str, str]:
+    """Scene, camera and strategy of a scan."""
+    return SCENES[k % 5], list(CAMERAS)[k // 5 % 3], STRATEGIES[(k // 15 + k) % 3]
 
 
 def numbers(text: str) -> set[int]:
@@ -238,9 +201,28 @@ def numbers(text: str) -> set[int]:
 
 
 def run(job: tuple[int, Sequence[str]]) -> list[Outcome]:
-    """One scan and its faults, in a process of its own."""
-    number, kinds = job
-    return Scan(number).outcomes(kinds, opened())
+    """A scan without a fault, and with one of each kind, in a process of its own."""
+    scan, kinds = job
+    name = " ".join(names(scan))
+    try:
+        clean, known, count = acquired(scan)
+    except AcquisitionError as error:
+        return [Outcome(None, name, 0, 0, 0.0, True, False, str(error))]
+    results = [Outcome(None, name, 0, count, 0.0, False, False, "")]
+    for kind in kinds:
+        at = int(np.random.default_rng((scan, KINDS.index(kind))).integers(2, count - 1))
+        try:
+            shown, seen, _ = acquired(scan, kind, at)
+        except AcquisitionError as error:
+            early = not isinstance(error, ScanRefused)  # before anything was kept
+            first = at - 1 if kind == "one repeated" else at
+            last = count if kind.startswith("JPEG") else at + 1
+            named = early and any(first <= number <= last for number in numbers(str(error)))
+            results.append(Outcome(kind, name, at, count, np.nan, early, named, str(error)))
+            continue
+        change = relative(shown[:, known & seen].T, clean[:, known & seen].T)
+        results.append(Outcome(kind, name, at, count, change, False, False, ""))
+    return results
 
 
 def main() -> None:

@@ -101,7 +101,6 @@ def claims(found: Series) -> list[Claim]:
 
 
 def draw(found: Series) -> Figure:
-    """Sums above, terms below them; then what is left of each bounce, and the error."""
     figure = figures.page(
         860,
         "Figure 4: the inverse series takes the bounces out of a picture",

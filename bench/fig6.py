@@ -130,7 +130,6 @@ def claims(shade: Recovery, gloss: Recovery, camera: float) -> list[Claim]:
 
 
 def draw_row(figure: Figure, found: Recovery, top: float, shown: tuple[int, ...], name: str) -> None:
-    """The picture, some sums, and the truth."""
     images = [(name, f"error {found.errors[0]:.2g}", found.sums[0])]
     for n in shown:
         images.append((f"{n} iteration{'s' * (n > 1)}", f"error {found.errors[n]:.2g}", found.sums[n]))

@@ -136,14 +136,6 @@ def by_matrices(inverse: Callable[[int], np.ndarray], at: Problem, like: Way) ->
     return Way(run, relative(l_d, at.l_d), spent, like.products - 1, like.nbytes, like.kept)
 
 
-def of_both(given: Options, at: Problem) -> Any:
-    """C of R = W^T C W in db2, far finer than needed."""
-    transform = analysis(Wavelet(given.device, at.rows.grid, "db2"))
-    rows = source("A", at.rows, MEMORY)
-    A = coefficients(rows, transform, transform, THRESHOLD, first=THRESHOLD / 4)
-    return -invert_coefficients(-A.core, rtol=FINE).D
-
-
 def of_rows(given: Options, at: Problem, C: Any) -> Any:
     """R W^T = W^T C, one column of C after the other."""
     W = Wavelet(given.device, at.rows.grid, "db2")
@@ -194,7 +186,9 @@ def ways(given: Options, at: Problem) -> dict[str, Way]:
         if reaches(n, SERIES):
             found["series"] = by_matrices(lambda steps: matrix_series(S, steps=steps).x, at, iteration)
             found["peer"] = by_matrices(lambda steps: by_numpy(S, steps), at, iteration)
-    both = of_both(given, at)
+    transform = analysis(Wavelet(given.device, at.rows.grid, "db2"))
+    A = coefficients(source("A", at.rows, MEMORY), transform, transform, THRESHOLD, first=THRESHOLD / 4)
+    both = -invert_coefficients(-A.core, rtol=FINE).D  # C of R = W^T C W in db2, far finer than needed
     found["both"] = by_wavelets(given, at, both, True)
     found["rows"] = by_wavelets(given, at, of_rows(given, at, both), False)
     return found
@@ -259,7 +253,6 @@ def slowdown(points: list[Point], slow: str, fast: str) -> tuple[int, float]:
 
 
 def claims(points: list[Point], laws: dict[str, Law]) -> list[Claim]:
-    """Of errors; and of slopes where they are known."""
     errors = [p.way.error for p in points]
     least, most = min(errors), max(errors)
     limit = f"at most {ERROR:.0%}"

@@ -242,7 +242,6 @@ def claims(found: list[Found], cameras: list[Found], loop: Loop | None) -> list[
 
 
 def facts(found: list[Found], cameras: list[Found], loop: Loop | None) -> dict[str, Any]:
-    """A line for each acquisition, and the real photographs."""
     lines: dict[str, Any] = {"projector pixels": N * N}
     names = [f"{one.size:g} camera pixels, {one.camera}, {one.noise}" for one in found]
     names += [f"at random, seed {seed}, {one.size:.2f} camera pixels" for seed, one in enumerate(cameras)]
@@ -254,7 +253,6 @@ def facts(found: list[Found], cameras: list[Found], loop: Loop | None) -> dict[s
 
 
 def draw(found: list[Found], cameras: list[Found], loop: Loop | None) -> Figure:
-    """Errors against the size of camera pixels and against noise; the rendered corner below."""
     figure = figures.page(
         430 if loop is None else 720,
         "A camera that is not aligned with the projector",
@@ -285,18 +283,17 @@ def draw(found: list[Found], cameras: list[Found], loop: Loop | None) -> Figure:
     _percent(axes)
     if loop is not None:
         before, after = loop.decibels
-        views = [
+        views: list[tuple[Any, ...]] = [
             (loop.desired, "asked for", "on the projector's pixels"),
             (loop.pattern, "pattern", "what the projector sends"),
             (loop.before, "before", f"the picture itself sent: {before:.1f} dB"),
             (loop.after, "after", f"the pattern sent: {after:.1f} dB"),
         ]
-        figures.pictures(figure, 480, [(_grey(image), *text) for image, *text in views])
+        for k, (image, *text) in enumerate(views):
+            codes = to_srgb(np.clip(image / max(float(image.max()), 1e-9), 0, 1))
+            views[k] = np.repeat(codes[..., None], 3, -1), *text
+        figures.pictures(figure, 480, views)
     return figure
-
-
-def _grey(image: np.ndarray) -> np.ndarray:
-    return np.repeat(to_srgb(np.clip(image / max(float(image.max()), 1e-9), 0, 1))[..., None], 3, -1)
 
 
 def _percent(axes: Axes) -> None:

@@ -121,7 +121,6 @@ def cases(given: Options) -> list[Case]:
 
 
 def claims(found: Sequence[Case]) -> list[Claim]:
-    """What must hold, and what the paper says."""
     matte = [case for case in found if case.gloss == 0]
     shiny = [case for case in found if 0 < case.gloss <= MODERATE]
     later = sum(case.off[2] > case.off[1] for case in shiny)
@@ -155,7 +154,6 @@ def _below(text: str, value: float, most: float) -> Claim:
 
 
 def draw(found: Sequence[Case]) -> Figure:
-    """Errors of bounces 1 and 2 above; what T tells, and the plain series, below."""
     figure = figures.page(
         810,
         "Glossy scenes: what one camera and one projector can tell",

@@ -97,7 +97,6 @@ def solver(method: str, b: np.ndarray, **rules: Any) -> Callable[[IdentityPlus],
 
 
 def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int) -> dict[str, Any]:
-    """What a step and a first solve ask for."""
     target, waits_most, products = TARGETS[method]
     S = IdentityPlus(make())
     b = np.random.default_rng(1).random((S.shape[0],) if k == 1 else (S.shape[0], k), dtype=np.float32)

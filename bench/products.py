@@ -98,7 +98,6 @@ def problem(smoke: bool) -> Problem:
 
 
 def forms(given: Options, at: Problem) -> list[Form]:
-    """R in pixels, with its rows in wavelets, and in wavelets on both sides."""
     W = Wavelet(given.device, at.grid, "db2")
     transform, drop = analysis(W), DROP * float(np.linalg.norm(at.R.ravel()))
     found = []

@@ -20,7 +20,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -133,26 +133,7 @@ def pictures(corner: Corner, built: Built) -> tuple[list[np.ndarray], list[float
     return [wanted, pattern, *parts], [relative(part.reshape(-1, 3), truth) for part, truth in pairs]
 
 
-def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
-    """Milliseconds of a product, of a solve and of the whole task."""
-    pixels = wanted.reshape(-1, 3).astype(np.float32)
-    R: Any = built.lighter.systems[0].R
-
-    def solve() -> None:
-        for c, S in enumerate(built.lighter.systems):
-            ltcl.solve(S, pixels[:, c], rtol=ERROR)
-
-    actions = {
-        "product, on coefficients": product(R.core, np.zeros(R.core.shape[1], np.float32)),
-        "product, in pixels": product(R, pixels[:, 0]),
-        "solve in colour": solve,
-        "compensate in colour": lambda: built.compensate(wanted),
-    }
-    return {name: 1e3 * spent for name, spent in seconds(actions).items()}
-
-
 def draw(names: list[str], images: list[np.ndarray]) -> Figure:
-    """The picture wanted, the pattern for it and where its light comes from."""
     figure = figures.page(
         270,
         "131072 pixels, each of which lights every other",
@@ -171,7 +152,19 @@ def main() -> None:
     corner = Corner(CornerRows(8 if given.smoke else 256, REFERENCE))
     built = build(given, corner)
     images, errors = pictures(corner, built)
-    ms = times(built, images[0])
+    pixels, R = images[0].reshape(-1, 3).astype(np.float32), cast(Compressed, built.lighter.systems[0].R)
+
+    def solve() -> None:
+        for c, S in enumerate(built.lighter.systems):
+            ltcl.solve(S, pixels[:, c], rtol=ERROR)
+
+    actions = {
+        "product, on coefficients": product(R.core, np.zeros(R.core.shape[1], np.float32)),
+        "product, in pixels": product(R, pixels[:, 0]),
+        "solve in colour": solve,
+        "compensate in colour": lambda: built.compensate(images[0]),
+    }
+    ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
     n = corner.rows.shape[0]
     facts: dict[str, Any] = {
         "pixels": n,

@@ -159,8 +159,8 @@ def _compensate_pictures(
             except LtclError as error:
                 error.args = (f"{error} (compensating {files[name]})",)
                 raise
-            high, noisy = settings["bounds"][1], transports.shows_noise(T, settings)
-            written, panels = _write(folder, name, desired[name], result, factor, high, setup, noisy)
+            white, noisy = max(settings["bounds"][1], 0.0) or 1.0, transports.shows_noise(T, settings)
+            written, panels = _write(folder / name, desired[name], result, factor, white, setup, noisy)
             sheet.append(panels)
             facts = {key: getattr(result, key) for key in _RESULTS}
             lack, solves = result.out_of_reach, {"channels": result.solution, "limited": result.limited}
@@ -175,12 +175,11 @@ def _compensate_pictures(
 
 
 def _write(
-    folder: Path,
-    name: str,
+    place: Path,
     desired: np.ndarray,
     result: Compensation,
     factor: float,
-    high: float,
+    white: float,
     setup: Any,
     noisy: bool,
 ) -> tuple[dict[str, Any], list[Any]]:
@@ -191,7 +190,7 @@ def _write(
     """
     from ltcl import images
 
-    scale, white = factor / result.gain, max(high, 0.0) or 1.0
+    folder, name, scale = place.parent, place.name, factor / result.gain
     seen, pattern = pictures.shades(result.appearance, scale), result.pattern
     missing = pictures.mark(seen, result.out_of_reach * scale)
     panels = {
