@@ -72,7 +72,7 @@ def contents(n: int, bounces: int) -> np.ndarray:
 
 def claims(found: Series) -> list[Claim]:
     alternate = (-1.0) ** np.arange(11)
-    right = np.mean(np.sign(found.terms[:11]) == alternate[:, None, None])
+    right = float(np.mean(np.sign(found.terms[:11]) == alternate[:, None, None]))
     before, after = cast(found.scene, found.sums[0]), cast(found.scene, found.sums[-1])
     bounces, errors = [found.l_d], found.errors
     for _ in range(99):

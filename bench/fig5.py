@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -60,7 +61,7 @@ class Found:
     swings: dict[str, np.ndarray]
     norms: dict[float, np.ndarray]
     closed: dict[float, Race]
-    opened: dict[float, Race]
+    opened: dict[Any, Race]
     below: Race
 
     @property

@@ -171,19 +171,15 @@ class Point:
     way: Way
 
 
-def reaches(pixels: int, farthest: int) -> bool:
-    """Whether a method with dense R goes so far: by time, and by the memory that is left."""
-    return pixels <= farthest and 4 * SQUARES * pixels**2 <= checks.host_memory()
-
-
 def ways(given: Options, at: Problem) -> dict[str, Way]:
     """Every method that goes so far, ready to run."""
     found, n = {}, len(at.l_out)
-    if reaches(n, DENSE):
+    most = (checks.host_memory() / (4 * SQUARES)) ** 0.5  # pixels of dense R for which memory is left
+    if n <= min(DENSE, most):
         R = interreflection(at.rows.n, ALBEDO, lambda said: note(f"N = {n}: {said.strip()}"))
         S = IdentityPlus(Dense(given.device, R))
         iteration = found["iteration"] = by_steps(S, at, n)
-        if reaches(n, SERIES):
+        if n <= min(SERIES, most):
             found["series"] = by_matrices(lambda steps: matrix_series(S, steps=steps).x, at, iteration)
             found["peer"] = by_matrices(lambda steps: by_numpy(S, steps), at, iteration)
     transform = analysis(Wavelet(given.device, at.rows.grid, "db2"))

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-from collections.abc import Callable
+from collections import namedtuple
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -41,7 +41,7 @@ import ltcl
 from _coefficients import relative
 from _figures import Claim
 from _harness import options
-from acquire import corner, held
+from acquire import CAMERAS, corner, held
 from ltcl.acquisition import Calibration, MitsubaRig, Report, VirtualRig, acquire, camera_map
 from ltcl.acquisition.geometry import decode
 from ltcl.device import Device
@@ -49,7 +49,6 @@ from ltcl.images import to_srgb
 
 N = 16
 SIZES, CLAIMED = (1.5, 2.0, 3.0, 4.0), (3.0, 4.0)
-CAMERAS = {"srgb, 8 bits": ("srgb", 8), "film, 12 bits": ("film", 12)}
 NOISES = {"10000 electrons": (10000.0, 0.0005), "2000": (2000.0, 0.002), "500": (500.0, 0.005)}
 KINDS = {"noise": slice(0, 2), "stripes": slice(2, 3), "smooth": slice(3, 6)}
 PLACES, PLACED = 10, (3.0, 4.5)  # cameras at random, and camera pixels to a side
@@ -61,14 +60,8 @@ BOARD_GRID, STEP = (768, 1024), 2.0
 LIT = 30  # codes that white shows more than black
 
 
-@dataclass(frozen=True)
-class View:
-    """A camera: pixels to a projector pixel's side, place on the projector's grid, size, and its noise."""
-
-    size: float
-    place: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-    grid: tuple[int, int]
-    seed: int = 2
+# A camera: pixels to a projector pixel's side, place on the projector's grid, (H, W), and its noise.
+View = namedtuple("View", "size place grid seed", defaults=[2])
 
 
 @dataclass(frozen=True)
@@ -160,7 +153,7 @@ def rendered(n: int, samples: int, patterns: np.ndarray, device: Device) -> Loop
         found, photographs = Calibration.of(path), Report.of(path).photographs
         linear = {"projector_response": "linear", "sensitivity": rig.describe()["sensitivity"]}
         truth = MitsubaRig("dihedral", grid, samples=FINE, seed=9, **linear, **common)
-        inner = scipy.ndimage.binary_erosion(found.resampling.coverage > 0.8, np.ones((3, 3)))
+        inner: Any = scipy.ndimage.binary_erosion(found.resampling.coverage > 0.8, np.ones((3, 3)))
         white = np.ones(grid, np.float32)
         ours, theirs = np.asarray(T @ white, np.float64)[inner], truth.radiance(white)[inner]
         unit = ours @ theirs / (ours @ ours)
@@ -171,8 +164,8 @@ def rendered(n: int, samples: int, patterns: np.ndarray, device: Device) -> Loop
     both = desired * level / np.median(ours), np.clip(np.asarray(pattern, np.float64), 0.0, 1.0)
     decibels = [_decibels(truth.radiance(p)[inner], desired[inner]) for p in both]
     views = np.stack([rig.radiance(found.projector.codes(p)) for p in both])
-    views /= np.quantile(views, 0.995, axis=(1, 2)).max()
-    return Loop(max(errors), photographs, decibels, *views, desired, both[1])
+    before, after = views / np.quantile(views, 0.995, axis=(1, 2)).max()
+    return Loop(max(errors), photographs, decibels, before, after, desired, both[1])
 
 
 def _decibels(a: np.ndarray, b: np.ndarray) -> float:

@@ -99,8 +99,8 @@ def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device
     compensation = ltcl.compensate(T, desired, method="direct")
     radius, iterations = settles(matrix, F, pattern.ravel())
     rounded = [_digits(value) for value in (*errors, *reported)]
-    last = _digits(compensation.error), compensation.clipped
-    return Case(room, exponent, gloss, *rounded, warned, _digits(radius), iterations, *last)
+    last = [warned, _digits(radius), iterations, _digits(compensation.error), compensation.clipped]
+    return Case(room, exponent, gloss, *rounded + last)
 
 
 def _digits(values: Any) -> Any:

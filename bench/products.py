@@ -12,6 +12,7 @@ are given.
 
 from __future__ import annotations
 
+from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -40,14 +41,7 @@ OTHERS = "#ff7f9f"
 OURS_TARGET, SCIPY_TARGET = 15.0, 30.0
 
 
-@dataclass(frozen=True)
-class Problem:
-    """R (N, N) float32, a picture, and R times it in float64."""
-
-    R: np.ndarray
-    grid: tuple[int, int]
-    x: np.ndarray
-    y: np.ndarray
+Problem = namedtuple("Problem", "R grid x y")  # R (N, N) float32, a picture, and R times it in float64
 
 
 @dataclass(frozen=True)
@@ -203,11 +197,10 @@ def main() -> None:
     facts: dict[str, Any] = {"pixels": len(at.x), "triad, GB/s": nbytes / ms.pop("triad") / 1e6}
     facts |= {f"{FORMATS[point.form]}, error {point.error:.2%}": str(point) for point in points}
     facts["not installed"] = ", ".join(missing()) or "none"
-    ends = [
-        p for p in points if p.wanted == ERROR and p.form != "rows"
-    ]  # sparse rows, and what solves run on
-    rows = compare(at, *ends, ms)
-    report(given, "Products with a smooth R", rows, facts, lambda: draw(at, points, *ends, ms))
+    # At 1 %: sparse rows of R, and ours that a solve runs on.
+    sparse, best = (p for p in points if p.wanted == ERROR and p.form != "rows")
+    rows, title = compare(at, sparse, best, ms), "Products with a smooth R"
+    report(given, title, rows, facts, lambda: draw(at, points, sparse, best, ms))
 
 
 if __name__ == "__main__":
