@@ -87,7 +87,7 @@ def claims(found: Series) -> list[Claim]:
         text = f"the picture bleeds {own}; odd terms turn it to {opposite}, even ones to {own}"
         shown = " ".join(f"{value:+.0%}" for value in excess[:4])
         measured = f"beside the {own} wall, {own} over {other} and blue: {shown} ..."
-        listed.append(Claim(text, measured, "+ - + - ...", (excess * alternate > 0).all()))
+        listed.append(Claim(text, measured, "+ - + - ...", bool((excess * alternate > 0).all())))
     colour = f"colour cast of neutral walls {before:.0%}, after {TERMS} terms {after:.1g}"
     removes = f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}"
     error = f"error {errors[0]:.2g}, after {TERMS} terms {errors[-1]:.1g}; each of the first {closer} closer"

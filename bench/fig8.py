@@ -44,10 +44,6 @@ class Inversion:
         """An estimate of the direct light."""
         return ltcl.solve(self.S, self.l_out, "monte_carlo", samples=samples, seed=seed, **KINDS[kind]).x
 
-    def errors(self, kind: str) -> np.ndarray:
-        """Of every number of samples, (COUNTS, SEEDS)."""
-        return np.array([[self.error(self.run(int(n), s, kind)) for s in range(SEEDS)] for n in COUNTS])
-
 
 def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
     plain, gathered = (found.error(found.run(FEW, 0, kind)) for kind in ("plain", "final gather"))
@@ -96,7 +92,9 @@ def main() -> None:
     room = box(6 if given.smoke else 32, sides=5, albedo=ALBEDO)
     scene, (l_d,), (S,), (l_out,) = boxes.lit(room, LAMP, given.device)
     found = Inversion(scene, S, l_out, l_d)
-    errors = {kind: found.errors(kind) for kind in KINDS}
+    samples = [(int(count), seed) for count in COUNTS for seed in range(SEEDS)]
+    shape = len(COUNTS), SEEDS
+    errors = {k: np.reshape([found.error(found.run(*each, k)) for each in samples], shape) for k in KINDS}
     facts = {"pixels": len(found.l_d), "albedo": ALBEDO, "samples": COUNTS.tolist()}
     for kind, values in errors.items():
         facts[f"relative error, {kind}"] = np.round(values.mean(axis=1), 5).tolist()

@@ -47,20 +47,14 @@ BOUNCES = 2
 TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
 
 
-@dataclass(frozen=True)
-class Corner:
-    """Rows of A of a reference albedo; A of a channel is a multiple of it. Light is (N, 3) float64."""
+def landscape_of(rows: CornerRows) -> np.ndarray:
+    """What the walls are to look like, (h, w, 3)."""
+    return 0.05 + 0.4 * landscape(*rows.grid).astype(np.float64)
 
-    rows: CornerRows
 
-    @property
-    def picture(self) -> np.ndarray:
-        """What the walls are to look like, (h, w, 3)."""
-        return 0.05 + 0.4 * landscape(*self.rows.grid).astype(np.float64)
-
-    def bounce(self, light: np.ndarray) -> np.ndarray:
-        """A_c l_c of every channel, with every number of A; the direct light of a picture l is l - A l."""
-        return self.rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
+def bounce(rows: CornerRows, light: np.ndarray) -> np.ndarray:
+    """A_c l_c of every channel, (N, 3) float64, with every number of A; direct is l - A l."""
+    return rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
 
 
 class Stopwatch(dict[str, float]):
@@ -91,21 +85,21 @@ class Built:
         return ltcl.compensate(self.lighter, picture, bounds=(-10.0, 10.0), rtol=ERROR)
 
 
-def build(given: Options, corner: Corner) -> Built:
+def build(given: Options, rows: CornerRows) -> Built:
     """The transport, from rows of A alone."""
-    W, spent = Wavelet(given.device, corner.rows.grid, "db2"), Stopwatch()
+    W, spent = Wavelet(given.device, rows.grid, "db2"), Stopwatch()
     with spent("compressing A"):
-        rows = source("A", corner.rows, MEMORY)
-        A = coefficients(rows, analysis(W), analysis(W), THRESHOLD, first=THRESHOLD / 4)
+        transform, blocks = analysis(W), source("A", rows, MEMORY)
+        A = coefficients(blocks, transform, transform, THRESHOLD, first=THRESHOLD / 4)
     found = []
     for albedo in ALBEDO:
         with spent(f"R of albedo {albedo:g}"):
             C = (A.core * np.float32(albedo / REFERENCE)).astype(np.float32)
             found.append(invert_coefficients(-C, rtol=RTOL))
-    cores, fewer, (h, w) = [-one.D for one in found], [], corner.rows.grid
+    cores, fewer, (h, w) = [-one.D for one in found], [], rows.grid
     with spent("what a pattern needs of R"):  # that the direct light of another picture is off by 0.6 %
-        grey = np.roll(corner.picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
-        exact = grey[:, None] - corner.bounce(grey[:, None])
+        grey = np.roll(landscape_of(rows).mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
+        exact = grey[:, None] - bounce(rows, grey[:, None])
         for C, truth in zip(cores, exact.T, strict=True):
 
             def error(core: Any, truth: np.ndarray = truth) -> float:
@@ -117,17 +111,17 @@ def build(given: Options, corner: Corner) -> Built:
     return Built(A, found, fewer, transport(W, cores, ALBEDO), transport(W, fewer, ALBEDO), spent)
 
 
-def pictures(corner: Corner, built: Built) -> tuple[list[np.ndarray], list[float]]:
+def pictures(rows: CornerRows, built: Built) -> tuple[list[np.ndarray], list[float]]:
     """A landscape, its pattern, direct light and bounces, (h, w, 3) each; errors of all but the first."""
-    wanted = corner.picture
+    wanted = landscape_of(rows)
     with built.spent("compensate, first call"):
         pattern = built.compensate(wanted).pattern
     with built.spent("separate, first call"):
         separation = ltcl.separate(built.T, wanted, BOUNCES, rtol=SEPARATION)
     l_out = wanted.reshape(-1, 3)
-    exact = [l_out - corner.bounce(l_out)]
+    exact = [l_out - bounce(rows, l_out)]
     for _ in range(BOUNCES):
-        exact.append(corner.bounce(exact[-1]))
+        exact.append(bounce(rows, exact[-1]))
     parts = [separation.direct, *separation.bounces]
     pairs = zip([pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
     return [wanted, pattern, *parts], [relative(part.reshape(-1, 3), truth) for part, truth in pairs]
@@ -149,9 +143,9 @@ def draw(names: list[str], images: list[np.ndarray]) -> Figure:
 
 def main() -> None:
     given = options(__doc__ or "")
-    corner = Corner(CornerRows(8 if given.smoke else 256, REFERENCE))
-    built = build(given, corner)
-    images, errors = pictures(corner, built)
+    rows = CornerRows(8 if given.smoke else 256, REFERENCE)
+    built = build(given, rows)
+    images, errors = pictures(rows, built)
     pixels, R = images[0].reshape(-1, 3).astype(np.float32), cast(Compressed, built.lighter.systems[0].R)
 
     def solve() -> None:
@@ -165,7 +159,7 @@ def main() -> None:
         "compensate in colour": lambda: built.compensate(images[0]),
     }
     ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
-    n = corner.rows.shape[0]
+    n = rows.shape[0]
     facts: dict[str, Any] = {
         "pixels": n,
         "A, numbers a row": built.A.core.nnz / n,
