@@ -114,8 +114,7 @@ def graph(figure: Figure, box: Box, title: str, xlabel: str, ylabel: str, scale:
     axes.set_axisbelow(True)
     axes.tick_params(colors=FAINT, labelsize=9.5, length=0)
     axes.minorticks_off()
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.spines[:].set_visible(False)
     axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
     axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
     return axes
