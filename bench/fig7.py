@@ -11,7 +11,7 @@ converges. Four ways, the first also by the BLAS of NumPy, each to an error of a
 
 The last two keep the largest numbers that 0.7 % need, in 16 bits each. Timed is all from the picture on the
 host to l_d on the host, once R is in the form that the method wants. Dense R is (I - A)^-1 - I by
-factorization (`_coefficients.py`). Both compressed forms come from C of R = W^T C W, which eq. 21 makes on
+factorization (`_corner.py`). Both compressed forms come from C of R = W^T C W, which eq. 21 makes on
 coefficients from rows of A that stream by, as in `resolution131k.py`; rows in wavelets are R W^T = W^T C.
 Each method goes as far as memory, and some minutes, allow. The truth needs no inverse: l_d = l_out - A l_out,
 A by exact rows.
@@ -31,7 +31,8 @@ from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, fewest, interreflection, note, relative
+from _coefficients import analysis, fewest, note, relative
+from _corner import Bounce, interreflection
 from _figures import Claim
 from _harness import Options, options, seconds
 from ltcl import checks
@@ -39,7 +40,7 @@ from ltcl.compression import invert_coefficients
 from ltcl.compression.coefficients import coefficients
 from ltcl.compression.sources import source
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet, restrict_to_support
-from ltcl.scenes import CornerRows, landscape
+from ltcl.scenes import landscape
 from ltcl.solvers import matrix_series
 
 SIZES, SMOKE = (8, 12, 16, 22, 32, 46, 64, 90, 128, 182, 256), (2, 4, 8)  # patches along a wall, N = 2 n^2
@@ -79,7 +80,7 @@ METHODS = {
 class Problem:
     """A corner, a picture of it, (N,) float32, and the direct light that makes it, (N,) float64."""
 
-    rows: CornerRows
+    rows: Bounce
     l_out: np.ndarray
     l_d: np.ndarray
 
@@ -97,7 +98,7 @@ class Way:
 
 
 def problem(n: int) -> Problem:
-    rows = CornerRows(n, ALBEDO)
+    rows = Bounce(n, ALBEDO)
     l_out = 0.05 + 0.4 * landscape(*rows.grid).mean(axis=2).reshape(-1)
     return Problem(rows, l_out, l_out - rows.matmat(l_out))
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from _harness import Row, options, product, report, seconds
+from ltcl.device import Device
 from ltcl.scenes import FormFactor, Patches, box, cut
-from ltcl.scenes.patches import Frame, squared_size
+from ltcl.scenes.patches import scaled, squared_size
 
 TARGETS = {"numpy": 20.0, "side": 2.0}
 ACCURACY = 1e-4
@@ -23,8 +24,8 @@ FAR = 64.0  # sizes of a pair, as `kernels/form_factor.cl` takes it
 class Peer:
     """The same sums in NumPy, for some rows."""
 
-    def __init__(self, patches: Patches, rows: np.ndarray) -> None:
-        placed = Frame.of(patches).patches(patches)
+    def __init__(self, device: Device, patches: Patches, rows: np.ndarray) -> None:
+        placed, _ = scaled(device, patches, np.zeros((0, 2, 3)))
         parts = (placed.centre, placed.normal, placed.right, placed.down)
         self.centre, self.normal, self.right, self.down = (part.astype(np.float32) for part in parts)
         self.area, self.reach = placed.area.astype(np.float32), FAR**2 * squared_size(placed)
@@ -62,7 +63,7 @@ def main() -> None:
     count = len(patches)
     rows = np.random.default_rng(0).choice(count, 16 if given.smoke else 64, replace=False)
     A = FormFactor(patches, device=given.device)
-    peer, x = Peer(patches, rows), np.random.default_rng(1).random((count, 3), dtype=np.float32)
+    peer, x = Peer(given.device, patches, rows), np.random.default_rng(1).random((count, 3), dtype=np.float32)
     one = np.ascontiguousarray(x[:, 0])
     exact = peer(one) + A._near.apply(given.device.upload(one)).get()[rows]
     if not np.allclose(A.dot(one)[rows], exact, rtol=1e-4):

@@ -22,7 +22,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import _figures as figures
-from _coefficients import ROWS, analysis, interreflection, largest, note, relative
+from _coefficients import ROWS, analysis, largest, note, relative
+from _corner import interreflection
 from _harness import Options, Row, options, product, report, seconds, triad
 from _peers import missing, sparse_products
 from ltcl.compression.coefficients import coefficients

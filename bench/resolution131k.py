@@ -28,6 +28,7 @@ from matplotlib.figure import Figure
 import _figures as figures
 import ltcl
 from _coefficients import analysis, fewest, note, relative, transport
+from _corner import Bounce
 from _figures import Claim
 from _harness import Options, options, product, seconds
 from ltcl.compression import SparseInverse, invert_coefficients
@@ -35,7 +36,7 @@ from ltcl.compression.coefficients import Coefficients, coefficients
 from ltcl.compression.sources import source
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
-from ltcl.scenes import CornerRows, dihedral, landscape
+from ltcl.scenes import dihedral, landscape
 from ltcl.scenes.viewer import draw as draw_view
 
 ALBEDO, REFERENCE = (0.8, 0.65, 0.5), 0.5
@@ -47,12 +48,12 @@ BOUNCES = 2
 TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
 
 
-def landscape_of(rows: CornerRows) -> np.ndarray:
+def landscape_of(rows: Bounce) -> np.ndarray:
     """What the walls are to look like, (h, w, 3)."""
     return 0.05 + 0.4 * landscape(*rows.grid).astype(np.float64)
 
 
-def bounce(rows: CornerRows, light: np.ndarray) -> np.ndarray:
+def bounce(rows: Bounce, light: np.ndarray) -> np.ndarray:
     """A_c l_c of every channel, (N, 3) float64, with every number of A; direct is l - A l."""
     return rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
 
@@ -85,7 +86,7 @@ class Built:
         return ltcl.compensate(self.lighter, picture, bounds=(-10.0, 10.0), rtol=ERROR)
 
 
-def build(given: Options, rows: CornerRows) -> Built:
+def build(given: Options, rows: Bounce) -> Built:
     """The transport, from rows of A alone."""
     W, spent = Wavelet(given.device, rows.grid, "db2"), Stopwatch()
     with spent("compressing A"):
@@ -111,7 +112,7 @@ def build(given: Options, rows: CornerRows) -> Built:
     return Built(A, found, fewer, transport(W, cores, ALBEDO), transport(W, fewer, ALBEDO), spent)
 
 
-def pictures(rows: CornerRows, built: Built) -> tuple[list[np.ndarray], list[float]]:
+def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]:
     """A landscape, its pattern, direct light and bounces, (h, w, 3) each; errors of all but the first."""
     wanted = landscape_of(rows)
     with built.spent("compensate, first call"):
@@ -143,7 +144,7 @@ def draw(names: list[str], images: list[np.ndarray]) -> Figure:
 
 def main() -> None:
     given = options(__doc__ or "")
-    rows = CornerRows(8 if given.smoke else 256, REFERENCE)
+    rows = Bounce(8 if given.smoke else 256, REFERENCE)
     built = build(given, rows)
     images, errors = pictures(rows, built)
     pixels, R = images[0].reshape(-1, 3).astype(np.float32), cast(Compressed, built.lighter.systems[0].R)

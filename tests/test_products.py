@@ -23,7 +23,7 @@ def benches(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(("n", "albedo"), [(2, 0.3), (10, 0.95)])
 def test_R_by_mirrors_is_that_of_the_corner(n: int, albedo: float) -> None:
-    R = importlib.import_module("_coefficients").interreflection(n, albedo, str)
+    R = importlib.import_module("_corner").interreflection(n, albedo, str)
     A = dihedral(n, albedo=albedo).A
     exact = np.linalg.inv(np.eye(len(A)) - A) - np.eye(len(A))
     assert R.dtype == np.float32
