@@ -50,7 +50,7 @@ class Bounce:
     def matmat(self, x: np.ndarray) -> np.ndarray:
         """A x, (N, k): a convolution along the seam, by a Fourier transform, and a matrix across it."""
         n = self.n
-        waves = np.fft.rfft(np.reshape(x, (n, 2 * n, -1)), 2 * n, axis=0)
+        waves = np.fft.rfft(np.reshape(x, (n, 2 * n, -1)).astype(np.float64), 2 * n, axis=0)
         parts = waves.view(np.float64)  # real and imaginary side by side: the spectra are real
         of_left, of_right = self._spectrum, self._spectrum.transpose(0, 2, 1)
         seen = np.concatenate([of_left @ parts[:, n:], of_right @ parts[:, :n]], axis=1)
