@@ -23,14 +23,6 @@ QUESTIONS = {
 }
 
 
-def scene(grid: tuple[int, int], camera: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Projector coordinates that each camera pixel sees."""
-    (h, w), (H, W) = grid, camera
-    v, u = np.mgrid[:H, :W] / np.array([H, W]).reshape(2, 1, 1)
-    d = 1 + 0.08 * u + 0.05 * v
-    return w * (0.05 + 0.8 * u + 0.06 * v) / d, h * (0.04 + 0.85 * v + 0.05 * u) / d
-
-
 def photographs(code: GrayCode, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
     """Bilinear samples of the patterns, 8 bits, with a standard deviation of 2 of 255."""
     rng, maps = np.random.default_rng(1), (x.astype(np.float32), y.astype(np.float32))
@@ -50,7 +42,11 @@ def off(x: np.ndarray, y: np.ndarray, truth: tuple[np.ndarray, np.ndarray]) -> f
 def main() -> None:
     given = options(__doc__ or "")
     grid, (H, W) = ((48, 64), (60, 80)) if given.smoke else ((768, 1024), (1024, 1280))
-    truth, code = scene(grid, (H, W)), GrayCode(grid)
+    (h, w), code = grid, GrayCode(grid)
+    v, u = np.mgrid[:H, :W] / np.array([H, W]).reshape(2, 1, 1)
+    d = 1 + 0.08 * u + 0.05 * v
+    # Projector coordinates that each camera pixel sees.
+    truth = w * (0.05 + 0.8 * u + 0.06 * v) / d, h * (0.04 + 0.85 * v + 0.05 * u) / d
     images = photographs(code, *truth)
     *coded, white, black = images
     peer = cv2.structured_light.GrayCodePattern.create(grid[1], grid[0])
@@ -71,7 +67,7 @@ def main() -> None:
         row = Row(question, "cv2 GrayCodePattern.decode", theirs, ours, "Mpixel/s", ours / theirs, target)
         rows.append(row)
     some = slice(H // 2, H // 2 + 2)  # rows in which OpenCV is asked pixel by pixel
-    answers = [peer.getProjPixel(coded, u, v) for v in range(some.start, some.stop) for u in range(W)]
+    answers = [peer.getProjPixel(coded, i, j) for j in range(some.start, some.stop) for i in range(W)]
     places = np.array([(np.nan, np.nan) if bad else place for bad, place in answers]).reshape(-1, W, 2)
     x, y = np.moveaxis(places, -1, 0)
     found, whole = decode(images, grid), decode(images, grid, subpixel=False)

@@ -55,9 +55,6 @@ class Case:
     compensation: float  # ||T p - desired|| / ||desired||
     clipped: float
 
-    def __str__(self) -> str:
-        return f"{self.room}, exponent {self.exponent:g}, gloss {self.gloss:g}"
-
 
 def norms(light: np.ndarray) -> np.ndarray:
     """Of pictures (k, h, w)."""
@@ -200,7 +197,7 @@ def main() -> None:
     given = options(__doc__ or "")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # the warning is among what is measured
     found = cases(given)
-    facts = {str(case): asdict(case) for case in found}
+    facts = {f"{c.room}, exponent {c.exponent:g}, gloss {c.gloss:g}": asdict(c) for c in found}
     title = "The single-view approximation (eq. 28, 29)"
     figures.conclude(given, title, claims(found), facts, lambda: draw(found))
 

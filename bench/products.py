@@ -78,10 +78,6 @@ class Point:
     pixels: float
     core: float
 
-    def __str__(self) -> str:
-        size = f"{self.kept:.4g} a row, {self.nbytes / 1e6:.4g} MB"
-        return f"{size}, {self.pixels:.4g} ms, core {self.core:.4g} ms"
-
 
 def problem(smoke: bool) -> Problem:
     n = 8 if smoke else 96
@@ -196,7 +192,10 @@ def main() -> None:
         more, others = measure(given, at, found, wanted, memory)
         points, ms = points + more, ms | others
     facts: dict[str, Any] = {"pixels": len(at.x), "triad, GB/s": nbytes / ms.pop("triad") / 1e6}
-    facts |= {f"{FORMATS[point.form]}, error {point.error:.2%}": str(point) for point in points}
+    for p in points:
+        times = f"{p.pixels:.4g} ms, core {p.core:.4g} ms"
+        size = f"{p.kept:.4g} a row, {p.nbytes / 1e6:.4g} MB, {times}"
+        facts[f"{FORMATS[p.form]}, error {p.error:.2%}"] = size
     facts["not installed"] = ", ".join(missing()) or "none"
     # At 1 %: sparse rows of R, and ours that a solve runs on.
     sparse, best = (p for p in points if p.wanted == ERROR and p.form != "rows")

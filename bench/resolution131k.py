@@ -48,11 +48,6 @@ BOUNCES = 2
 TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
 
 
-def landscape_of(rows: Bounce) -> np.ndarray:
-    """What the walls are to look like, (h, w, 3)."""
-    return 0.05 + 0.4 * landscape(*rows.grid).astype(np.float64)
-
-
 def bounce(rows: Bounce, light: np.ndarray) -> np.ndarray:
     """A_c l_c of every channel, (N, 3) float64, with every number of A; direct is l - A l."""
     return rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
@@ -99,7 +94,8 @@ def build(given: Options, rows: Bounce) -> Built:
             found.append(invert_coefficients(-C, rtol=RTOL))
     cores, fewer, (h, w) = [-one.D for one in found], [], rows.grid
     with spent("what a pattern needs of R"):  # that the direct light of another picture is off by 0.6 %
-        grey = np.roll(landscape_of(rows).mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
+        picture = 0.05 + 0.4 * landscape(h, w).astype(np.float64)
+        grey = np.roll(picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
         exact = grey[:, None] - bounce(rows, grey[:, None])
         for C, truth in zip(cores, exact.T, strict=True):
 
@@ -114,7 +110,7 @@ def build(given: Options, rows: Bounce) -> Built:
 
 def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]:
     """A landscape, its pattern, direct light and bounces, (h, w, 3) each; errors of all but the first."""
-    wanted = landscape_of(rows)
+    wanted = 0.05 + 0.4 * landscape(*rows.grid).astype(np.float64)
     with built.spent("compensate, first call"):
         pattern = built.compensate(wanted).pattern
     with built.spent("separate, first call"):

@@ -58,7 +58,7 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
         + [f"tests/{name}.py" for name in ("bases", "conftest", "gallery", "house", "problems", "reference")],
     ),
     "tests of noise": (1300, ["tests/noise"]),
-    "benches of the core": (2000, [f"bench/{name}.py" for name in _BENCHES.split()]),
+    "benches of the core": (1750, [f"bench/{name}.py" for name in _BENCHES.split()]),
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),
     "tests of these": (
