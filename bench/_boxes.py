@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 import ltcl
+from _coefficients import relative
 from ltcl.scenes import Scene, box
 from ltcl.scenes.viewer import Viewer
 from ltcl.solvers import Solution, Status
@@ -42,12 +44,19 @@ def all_bounces(scene: Scene, l_d: np.ndarray) -> np.ndarray:
     return np.linalg.solve(system, l_d[..., None])[..., 0]
 
 
-def terms(S: Any, l_out: np.ndarray, count: int) -> np.ndarray:
-    """Terms (-R)^k l_out for k = 0 .. count, (count + 1, N), by products with S = I + R on the device."""
+def terms(systems: Sequence[Any], l_out: np.ndarray, count: int) -> np.ndarray:
+    """Terms (-R)^k l_out for k = 0 .. count, (count + 1, channels, N), by products with S = I + R."""
     found = [l_out]
     for _ in range(count):
-        found.append(found[-1] - S @ found[-1])
+        found.append(found[-1] - np.stack([S @ l for S, l in zip(systems, found[-1], strict=True)]))
     return np.stack(found)
+
+
+def lit(room: Scene, lamp: Any, device: ltcl.Device) -> tuple[Scene, np.ndarray, Any, np.ndarray]:
+    """A room from the front, its direct light under a lamp (channels, N), S of each channel, the picture."""
+    scene = from_the_front(room)
+    l_d = scene.albedo * scene.irradiance(lamp).reshape(-1)
+    return scene, l_d, scene.transport(scene.first_bounce, device).systems, all_bounces(scene, l_d)
 
 
 @dataclass(frozen=True)
@@ -84,5 +93,4 @@ def race(name: str, n: int, sides: int, albedo: float, device: ltcl.Device) -> R
     (l_out,) = all_bounces(scene, l_d[None])
     jacobi, chebyshev = (ltcl.solve(S, l_out, m, rtol=1e-5, throw=False) for m in ("jacobi", "chebyshev"))
     rho_a = albedo * float(np.linalg.eigvalsh(scene.form_factors)[-1])
-    error = float(np.linalg.norm(chebyshev.x - l_d) / np.linalg.norm(l_d))
-    return Race(name, rho_a / (1 - rho_a), jacobi, chebyshev, error)
+    return Race(name, rho_a / (1 - rho_a), jacobi, chebyshev, relative(chebyshev.x, l_d))

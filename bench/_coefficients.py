@@ -51,6 +51,12 @@ def bisect(error: Callable[[float], float], wanted: float, high: float) -> float
     return low
 
 
+def fewest(C: Any, error: Callable[[Any], float], wanted: float) -> Any:
+    """As few of the largest numbers of C as keep `error` of them at `wanted`."""
+    threshold = bisect(lambda t: error(drop_below(C, t)[0]), wanted, float(np.abs(C.data).max()))
+    return drop_below(C, threshold)[0]
+
+
 def transport(W: Wavelet, cores: Sequence[Any], albedo: Sequence[float]) -> ltcl.Transport:
     """T = (I + R) F of an R = W^T C W for each colour, in tiles of 16 bits; F is the albedo."""
     systems = []

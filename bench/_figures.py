@@ -11,26 +11,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from rich.console import Console
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from rich.table import Table
 
-from _harness import Options, record, write_json
-from ltcl import plots
+from _harness import Options, publish
 from ltcl.images import from_srgb, to_srgb
 from ltcl.plots.page import FAINT, GRID, PAPER, axes_at, figure_of, heading, label_at
 from ltcl.scenes import Scene
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-Box = tuple[float, float, float, float]
-"""Left, top, width and height in pixels, from the top left corner of the page."""
-
-WIDTH, MARGIN = 1000, 30
+Box = tuple[float, float, float, float]  # left, top, width and height in pixels, from the top left corner
+WIDTH, MARGIN, SIZE = 1000, 30, 400  # pixels of the page, and of a view
 
 
 @dataclass(frozen=True)
@@ -63,33 +57,14 @@ class Claim:
 
 
 def conclude(
-    given: Options,
-    title: str,
-    claims: Sequence[Claim],
-    facts: dict[str, Any],
-    draw: Callable[[], Figure],
+    given: Options, title: str, claims: Sequence[Claim], facts: dict[str, Any], draw: Callable[[], Figure]
 ) -> None:
-    """Print the claims, write what the command line asked for, and exit with 1 if one failed.
-
-    Raises
-    ------
-    SystemExit
-        A claim is not as expected; JSON and picture are written all the same.
-    """
-    console = Console(width=150)
-    console.print(f"[bold]{title}[/]\n{given.device.name}, {given.device.driver}")
-    for name, value in facts.items():
-        console.print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
+    """Publish the claims, and exit with 1 if one is not as expected."""
     table = Table("claim", "measured", "wanted", "verdict", show_lines=True)
     for claim in claims:
         table.add_row(claim.text, claim.measured, claim.wanted, claim.verdict)
-    console.print(table)
-    if given.json is not None:
-        listed = [{**dataclasses.asdict(claim), "verdict": claim.verdict} for claim in claims]
-        write_json(given.json, record(given, title, facts) | {"claims": listed})
-    if given.plot is not None:
-        given.plot.parent.mkdir(parents=True, exist_ok=True)
-        plots.save(draw(), given.plot)
+    listed = [{**dataclasses.asdict(claim), "verdict": claim.verdict} for claim in claims]
+    publish(given, title, facts, table, {"claims": listed}, draw)
     if not all(claim.passed for claim in claims):
         raise SystemExit(1)
 
@@ -111,19 +86,22 @@ def columns(count: int, gap: int = 14) -> tuple[list[float], float]:
 
 def picture(
     figure: Figure, place: tuple[float, float, float], image: np.ndarray, label: str, note: str = ""
-) -> float:
-    """Draw an image (h, w, 3), sRGB in [0, 1], with a label above and a note below; return its height.
-
-    `place` is left, top and width in pixels; the label takes 20 pixels above the top.
-    """
-    left, top, width = place
+) -> None:
+    """Draw an image (h, w, 3), sRGB in [0, 1], with a label of 20 pixels above and a note below."""
+    left, top, width = place  # in pixels
     height = width * image.shape[0] / image.shape[1]
     label_at(figure, left, top - 6, label, size=10.5, fontweight="bold", va="bottom")
     axes = axes_at(figure, (left, top, width, height))
     axes.imshow(image, interpolation="antialiased", aspect="auto")
     axes.axis("off")
     label_at(figure, left, top + height + 5, note, size=9.5, color=FAINT, linespacing=1.35)
-    return height
+
+
+def pictures(figure: Figure, top: float, shown: Sequence[tuple[Any, ...]], gap: int = 14) -> None:
+    """Draw (image, label) or (image, label, note) side by side."""
+    lefts, width = columns(len(shown), gap)
+    for left, (image, *text) in zip(lefts, shown, strict=True):
+        picture(figure, (left, top, width), image, *text)
 
 
 def graph(figure: Figure, box: Box, title: str, xlabel: str, ylabel: str, scale: str = "log") -> Axes:
@@ -136,28 +114,28 @@ def graph(figure: Figure, box: Box, title: str, xlabel: str, ylabel: str, scale:
     axes.set_axisbelow(True)
     axes.tick_params(colors=FAINT, labelsize=9.5, length=0)
     axes.minorticks_off()
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    axes.spines[:].set_visible(False)
     axes.set_xlabel(xlabel, color=FAINT, fontsize=10)
     axes.set_ylabel(ylabel, color=FAINT, fontsize=10)
     return axes
 
 
-def light(scene: Scene, values: np.ndarray, gain: float = 1.0, size: int = 400) -> np.ndarray:
+def light(scene: Scene, values: np.ndarray, gain: float = 1.0) -> np.ndarray:
     """Linear light on the walls as the viewer sees it, sRGB on the page's colour; negative light is black."""
-    return _on_page(scene, to_srgb(np.clip(gain * _coloured(scene.view(values, size)), 0, 1)), size)
+    return _on_page(scene, to_srgb(np.clip(gain * _view(scene, values), 0, 1)))
 
 
-def signed(scene: Scene, values: np.ndarray, gain: float = 1.0, size: int = 400) -> np.ndarray:
+def signed(scene: Scene, values: np.ndarray, gain: float = 1.0) -> np.ndarray:
     """Positive and negative light around neutral grey, which is 0: each colour for itself."""
-    return _on_page(scene, np.clip(0.5 + 0.5 * gain * _coloured(scene.view(values, size)), 0, 1), size)
+    return _on_page(scene, np.clip(0.5 + 0.5 * gain * _view(scene, values), 0, 1))
 
 
-def _coloured(image: np.ndarray) -> np.ndarray:
+def _view(scene: Scene, values: np.ndarray) -> np.ndarray:
+    image = scene.view(values, SIZE)
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=-1)
 
 
-def _on_page(scene: Scene, image: np.ndarray, size: int) -> np.ndarray:
-    coverage = scene.view(np.ones(scene.grid), size)[..., None]
+def _on_page(scene: Scene, image: np.ndarray) -> np.ndarray:
+    coverage = scene.view(np.ones(scene.grid), SIZE)[..., None]
     paper = from_srgb(np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)]))
     return np.clip(to_srgb(from_srgb(image) * coverage + paper * (1 - coverage)), 0, 1)

@@ -128,25 +128,32 @@ def triad(device: Device, smoke: bool) -> tuple[Callable[[], None], int]:
 def report(
     given: Options, title: str, rows: list[Row], facts: dict[str, Any], draw: Callable[[], Any] | None = None
 ) -> None:
-    """Print the rows, and write and draw them where the command line asked for it."""
+    """Publish comparisons, by default as bars."""
+    table = Table("question", "competitor", "theirs", "ours", "unit", "ratio", "target", "verdict")
+    for row in rows:
+        target = "" if row.target is None else f"{row.target:.3g}x"
+        figures = (f"{row.theirs:.4g}", f"{row.ours:.4g}", row.unit, f"{row.ratio:.2f}x")
+        table.add_row(row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict)
+    content = {"rows": [{**asdict(row), "verdict": row.verdict} for row in rows]}
+    publish(given, title, facts, table, content, draw or (lambda: _bars(title, rows)))
+
+
+def publish(
+    given: Options, title: str, facts: dict[str, Any], table: Table, content: Any, draw: Callable[[], Any]
+) -> None:
+    """Print facts and table; write them with `content`, and draw, where the command line asked for it."""
     console = Console(width=150)
     console.print(f"[bold]{title}[/]\n{given.device.name}, {given.device.driver}")
     for name, value in facts.items():
         console.print(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
     if given.smoke:
         console.print("[yellow]--smoke: sizes this small show that it runs, not how fast[/]")
-    table = Table("question", "competitor", "theirs", "ours", "unit", "ratio", "target", "verdict")
-    for row in rows:
-        target = "" if row.target is None else f"{row.target:.3g}x"
-        figures = (f"{row.theirs:.4g}", f"{row.ours:.4g}", row.unit, f"{row.ratio:.2f}x")
-        table.add_row(row.question, row.competitor, *figures, target, "" if given.smoke else row.verdict)
     console.print(table)
     if given.json is not None:
-        content = [{**asdict(row), "verdict": row.verdict} for row in rows]
-        write_json(given.json, record(given, title, facts) | {"rows": content})
+        write_json(given.json, record(given, title, facts) | content)
     if given.plot is not None:
         given.plot.parent.mkdir(parents=True, exist_ok=True)
-        plots.save(draw() if draw else _bars(title, rows), given.plot)
+        plots.save(draw(), given.plot)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -157,19 +164,10 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 def record(given: Options, title: str, facts: dict[str, Any]) -> dict[str, Any]:
     """What every JSON file of a bench opens with: the question, the device and the versions."""
-    return {
-        "title": title,
-        "smoke": given.smoke,
-        "device": given.device.name,
-        "driver": given.device.driver,
-        "versions": {
-            "ltcl": ltcl.__version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "scipy": scipy.__version__,
-        },
-        "facts": facts,
-    }
+    versions = {"ltcl": ltcl.__version__, "python": platform.python_version()}
+    versions |= {"numpy": np.__version__, "scipy": scipy.__version__}
+    device = {"device": given.device.name, "driver": given.device.driver}
+    return {"title": title, "smoke": given.smoke, **device, "versions": versions, "facts": facts}
 
 
 def _bars(title: str, rows: list[Row]) -> Any:

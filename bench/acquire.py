@@ -17,6 +17,7 @@ photographs and time against the number of pixels, beside what the plan said bef
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,10 +28,12 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator
 
 import _figures as figures
 import ltcl
-from _acquired import Cost, draw
+from _coefficients import relative
 from _figures import Claim
 from _harness import options
 from ltcl.acquisition import Report, VirtualRig, acquire
@@ -42,18 +45,30 @@ CAMERAS = {"srgb, 8 bits": ("srgb", 8), "film, 12 bits": ("film", 12)}
 STRATEGIES = ("adaptive", "hadamard", "pixel")
 COLOURS, MIXING = (0.7, 0.5, 0.3), [[0.9, 0.15, 0.0], [0.05, 0.8, 0.1], [0.0, 0.2, 0.9]]
 TILES = 8
+# Of the strategies: name and colour of their curves, and width, as one lies below another.
+LINES = {
+    "adaptive": ("adaptive", "#c0392b", 1.5),
+    "hadamard": ("S-matrices", "#2a7f9e", 4),
+    "pixel": ("one at a time", "#e0b34c", 1.5),
+}
 
 
 @dataclass(frozen=True)
 class Found:
-    """One acquisition. `bounces`: error over `std` of bounces 0 to 3; `inside`: within 3 deviations.
+    """One acquisition: photographs and seconds of exposure, as planned and as taken; seconds it ran.
 
-    `far` is the error of far light row by row, `weak` that of all of it, which noise hardly changes.
+    `bounces`: error over `std` of bounces 0 to 3; `inside`: within 3 deviations. `far` is the error of far
+    light row by row, `weak` that of all of it, which noise hardly changes.
     """
 
     name: str
     strategy: str
-    cost: Cost
+    pixels: int
+    planned: int
+    photographs: int
+    planned_exposure: float
+    exposure: float
+    seconds: float
     held: float
     sums: float
     sum_deviation: float
@@ -76,14 +91,9 @@ def held(n: int) -> np.ndarray:
     """Noise, stripes and smooth patterns, (N, 6)."""
     rng = np.random.default_rng(11)
     y, x = np.mgrid[:n, :n] / n
-    parts = [rng.random((n, n)) for _ in range(2)]
-    parts += [
-        np.sin(60 * x + 20 * y) > 0,
-        x * (1 - y),
-        0.5 + 0.5 * np.sin(9 * x),
-        (x - 0.3) ** 2 + y**2 < 0.1,
-    ]
-    return np.stack([np.asarray(part, np.float64) for part in parts]).reshape(6, -1).T
+    smooth = [x * (1 - y), 0.5 + 0.5 * np.sin(9 * x), (x - 0.3) ** 2 + y**2 < 0.1]
+    patterns = [rng.random((n, n)), rng.random((n, n)), np.sin(60 * x + 20 * y) > 0, *smooth]
+    return np.stack(patterns).astype(np.float64).reshape(6, -1).T
 
 
 class Truth:
@@ -119,7 +129,6 @@ def shown(T: ltcl.Transport, P: np.ndarray) -> np.ndarray:
 
 
 def measured(truth: Truth, camera: str, strategy: str, device: Device, name: str) -> Found:
-    """Acquire and compare."""
     response, bits = CAMERAS[camera]
     grid, T_or = (truth.n, truth.n), truth.matrices if truth.channels == 3 else truth.matrices[0]
     rig = VirtualRig(T_or, grid, mixing=truth.mixing, response=response, bits=bits, ambient=0.01, seed=2)
@@ -128,28 +137,17 @@ def measured(truth: Truth, camera: str, strategy: str, device: Device, name: str
         T = acquire(rig, geometry="aligned", strategy=strategy, store=path, device=device)
         seconds, report = time.perf_counter() - start, Report.of(path)
         plan = BlockStore.open(path).attributes["plan"]
-        cost = Cost(strategy, truth.n**2, plan["photographs"], report.photographs, plan["seconds"],
-                    report.patterns * sum(report.exposures), seconds)  # fmt: skip
-        unit, sums = rows(T, truth)
+        exposures = plan["seconds"], report.patterns * sum(report.exposures)
+        white = np.ones((truth.n**2, 1, truth.channels))
+        ours, theirs = shown(T, white)[:, 0], truth.seen(white)[:, 0]
+        unit = np.sum(ours * theirs, axis=0) / np.sum(ours**2, axis=0)  # of light, of each channel
+        sums = float(np.max(np.abs(unit * ours / theirs - 1)))
         P = np.repeat(held(truth.n)[..., None], truth.channels, axis=-1)
-        ratios, inside = of_bounces(T, truth)
         return Found(
-            name, strategy, cost, apart(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
-            *far(T, truth, unit), compensated(T, truth, unit), ratios, inside,
+            name, strategy, truth.n**2, plan["photographs"], report.photographs, *exposures, seconds,
+            relative(unit * shown(T, P), truth.seen(P)), sums, report.sum_deviation,
+            *far(T, truth, unit), compensated(T, truth, unit), *of_bounces(T, truth),
         )  # fmt: skip
-
-
-def apart(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """The largest relative error over pictures and channels."""
-    return float(np.max(np.linalg.norm(ours - theirs, axis=0) / np.linalg.norm(theirs, axis=0)))
-
-
-def rows(T: ltcl.Transport, truth: Truth) -> tuple[np.ndarray, float]:
-    """The unit of light of each channel, and the row sum that is furthest off in it."""
-    white = np.ones((truth.n**2, 1, truth.channels))
-    ours, theirs = shown(T, white)[:, 0], truth.seen(white)[:, 0]
-    unit = np.sum(ours * theirs, axis=0) / np.sum(ours**2, axis=0)
-    return unit, float(np.max(np.abs(unit * ours / theirs - 1)))
 
 
 def far(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> tuple[float, float]:
@@ -160,7 +158,7 @@ def far(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> tuple[float, float
     (y, x), (v, u) = (np.divmod(part, TILES) for part in (tile, np.arange(TILES**2)))
     beyond = (np.maximum(abs(y - v), abs(x - u)) > 1)[..., None]
     ours, theirs = (np.sum(beyond * seen, axis=1) for seen in (unit * shown(T, P), truth.seen(P)))
-    return apart(ours, theirs), float(np.max(np.abs(ours.sum(axis=0) / theirs.sum(axis=0) - 1)))
+    return relative(ours, theirs), float(np.max(np.abs(ours.sum(axis=0) / theirs.sum(axis=0) - 1)))
 
 
 def of_bounces(T: ltcl.Transport, truth: Truth) -> tuple[list[float], float]:
@@ -191,69 +189,85 @@ def compensated(T: ltcl.Transport, truth: Truth, unit: np.ndarray) -> float:
     return float(10 * np.log10(desired.max() ** 2 / np.mean(error**2)))
 
 
-def claims(found: list[Found]) -> list[Claim]:
-    """What has to hold of each acquisition."""
-    listed = []
+def claims(found: list[Found], costs: list[Found], largest: int) -> list[Claim]:
+    cost = {one.strategy: one.photographs for one in costs if one.pixels == largest}
+    over = max(one.photographs / one.planned for one in costs)
+    fifth = "an adaptive scan takes a fifth of the photographs of one pixel at a time"
+    counts, is_fifth = f"{cost['adaptive']} of {cost['pixel']}", 5 * cost["adaptive"] <= cost["pixel"]
+    listed = [
+        Claim(fifth, counts, "at most 1 / 5", is_fifth),
+        Claim("photographs over what the plan said, at most", f"{over:.3f}", "at most 1", over <= 1),
+    ]
     for one in found:
-        worst, noisy = max(one.bounces[1:]), f"{one.inside:.1%} within 3 deviations"
+        ratios = ", ".join(f"{ratio:.2f}" for ratio in one.bounces[1:])
+        bounces = f"{one.name}: bounces 1 to 3, error over std"
+        inside = f"{one.inside:.1%} within 3 deviations"
         listed += [
             Claim(f"{one.name}: T p of held patterns", f"{one.held:.2%}", "at most 2 %", one.held <= 0.02),
             Claim(f"{one.name}: row sum furthest off", f"{one.sums:.2%}", "at most 2 %", one.sums <= 0.02),
             Claim(f"{one.name}: far light, all", f"{one.weak:.2%} off", "at most 2 %", one.weak <= 0.02),
             Claim(f"{one.name}: compensated", f"{one.decibels:.1f} dB", "at least 30", one.decibels >= 30),
-            Claim(
-                f"{one.name}: bounces 1 to 3, error over std",
-                ", ".join(f"{ratio:.2f}" for ratio in one.bounces[1:]) + f"; {noisy}",
-                "at most 2",
-                worst <= 2,
-            ),
+            Claim(bounces, f"{ratios}; {inside}", "at most 2", max(one.bounces[1:]) <= 2),
         ]
     return listed
 
 
-def of_cost(costs: list[Cost], largest: int) -> list[Claim]:
-    """What has to hold of photographs."""
-    cost = {one.strategy: one.photographs for one in costs if one.pixels == largest}
-    over = max(one.photographs / one.planned for one in costs)
-    return [
-        Claim(
-            "an adaptive scan takes a fifth of the photographs of one pixel at a time",
-            f"{cost['adaptive']} of {cost['pixel']}",
-            "at most 1 / 5",
-            5 * cost["adaptive"] <= cost["pixel"],
-        ),
-        Claim("photographs over what the plan said, at most", f"{over:.3f}", "at most 1", over <= 1),
+def draw(costs: list[Found]) -> Figure:
+    figure = figures.page(
+        440,
+        "What it takes to measure a transport",
+        "A corner of n x n pixels, a camera of 12 bits. Dashed: what plans said.",
+    )
+    quantities = [
+        ("photographs", 1, "photographs", "planned"),
+        ("hours of exposure", 3600, "exposure", "planned_exposure"),
+        ("seconds of computing", 1, "seconds", None),
     ]
+    for place, (title, unit, taken, planned) in enumerate(quantities):
+        axes = figures.graph(figure, (70 + 320 * place, 140, 260, 230), title, "pixels", "")
+        for strategy, (label, colour, width) in LINES.items():
+            some = [cost for cost in costs if cost.strategy == strategy]
+            pixels = [cost.pixels for cost in some]
+            values = [getattr(cost, taken) / unit for cost in some]
+            axes.plot(pixels, values, "o-", ms=4, lw=width, color=colour, label=label)
+            if planned is not None:
+                values = [getattr(cost, planned) / unit for cost in some]
+                axes.plot(pixels, values, "--", lw=1, color=colour)
+        sides = sorted({round(cost.pixels**0.5) for cost in costs})
+        axes.set_xscale("log")
+        axes.set_xticks([n * n for n in sides], [f"{n}\u00b2" for n in sides])
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
+        axes.minorticks_off()
+        if place == 0:
+            axes.legend(frameon=False, labelcolor=figures.FAINT, fontsize=9.5)
+    return figure
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     sides = [8, 16] if given.smoke else [16, 24, 32, 48, 64]
     run = partial(measured, device=given.device)
-    truth = Truth([corner(sides[-1])])
-    cameras = list(CAMERAS)[1:] if given.smoke else CAMERAS
+    truth, cameras = Truth([corner(sides[-1])]), list(CAMERAS)[1:] if given.smoke else CAMERAS
     found = [run(truth, camera, k, name=f"{k}, {camera}") for camera in cameras for k in STRATEGIES]
-    smaller = [
-        run(Truth([corner(n)]), "film, 12 bits", k, name=f"{k}, {n}") for n in sides[:-1] for k in STRATEGIES
-    ]
+    costs = []
+    for n, k in itertools.product(sides[:-1], STRATEGIES):
+        costs.append(run(Truth([corner(n)]), "film, 12 bits", k, name=f"{k}, {n}"))
+    costs += [one for one in found if "film" in one.name]
     colour = Truth([corner(8 if given.smoke else 32, albedo) for albedo in COLOURS], MIXING)
-    mixed = [run(colour, "srgb, 8 bits", k, name=f"{k}, colours") for k in STRATEGIES[:2]]
-    largest = [one.cost for one in found if "film" in one.name]
-    costs = [*(one.cost for one in smaller), *largest]
+    found += [run(colour, "srgb, 8 bits", k, name=f"{k}, colours") for k in STRATEGIES[:2]]
     facts: dict[str, Any] = {"pixels": sides[-1] ** 2}
-    for one in [*found, *mixed]:
-        facts[f"{one.name}, seconds"] = one.cost.seconds
-        facts[f"{one.name}, photographs"] = one.cost.photographs
+    for one in found:
+        facts[f"{one.name}, seconds"] = one.seconds
+        facts[f"{one.name}, photographs"] = one.photographs
         facts[f"{one.name}, far light row by row"] = one.far
         facts[f"{one.name}, direct part, error over std"] = one.bounces[0]
         if one.strategy != "adaptive":
             facts[f"{one.name}, columns beside white before they added up to it"] = one.sum_deviation
     for cost in costs:
-        facts[f"{cost.strategy}, {cost.pixels} pixels, photographs over plan"] = (
-            cost.photographs / cost.planned
-        )
-    listed = of_cost(costs, sides[-1] ** 2) + claims([*found, *mixed])
+        name = f"{cost.strategy}, {cost.pixels} pixels, photographs over plan"
+        facts[name] = cost.photographs / cost.planned
+    listed = claims(found, costs, sides[-1] ** 2)
     if given.smoke:  # so few pixels show that it runs, not how few photographs a larger one takes
         listed = listed[1:2]
     figures.conclude(given, "A transport from photographs", listed, facts, partial(draw, costs))

@@ -70,13 +70,7 @@ def identity_plus(device: Device, S: np.ndarray) -> tuple[Any, np.ndarray]:
     return IdentityPlus(Dense(device, R)), np.eye(len(S)) + R.astype(np.longdouble)
 
 
-def tiles(device: Device, S: np.ndarray) -> tuple[Any, np.ndarray]:
-    """Tiles of float16, which stand for other numbers."""
-    A = Tiles(device, scipy.sparse.csr_array(S))
-    return A, A.matrix().toarray()
-
-
-# S as it is given to solve, and its numbers.
+# S as it is given to solve, and its numbers: tiles of float16 stand for other ones.
 KINDS: dict[str, Callable[[Device, np.ndarray], tuple[Any, np.ndarray]]] = {
     "float64 array": lambda device, S: (S, S),
     "float32 array": lambda device, S: (S.astype(np.float32), S.astype(np.float32)),
@@ -84,7 +78,7 @@ KINDS: dict[str, Callable[[Device, np.ndarray], tuple[Any, np.ndarray]]] = {
     "LinearOperator": lambda device, S: (aslinearoperator(S), S),
     "Dense": lambda device, S: (Dense(device, S), S.astype(np.float32)),
     "CSR": lambda device, S: (CSR(device, scipy.sparse.csr_array(S)), S),
-    "tiles": tiles,
+    "tiles": lambda device, S: (A := Tiles(device, scipy.sparse.csr_array(S)), A.matrix().toarray()),
     "I + R": identity_plus,
 }
 
@@ -118,7 +112,6 @@ def untrue(device: Device, random: Random, tally: Counter[str]) -> str | None:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     random, tally, total = np.random.default_rng(0), Counter[str](), SOLVES[given.smoke]
     with warnings.catch_warnings():

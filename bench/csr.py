@@ -39,32 +39,24 @@ def matrix(n: int, per_row: int, run: int, seed: int = 0) -> Any:
     return scipy.sparse.csr_array((values, columns, pointers), shape=(n, n))
 
 
-def products(given: Options, name: str, A: Any) -> dict[str, Callable[[], object]]:
-    """A product of ours and of each peer for each number of sides, ours checked against SciPy's."""
+def compare(given: Options, name: str, A: Any) -> list[Row]:
+    """Rows for one matrix; everything is timed in turn, so that all ratios are of one moment."""
+    run, nbytes = triad(given.device, given.smoke)
     operator, rng = CSR(given.device, A), np.random.default_rng(1)
-    actions: dict[str, Callable[[], object]] = {}
+    actions: dict[str, Callable[[], object]] = {"triad": run}
     for k in SIDES:
         x = rng.random((A.shape[1], k) if k > 1 else A.shape[1], dtype=np.float32)
         if not np.allclose(operator.dot(x), A @ x, rtol=1e-4, atol=1e-5):
             raise SystemExit(f"the product of {name} with {k} right-hand sides is wrong")
         actions[f"ours {k}"] = product(operator, x)
-        peers = sparse_products(A, x)
-        actions |= {f"{peer} {k}": peers[peer] for peer in PEERS if peer in peers}
-    return actions
-
-
-def compare(given: Options, name: str, A: Any) -> list[Row]:
-    """Rows for one matrix; everything is timed in turn, so that all ratios are of one moment."""
-    run, nbytes = triad(given.device, given.smoke)
-    times = seconds({"triad": run, **products(given, name, A)})
-    ms = {what: 1e3 * spent for what, spent in times.items()}
+        actions |= {f"{peer} {k}": theirs for peer, theirs in sparse_products(A, x).items()}
+    ms = {what: 1e3 * spent for what, spent in seconds(actions).items()}
     rows, alone = [], ms["ours 1"]
     for k in SIDES:
         question, ours = f"{name}, k = {k}", ms[f"ours {k}"]
         targets = {"scipy": SCIPY_TARGET.get(k), "cupy": CUSPARSE_TARGET}
         for peer, who in PEERS.items():
-            theirs = ms.get(f"{peer} {k}")
-            if theirs is not None:
+            if (theirs := ms.get(f"{peer} {k}")) is not None:
                 rows.append(Row.of_times(question, who, theirs, ours, "ms", targets.get(peer)))
         if k == 1:
             roof, rate = nbytes / ms["triad"] / 1e6, 8 * A.nnz / ours / 1e6
@@ -76,7 +68,6 @@ def compare(given: Options, name: str, A: Any) -> list[Row]:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     n, per_row = (2048, 32) if given.smoke else (131072, 256)
     rows = []

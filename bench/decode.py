@@ -10,23 +10,17 @@ finds fractions of a pixel: the facts tell what comes of that.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 
 from _harness import Row, options, report, seconds
-from ltcl.acquisition.geometry import Correspondence, GrayCode, Resampling, decode
+from ltcl.acquisition.geometry import GrayCode, Resampling, decode
 
-TARGETS = {"whole": 2.0, "fraction": 1.0}
-
-
-def scene(grid: tuple[int, int], camera: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Projector coordinates that each camera pixel sees."""
-    (h, w), (H, W) = grid, camera
-    v, u = np.mgrid[:H, :W] / np.array([H, W]).reshape(2, 1, 1)
-    d = 1 + 0.08 * u + 0.05 * v
-    return w * (0.05 + 0.8 * u + 0.06 * v) / d, h * (0.04 + 0.85 * v + 0.05 * u) / d
+QUESTIONS = {
+    "bits": ("bits and coordinates", None),
+    "whole": ("and neighbours compared", 2.0),
+    "fraction": ("and fractions of a pixel", 1.0),
+}
 
 
 def photographs(code: GrayCode, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
@@ -40,89 +34,52 @@ def photographs(code: GrayCode, x: np.ndarray, y: np.ndarray) -> list[np.ndarray
     return images
 
 
-class Peer:
-    """OpenCV on two cameras that take the same photographs."""
-
-    def __init__(self, code: GrayCode, images: list[np.ndarray]) -> None:
-        self.pattern = cv2.structured_light.GrayCodePattern.create(code.grid[1], code.grid[0])
-        self.pattern.setBlackThreshold(10)
-        self.pattern.setWhiteThreshold(5)
-        self.images = images
-
-    def __call__(self) -> bool:
-        """Decode both; whether it did."""
-        *coded, white, black = self.images
-        return self.pattern.decode([coded, coded], None, [black, black], [white, white])[0]
-
-    def map(self, rows: slice) -> np.ndarray:
-        """(rows, W, 2) of a few rows, pixel by pixel; NaN where it gives none."""
-        W = self.images[0].shape[1]
-        places = [(u, v) for v in range(rows.start, rows.stop) for u in range(W)]
-        found = [self.pattern.getProjPixel(self.images[:-2], u, v) for u, v in places]
-        return np.array([(np.nan, np.nan) if bad else p for bad, p in found]).reshape(-1, W, 2)
-
-
 def off(x: np.ndarray, y: np.ndarray, truth: tuple[np.ndarray, np.ndarray]) -> float:
     """Root mean square distance from the truth, of what was decoded."""
     return float(np.sqrt(np.nanmean((x - truth[0]) ** 2 + (y - truth[1]) ** 2)))
 
 
-def actions(code: GrayCode, images: list[np.ndarray], peer: Peer) -> dict[str, Callable[[], object]]:
-    """What is timed."""
-    return {
-        "opencv": peer,
+def main() -> None:
+    given = options(__doc__ or "")
+    grid, (H, W) = ((48, 64), (60, 80)) if given.smoke else ((768, 1024), (1024, 1280))
+    (h, w), code = grid, GrayCode(grid)
+    v, u = np.mgrid[:H, :W] / np.array([H, W]).reshape(2, 1, 1)
+    d = 1 + 0.08 * u + 0.05 * v
+    # Projector coordinates that each camera pixel sees.
+    truth = w * (0.05 + 0.8 * u + 0.06 * v) / d, h * (0.04 + 0.85 * v + 0.05 * u) / d
+    images = photographs(code, *truth)
+    *coded, white, black = images
+    peer = cv2.structured_light.GrayCodePattern.create(grid[1], grid[0])
+    peer.setBlackThreshold(10)
+    peer.setWhiteThreshold(5)
+    actions = {
+        "opencv": lambda: peer.decode([coded, coded], None, [black, black], [white, white])[0],
         "bits": lambda: code.decode(images, edges=False),
-        "whole": lambda: decode(images, code.grid, subpixel=False),
-        "fraction": lambda: decode(images, code.grid),
+        "whole": lambda: decode(images, grid, subpixel=False),
+        "fraction": lambda: decode(images, grid),
     }
-
-
-def facts(found: Correspondence, whole: Correspondence, peer: Peer, truth: tuple[np.ndarray, ...]) -> dict:
-    """How good the maps are: decoded, and off by how many projector pixels."""
-    rows = slice(len(truth[0]) // 2, len(truth[0]) // 2 + 2)
-    theirs = peer.map(rows)
-    return {
+    if not actions["opencv"]():
+        raise SystemExit("OpenCV decoded nothing")
+    rate = {name: H * W / spent / 1e6 for name, spent in seconds(actions, 3).items()}
+    rows, theirs = [], 2 * rate["opencv"]
+    for name, (question, target) in QUESTIONS.items():
+        ours = rate[name]
+        row = Row(question, "cv2 GrayCodePattern.decode", theirs, ours, "Mpixel/s", ours / theirs, target)
+        rows.append(row)
+    some = slice(H // 2, H // 2 + 2)  # rows in which OpenCV is asked pixel by pixel
+    answers = [peer.getProjPixel(coded, i, j) for j in range(some.start, some.stop) for i in range(W)]
+    places = np.array([(np.nan, np.nan) if bad else place for bad, place in answers]).reshape(-1, W, 2)
+    x, y = np.moveaxis(places, -1, 0)
+    found, whole = decode(images, grid), decode(images, grid, subpixel=False)
+    facts = {
         "decoded, ours": found.decoded,
-        f"decoded, opencv, {2 * theirs.shape[1]} pixels": float(np.mean(np.isfinite(theirs[..., 0]))),
-        "rms, opencv there": off(theirs[..., 0], theirs[..., 1], (truth[0][rows], truth[1][rows])),
-        "rms, whole numbers": off(whole.x, whole.y, (truth[0], truth[1])),
-        "rms, fractions": off(found.x, found.y, (truth[0], truth[1])),
+        f"decoded, opencv, {2 * W} pixels": float(np.mean(np.isfinite(x))),
+        "rms, opencv there": off(x, y, (truth[0][some], truth[1][some])),
+        "rms, whole numbers": off(whole.x, whole.y, truth),
+        "rms, fractions": off(found.x, found.y, truth),
         "nonzeros of the resampling, millions": Resampling.of(found).weights.nnz / 1e6,
     }
-
-
-def main() -> None:
-    """Run the bench."""
-    given = options(__doc__ or "")
-    grid, camera = ((48, 64), (60, 80)) if given.smoke else ((768, 1024), (1024, 1280))
-    truth = scene(grid, camera)
-    code = GrayCode(grid)
-    images = photographs(code, *truth)
-    peer = Peer(code, images)
-    if not peer():
-        raise SystemExit("OpenCV decoded nothing")
-    times = seconds(actions(code, images, peer), 3)
-    mega = camera[0] * camera[1] / 1e6
-    theirs = 2 * mega / times["opencv"]
-    questions = {
-        "bits": ("bits and coordinates", None),
-        "whole": ("and neighbours compared", TARGETS["whole"]),
-        "fraction": ("and fractions of a pixel", TARGETS["fraction"]),
-    }
-    rows = [
-        Row(
-            question,
-            "cv2 GrayCodePattern.decode",
-            theirs,
-            mega / times[key],
-            "Mpixel/s",
-            mega / times[key] / theirs,
-            t,
-        )
-        for key, (question, t) in questions.items()
-    ]
-    found, whole = decode(images, grid), decode(images, grid, subpixel=False)
-    report(given, "Gray code into a map", rows, facts(found, whole, peer, truth))
+    report(given, "Gray code into a map", rows, facts)
 
 
 if __name__ == "__main__":

@@ -20,32 +20,27 @@ from ltcl.operators import Dense
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     scene = ltcl.scenes.box(6 if given.smoke else 32, sides=4, albedo=0.45)
     T = scene.transport(device=given.device)
     S = T.systems[0]
     dense = S.to_dense()
-    pattern = np.random.default_rng(0).random(T.shape[1])
-    l_d = T.first_bounce * pattern
+    l_d = T.first_bounce * np.random.default_rng(0).random(T.shape[1])
     l_out = dense @ l_d
     l_out32, factors32 = l_out.astype(np.float32), scipy.linalg.lu_factor(dense.astype(np.float32))
     A = np.eye(len(dense)) - np.linalg.inv(dense)
     inverse = ltcl.Inverse([Dense(given.device, A)], [1e-5], T.grid, T.first_bounce)
     solution = ltcl.solve(S, l_out, "chebyshev", rtol=1e-2)
     run, nbytes = triad(given.device, given.smoke)
-    times = seconds(
-        {
-            "triad": run,
-            "ours": lambda: ltcl.solve(S, l_out, "chebyshev", rtol=1e-2),
-            "float64": lambda: np.linalg.solve(dense, l_out),
-            "kept32": lambda: scipy.linalg.lu_solve(factors32, l_out32),
-            "inverse": lambda: inverse.solve(l_out),
-        },
-        repeats=5,
-    )
-    question = f"direct part at N = {T.shape[0]}"
-    kept = "LU kept, float32 (ours: an inverse kept)"
+    actions = {
+        "triad": run,
+        "ours": lambda: ltcl.solve(S, l_out, "chebyshev", rtol=1e-2),
+        "float64": lambda: np.linalg.solve(dense, l_out),
+        "kept32": lambda: scipy.linalg.lu_solve(factors32, l_out32),
+        "inverse": lambda: inverse.solve(l_out),
+    }
+    times = seconds(actions, repeats=5)
+    question, kept = f"direct part at N = {T.shape[0]}", "LU kept, float32 (ours: an inverse kept)"
     rows = [
         Row.of_times(question, "numpy.linalg.solve, float64", times["float64"], times["ours"], "s", 51.0),
         Row.of_times(question, kept, times["kept32"], times["inverse"], "s", 1.0),

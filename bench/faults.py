@@ -34,11 +34,11 @@ from rich.progress import track
 
 import _figures as figures
 import ltcl
+from _coefficients import relative
 from _figures import Claim
 from _harness import options
 from ltcl import scenes
 from ltcl.acquisition import VirtualRig, acquire, camera_map
-from ltcl.device import Device
 from ltcl.errors import AcquisitionError, ScanRefused
 
 N, SIZE = 8, 3.0  # projector pixels along a wall; camera pixels to one
@@ -57,6 +57,7 @@ FAULTS, CLEAN = 100, 200
 VIEWS = 10
 HARM = 0.01
 PROCESSES = 2
+opened = cache(ltcl.open_device)  # of each process
 
 
 @cache
@@ -108,15 +109,12 @@ class Person:
         lamp = T.sum(axis=1) * (0.6 + 0.8 * x + 0.3 * y).ravel()
         added = lamp * np.random.default_rng(seed).uniform(0.01, 0.1) if kind == "light on in one" else 0.0
         shift = float(kind.split()[1]) if kind and kind.startswith("moved") else 0.0
-        self._rig, self._faulty_rig = (
-            VirtualRig(
-                T, (h, w), camera_grid=shape, camera_map=C, ambient=light, seed=seed, **CAMERAS[camera]
-            )
-            for (shape, C), light in (
-                (view((h, w), seed % VIEWS, 0.0), 0.01),
-                (view((h, w), seed % VIEWS, shift), 0.01 + added),
-            )
-        )
+        rigs = []
+        for moved, light in ((0.0, 0.01), (shift, 0.01 + added)):
+            shape, C = view((h, w), seed % VIEWS, moved)
+            place: dict[str, Any] = {"camera_grid": shape, "camera_map": C, "ambient": light}
+            rigs.append(VirtualRig(T, (h, w), seed=seed, **place, **CAMERAS[camera]))
+        self._rig, self._faulty_rig = rigs
         self.bits = self._rig.bits
 
     def prepare(self, shots: Iterable[tuple[Any, float]]) -> None:
@@ -133,37 +131,27 @@ class Person:
         self.number += 1
         if self._list and self._list[0][1] == seconds and np.array_equal(self._list[0][0], codes):
             self._list.popleft()
-        self._last = self._image(codes, seconds)
-        return self._last
-
-    def _image(self, codes: np.ndarray, seconds: float) -> np.ndarray:
-        n, at, kind = self.number, self.at, self.kind
-        following = self._list[0] if self._list else (codes, seconds)
-        if kind is None or n < at:
-            return self._rig.photograph(codes, seconds)
-        if kind == "two exchanged" and n == at:
-            self._put_off = codes, seconds
-            return self._rig.photograph(*following)
-        if kind == "two exchanged" and n == at + 1:
-            return self._rig.photograph(*self._put_off)
+        n, at, kind, rig, shot = self.number, self.at, self.kind or "", self._rig, (codes, seconds)
+        following = self._list[0] if self._list else shot
         if kind == "one repeated" and n == at and self._last is not None:
             return self._last
-        if kind == "one missing":
-            return self._rig.photograph(*following)
-        if kind.startswith("moved") or (kind == "light on in one" and n == at):
-            return self._faulty_rig.photograph(codes, seconds)
-        if kind == "a third of a stop" and n == at:
-            return self._rig.photograph(codes, seconds * 2.0 ** (1 / 3))
-        image = self._rig.photograph(codes, seconds)
-        return jpeg(image, self.bits) if kind == "JPEG from one on" else image
-
-
-def jpeg(image: np.ndarray, bits: int | None) -> np.ndarray:
-    """The photograph as a JPEG of quality 70."""
-    shift = (bits or 8) - 8
-    _, data = cv2.imencode(".jpg", (image >> shift).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 70])
-    decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    return np.asarray(decoded).astype(image.dtype) << shift
+        if kind == "two exchanged" and n == at:
+            self._put_off, shot = shot, following
+        elif kind == "two exchanged" and n == at + 1:
+            shot = self._put_off
+        elif kind == "one missing" and n >= at:
+            shot = following
+        elif kind == "a third of a stop" and n == at:
+            shot = codes, seconds * 2.0 ** (1 / 3)
+        elif (kind.startswith("moved") and n >= at) or (kind == "light on in one" and n == at):
+            rig = self._faulty_rig
+        image = rig.photograph(*shot)
+        if kind == "JPEG from one on" and n >= at:
+            shift, quality = (self.bits or 8) - 8, [cv2.IMWRITE_JPEG_QUALITY, 70]
+            _, data = cv2.imencode(".jpg", (image >> shift).astype(np.uint8), quality)
+            image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)).astype(image.dtype) << shift
+        self._last = image
+        return image
 
 
 @dataclass(frozen=True)
@@ -179,56 +167,28 @@ class Outcome:
     named: bool
     text: str
 
-
-@dataclass(frozen=True)
-class Scan:
-    """What is scanned, and how: the same number is the same scan, to the noise."""
-
-    number: int
-
     @property
-    def names(self) -> tuple[str, str, str]:
-        """Scene, camera, strategy."""
-        k = self.number
-        return SCENES[k % 5], list(CAMERAS)[k // 5 % 3], STRATEGIES[(k // 15 + k) % 3]
+    def where(self) -> str:
+        """Scan and photograph."""
+        return f"{self.scan}, photograph {self.at} of {self.count}"
 
-    def acquired(
-        self, device: Device, kind: str | None = None, at: int = 0
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """T p of some patterns, which pixels are known, photographs."""
-        name, camera, strategy = self.names
-        rig = Person(name, camera, self.number, kind, at)
-        with TemporaryDirectory() as folder:
-            T = acquire(rig, strategy=strategy, store=Path(folder) / "T.zarr", device=device)
-            y, x = np.mgrid[: T.grid[0], : T.grid[1]] / max(T.grid)
-            rng = np.random.default_rng(3)
-            P = [rng.random(T.grid), rng.random(T.grid) < 0.5, 0.5 + 0.5 * np.sin(9 * x + 5 * y), x > y]
-            shown = np.asarray(T @ np.stack(P).astype(np.float32), np.float64).reshape(len(P), -1)
-            return shown, ~np.asarray(T.masked).ravel(), rig.number
 
-    def outcomes(self, kinds: Sequence[str], device: Device) -> list[Outcome]:
-        """The scan without a fault, and with one of each kind."""
-        name = " ".join(self.names)
-        try:
-            clean, known, count = self.acquired(device)
-        except AcquisitionError as error:
-            return [Outcome(None, name, 0, 0, 0.0, True, False, str(error))]
-        results = [Outcome(None, name, 0, count, 0.0, False, False, "")]
-        for kind in kinds:
-            at = int(np.random.default_rng((self.number, KINDS.index(kind))).integers(2, count - 1))
-            try:
-                shown, seen, _ = self.acquired(device, kind, at)
-            except AcquisitionError as error:
-                early = not isinstance(error, ScanRefused)  # before anything was kept
-                first = at - 1 if kind == "one repeated" else at
-                last = count if kind.startswith("JPEG") else at + 1
-                named = early and any(first <= number <= last for number in numbers(str(error)))
-                results.append(Outcome(kind, name, at, count, np.nan, early, named, str(error)))
-                continue
-            both = known & seen
-            change = np.linalg.norm((shown - clean)[:, both], axis=1) / np.linalg.norm(clean[:, both], axis=1)
-            results.append(Outcome(kind, name, at, count, float(change.max()), False, False, ""))
-        return results
+def acquired(number: int, kind: str | None = None, at: int = 0) -> tuple[np.ndarray, np.ndarray, int]:
+    """T p of some patterns, which pixels are known, photographs; one number is one scan, to the noise."""
+    name, camera, strategy = names(number)
+    rig = Person(name, camera, number, kind, at)
+    with TemporaryDirectory() as folder:
+        T = acquire(rig, strategy=strategy, store=Path(folder) / "T.zarr", device=opened())
+        y, x = np.mgrid[: T.grid[0], : T.grid[1]] / max(T.grid)
+        rng = np.random.default_rng(3)
+        P = [rng.random(T.grid), rng.random(T.grid) < 0.5, 0.5 + 0.5 * np.sin(9 * x + 5 * y), x > y]
+        shown = np.asarray(T @ np.stack(P).astype(np.float32), np.float64).reshape(len(P), -1)
+        return shown, ~np.asarray(T.masked).ravel(), rig.number
+
+
+def names(k: int) -> tuple[str, str, str]:
+    """Scene, camera and strategy of a scan."""
+    return SCENES[k % 5], list(CAMERAS)[k // 5 % 3], STRATEGIES[(k // 15 + k) % 3]
 
 
 def numbers(text: str) -> set[int]:
@@ -240,53 +200,55 @@ def numbers(text: str) -> set[int]:
     return result
 
 
-def run(job: tuple[int, Sequence[str], str | None]) -> list[Outcome]:
-    """One scan and its faults, in a process of its own."""
-    number, kinds, device = job
-    return Scan(number).outcomes(kinds, opened(device))
-
-
-@cache
-def opened(device: str | None) -> Device:
-    """The device of this process."""
-    return ltcl.open_device(device)
+def run(job: tuple[int, Sequence[str]]) -> list[Outcome]:
+    """A scan without a fault, and with one of each kind, in a process of its own."""
+    scan, kinds = job
+    name = " ".join(names(scan))
+    try:
+        clean, known, count = acquired(scan)
+    except AcquisitionError as error:
+        return [Outcome(None, name, 0, 0, 0.0, True, False, str(error))]
+    results = [Outcome(None, name, 0, count, 0.0, False, False, "")]
+    for kind in kinds:
+        at = int(np.random.default_rng((scan, KINDS.index(kind))).integers(2, count - 1))
+        try:
+            shown, seen, _ = acquired(scan, kind, at)
+        except AcquisitionError as error:
+            early = not isinstance(error, ScanRefused)  # before anything was kept
+            first = at - 1 if kind == "one repeated" else at
+            last = count if kind.startswith("JPEG") else at + 1
+            named = early and any(first <= number <= last for number in numbers(str(error)))
+            results.append(Outcome(kind, name, at, count, np.nan, early, named, str(error)))
+            continue
+        change = relative(shown[:, known & seen].T, clean[:, known & seen].T)
+        results.append(Outcome(kind, name, at, count, change, False, False, ""))
+    return results
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     faults, clean = (1, 2) if given.smoke else (FAULTS, CLEAN)
-    jobs = [(k, KINDS if k < faults else (), None) for k in range(clean)]
+    jobs = [(k, KINDS if k < faults else ()) for k in range(clean)]
     with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("spawn")) as pool:
         results = pool.map(run, jobs)
         followed = track(results, "scans", total=len(jobs), disable=not sys.stderr.isatty())
         outcomes = [one for several in followed for one in several]
-    facts: dict[str, Any] = {
-        "scans": len(outcomes),
-        "cameras": ", ".join(CAMERAS),
-        "scenes": ", ".join(SCENES),
-    }
+    facts: dict[str, Any] = {"scans": len(outcomes)}
+    facts |= {"cameras": ", ".join(CAMERAS), "scenes": ", ".join(SCENES)}
     claims, shares = [], {}
     for kind in KINDS:
         some = [one for one in outcomes if one.kind == kind]
         refused = [one for one in some if one.refused]
-        named = sum(one.named for one in refused)
         missed = [one for one in some if not one.refused and not one.change <= HARM]
-        claims += [
-            Claim(f"{kind}: kept, T p moved by over 1 %", f"{len(missed)} of {len(some)}", "0", not missed),
-            Claim(
-                f"{kind}: refused and named",
-                f"{named} of {len(refused)}",
-                "95 %",
-                named >= 0.95 * len(refused),
-            ),
-        ]
-        shares[kind] = len(refused) / len(some), named / len(some)
-        facts |= {
-            f"{kind}, kept": [f"{o.scan}, photograph {o.at} of {o.count}: {o.change:.1%}" for o in missed]
-        }
-        wrong = [f"{o.scan}, photograph {o.at} of {o.count}: {o.text}" for o in refused if not o.named]
-        facts |= {f"{kind}, another named": wrong}
+        wrong = [one for one in refused if not one.named]
+        named, count = len(refused) - len(wrong), len(refused)
+        lost = f"{len(missed)} of {len(some)}"
+        claims.append(Claim(f"{kind}: kept, T p moved by over 1 %", lost, "0", not missed))
+        is_named = named >= 0.95 * count
+        claims.append(Claim(f"{kind}: refused and named", f"{named} of {count}", "95 %", is_named))
+        shares[kind] = count / len(some), named / len(some)
+        facts[f"{kind}, kept"] = [f"{o.where}: {o.change:.1%}" for o in missed]
+        facts[f"{kind}, another named"] = [f"{o.where}: {o.text}" for o in wrong]
     wrong = [one for one in outcomes if one.kind is None and one.refused]
     claims.append(Claim("scans without a fault, refused", f"{len(wrong)} of {clean}", "0", not wrong))
     facts |= {"refused without a fault": [f"{o.scan}: {o.text}" for o in wrong]}
@@ -295,7 +257,6 @@ def main() -> None:
 
 
 def draw(shares: dict[str, tuple[float, float]]) -> Figure:
-    """Bars of what was refused, and named, of each kind."""
     figure = Figure(figsize=(9, 4), dpi=120, layout="constrained")
     axes, places = figure.subplots(), range(len(shares))
     refused, named = zip(*shares.values(), strict=True)

@@ -11,9 +11,10 @@ in cyan and magenta; the bleeding cancels; n terms remove the bounces up to n; t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -23,9 +24,6 @@ from _harness import options
 from ltcl.plots.page import FAINT, INK, axes_at, label_at
 from ltcl.scenes import Scene
 from ltcl.theory import bounce_coefficients
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TERMS, SHOWN, ORDERS, BOUNCES = 30, (0, 1, 2, 3, 8), 5, 8
 
@@ -72,100 +70,65 @@ def contents(n: int, bounces: int) -> np.ndarray:
     return np.cumsum(bounce_coefficients(n, bounces))
 
 
-def bounce_error(found: Series) -> float:
-    """Largest relative difference of sums of 1 .. ORDERS terms from `contents` of A^j l_d in float64."""
-    bounces = [found.l_d]
+def claims(found: Series) -> list[Claim]:
+    alternate = (-1.0) ** np.arange(11)
+    right = float(np.mean(np.sign(found.terms[:11]) == alternate[:, None, None]))
+    before, after = cast(found.scene, found.sums[0]), cast(found.scene, found.sums[-1])
+    bounces, errors = [found.l_d], found.errors
     for _ in range(99):
         bounces.append(boxes.bounce(found.scene, bounces[-1]))
     expected = [np.tensordot(contents(n, 99), bounces, 1) for n in range(1, ORDERS + 1)]
-    off = np.linalg.norm(found.sums[1 : ORDERS + 1] - expected, axis=(1, 2))
-    return float(off.max() / np.linalg.norm(found.l_d))
-
-
-def claims(found: Series) -> list[Claim]:
-    """What the paper says of the figure."""
-    alternate = (-1.0) ** np.arange(11)
-    right = np.mean(np.sign(found.terms[:11]) == alternate[:, None, None])
-    red, green = bleeding(found.scene, found.terms[:11])
-    before, after = cast(found.scene, found.sums[0]), cast(found.scene, found.sums[-1])
-    off, errors = bounce_error(found), found.errors
+    off = np.linalg.norm(found.sums[1 : ORDERS + 1] - expected, axis=(1, 2)).max() / np.linalg.norm(found.l_d)
     absent = not any(contents(n, n)[1:].any() for n in range(1, ORDERS + 1))
     closer = int(np.argmin(np.diff(errors[:21]) < 0)) or 20
+    listed = [Claim("terms alternate in sign", f"in {right:.0%} of values of 11 terms", "100%", right == 1)]
+    names = (("red", "cyan", "green"), ("green", "magenta", "red"))
+    for (own, opposite, other), excess in zip(names, bleeding(found.scene, found.terms[:11]), strict=True):
+        text = f"the picture bleeds {own}; odd terms turn it to {opposite}, even ones to {own}"
+        shown = " ".join(f"{value:+.0%}" for value in excess[:4])
+        measured = f"beside the {own} wall, {own} over {other} and blue: {shown} ..."
+        listed.append(Claim(text, measured, "+ - + - ...", bool((excess * alternate > 0).all())))
+    colour = f"colour cast of neutral walls {before:.0%}, after {TERMS} terms {after:.1g}"
+    removes = f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}"
+    error = f"error {errors[0]:.2g}, after {TERMS} terms {errors[-1]:.1g}; each of the first {closer} closer"
+    removed, converges = absent and off < 1e-5, errors[-1] < 1e-3 and closer == 20
     return [
-        Claim("terms alternate in sign", f"in {right:.0%} of values of 11 terms", "100%", bool(right == 1)),
-        Claim(
-            "the picture bleeds red; odd terms turn it to cyan, even ones to red",
-            "beside the red wall, red over green and blue: " + _percent(red),
-            "+ - + - ...",
-            bool((red * alternate > 0).all()),
-        ),
-        Claim(
-            "the picture bleeds green; odd terms turn it to magenta, even ones to green",
-            "beside the green wall, green over red and blue: " + _percent(green),
-            "+ - + - ...",
-            bool((green * alternate > 0).all()),
-        ),
-        Claim(
-            "in the end no colour bleeds",
-            f"colour cast of neutral walls {before:.0%}, after {TERMS} terms {after:.1g}",
-            "below 1e-3",
-            after < 1e-3 < before,
-        ),
-        Claim(
-            "n terms remove the bounces 1 .. n (eq. 12, 13)",
-            f"coefficients {'' if absent else 'not '}0; sums off their expansion in A by {off:.1g}",
-            "0; below 1e-5",
-            absent and off < 1e-5,
-        ),
-        Claim(
-            "the series converges to the direct light",
-            f"error {errors[0]:.2g}, after {TERMS} terms {errors[-1]:.1g}; each of the first {closer} closer",
-            "below 1e-3; 20",
-            bool(errors[-1] < 1e-3 and closer == 20),
-        ),
+        *listed,
+        Claim("in the end no colour bleeds", colour, "below 1e-3", after < 1e-3 < before),
+        Claim("n terms remove the bounces 1 .. n (eq. 12, 13)", removes, "0; below 1e-5", removed),
+        Claim("the series converges to the direct light", error, "below 1e-3; 20", converges),
     ]
 
 
-def _percent(values: np.ndarray) -> str:
-    return " ".join(f"{value:+.0%}" for value in values[:4]) + " ..."
-
-
 def draw(found: Series) -> Figure:
-    """Sums above, terms below them; then what is left of each bounce, and the error."""
     figure = figures.page(
         860,
         "Figure 4: the inverse series takes the bounces out of a picture",
         "A closed box, seen through its front wall. Above: the picture and n terms of the series, which",
         "swings around the direct light until it settles there. Below: the terms alone; neutral grey is 0.",
     )
-    scene = found.scene
-    lefts, width = figures.columns(len(SHOWN) + 1)
-    gain = 0.9 / np.quantile(found.sums[0], 0.999)
-    for left, n in zip(lefts, SHOWN, strict=False):
-        label = _after(n) if n else r"picture $l_{out}$"
+    scene, gain, sums, terms = found.scene, 0.9 / np.quantile(found.sums[0], 0.999), [], []
+    for n in SHOWN:
         image = figures.light(scene, scene.picture(found.sums[n]), gain)
-        figures.picture(figure, (left, 130, width), image, label, f"error {found.errors[n]:.2g}")
+        sums.append((image, _after(n) if n else r"picture $l_{out}$", f"error {found.errors[n]:.2g}"))
         scale = 1 / np.quantile(np.abs(found.terms[n]), 0.999)
         power = rf"{'-+'[n % 2 == 0]}R^{n}\,l_{{out}}" if n > 1 else r"-R\,l_{out}" if n else "l_{out}"
         image = figures.signed(scene, scene.picture(found.terms[n]), scale)
-        figures.picture(figure, (left, 340, width), image, f"${power}$", f"shown \u00d7 {scale:.2g}")
+        terms.append((image, f"${power}$", f"shown \u00d7 {scale:.2g}"))
     image = figures.light(scene, scene.picture(found.l_d), gain)
-    figures.picture(figure, (lefts[-1], 130, width), image, r"direct light $l_d$", "the truth")
+    figures.pictures(figure, 130, [*sums, (image, r"direct light $l_d$", "the truth")])
+    lefts, width = figures.columns(len(SHOWN) + 1)
+    for left, shown in zip(lefts, terms, strict=False):
+        figures.picture(figure, (left, 340, width), *shown)
     note = "Even terms are light\nthat bled: red, green.\nOdd ones take light\naway: cyan, magenta."
     label_at(figure, lefts[-1], 350, note, size=10, color=FAINT, linespacing=1.5)
     draw_contents(figure)
-    axes = figures.graph(
-        figure, (640, 580, 330, 220), "Error of the sum, each colour", "terms n", "relative error"
-    )
+    box = (640, 580, 330, 220)
+    axes = figures.graph(figure, box, "Error of the sum, each colour", "terms n", "relative error")
     for name, colour, channel in (("green", "#8bd17c", 1), ("red", "#ff5d5d", 0), ("blue", "#5c9cff", 2)):
         off = np.linalg.norm(found.sums[:, channel] - found.l_d[channel], axis=1)
-        axes.plot(
-            off / np.linalg.norm(found.l_d[channel]),
-            color=colour,
-            lw=2,
-            label=name,
-            ls="--" if channel == 0 else "-",
-        )
+        look: Any = {"color": colour, "lw": 2, "ls": "-" if channel else "--"}
+        axes.plot(off / np.linalg.norm(found.l_d[channel]), label=name, **look)
     axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
     axes.set_xlim(0, TERMS)
     return figure
@@ -178,21 +141,12 @@ def _after(n: int) -> str:
 def draw_contents(figure: Figure) -> None:
     """The table of `contents`: which bounces n terms leave."""
     table = np.array([contents(n, BOUNCES) for n in range(ORDERS + 1)])
-    axes = axes_at(figure, (130, 580, 430, 220))
-    label_at(
-        figure,
-        30,
-        572,
-        "How often each bounce of light is in the sum",
-        size=11,
-        fontweight="bold",
-        va="bottom",
-    )
+    axes, bold = axes_at(figure, (130, 580, 430, 220)), {"fontweight": "bold", "va": "bottom"}
+    label_at(figure, 30, 572, "How often each bounce of light is in the sum", size=11, **bold)
     axes.imshow(np.arcsinh(table), cmap="RdBu_r", vmin=-6, vmax=6, aspect="auto")
     for (n, j), value in np.ndenumerate(table):
-        axes.text(
-            j, n, str(value), ha="center", va="center", fontsize=10, color="#15171b" if value else "#b9bdc4"
-        )
+        colour = "#15171b" if value else "#b9bdc4"
+        axes.text(j, n, str(value), ha="center", va="center", fontsize=10, color=colour)
     axes.set_xticks(range(BOUNCES + 1), ["direct", *map(str, range(1, BOUNCES + 1))], color=INK, fontsize=9.5)
     names = ["picture", *map(_after, range(1, ORDERS + 1))]
     axes.set_yticks(range(ORDERS + 1), names, color=INK, fontsize=9.5)
@@ -201,21 +155,19 @@ def draw_contents(figure: Figure) -> None:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     scene, l_d = boxes.coloured_box(4 if given.smoke else 16)
     T = scene.transport(first_bounce=scene.first_bounce, device=given.device)
     l_out = boxes.all_bounces(scene, l_d)
-    series = np.stack([boxes.terms(S, l, TERMS) for S, l in zip(T.systems, l_out, strict=True)], axis=1)
+    series = boxes.terms(T.systems, l_out, TERMS)
     found = Series(scene, l_d, series, np.cumsum(series, axis=0))
     facts = {
         "patches": l_d.shape[1],
         "largest albedo": float(scene.albedo.max()),
         "relative error after n terms": [float(f"{error:.3g}") for error in found.errors],
     }
-    figures.conclude(
-        given, "Figure 4: terms of the inverse series", claims(found), facts, lambda: draw(found)
-    )
+    title = "Figure 4: terms of the inverse series"
+    figures.conclude(given, title, claims(found), facts, lambda: draw(found))
 
 
 if __name__ == "__main__":

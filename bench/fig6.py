@@ -14,10 +14,11 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse.linalg
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -27,9 +28,6 @@ from _figures import Claim
 from _harness import options
 from ltcl.plots.page import FAINT
 from ltcl.scenes import Block, Scene, box, glossy
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 SHADED, BLOCK = 1.15 * np.array(ALBEDO[:5]), Block((0.3, 0.42, 0), (0.28, 0.28, 0.5), albedo=(0.5, 0.5, 0.5))
 LAMP = (0.85, 0.75, 0.8)
@@ -57,19 +55,11 @@ class Recovery:
         truth = self.seen(self.l_d)
         return np.array([np.linalg.norm(self.seen(l) - truth) for l in self.sums]) / np.linalg.norm(truth)
 
-    @property
-    def rate(self) -> float:
-        """How much one iteration shrinks the error in the end."""
-        return float(self.errors[16] / self.errors[15])
-
     @functools.cached_property
     def rho(self) -> float:
         """rho(R) = rho(A) / (1 - rho(A)), of the slowest colour, by Arnoldi's method on A."""
-        largest = (
-            scipy.sparse.linalg.eigs(A, 1, return_eigenvectors=False, v0=np.ones(A.shape[0]))
-            for A in self.bounces
-        )
-        rho = max(float(np.abs(value[0])) for value in largest)
+        eigs = functools.partial(scipy.sparse.linalg.eigs, k=1, return_eigenvectors=False)
+        rho = max(float(np.abs(eigs(A, v0=np.ones(A.shape[0]))[0])) for A in self.bounces)
         return rho / (1 - rho)
 
     @property
@@ -79,26 +69,8 @@ class Recovery:
 
     def chebyshev(self) -> int:
         """Products that Chebyshev's iteration needs, in the slowest colour."""
-        return max(
-            ltcl.solve(S, l, "chebyshev", rtol=RTOL).products
-            for S, l in zip(self.systems, self.sums[0], strict=True)
-        )
-
-
-def sums(systems: tuple[Any, ...], l_out: np.ndarray) -> np.ndarray:
-    """Of 0 .. MOST terms of the series, (MOST + 1, 3, unknowns)."""
-    series = [boxes.terms(S, l, MOST) for S, l in zip(systems, l_out, strict=True)]
-    return np.cumsum(np.stack(series, axis=1), axis=0)
-
-
-def with_shadows(n: int, device: ltcl.Device) -> Recovery:
-    """The box with the block."""
-    room = box(n, 5, SHADED, occluder=BLOCK, device=device)
-    scene = boxes.from_the_front(room)
-    l_d = scene.albedo * scene.irradiance(LAMP).reshape(-1)
-    systems = scene.transport(scene.first_bounce, device).systems
-    found = sums(systems, boxes.all_bounces(scene, l_d))
-    return Recovery(scene, l_d, found, systems, tuple(scene.A), scene.picture)
+        pairs = zip(self.systems, self.sums[0], strict=True)
+        return max(ltcl.solve(S, l, "chebyshev", rtol=RTOL).products for S, l in pairs)
 
 
 def with_gloss(n: int, smoke: bool) -> Recovery:
@@ -107,9 +79,8 @@ def with_gloss(n: int, smoke: bool) -> Recovery:
     l_d = np.stack([K @ (scene.Q @ np.ones(scene.Q.shape[1])) for K in scene.K])
     systems = tuple(map(LightField, scene.A))
     l_out = np.stack([S @ l for S, l in zip(systems, l_d, strict=True)])
-    return Recovery(
-        scene.matte, l_d, sums(systems, l_out), systems, scene.A, lambda l: scene.picture(l @ scene.P.T)
-    )
+    sums, seen = np.cumsum(boxes.terms(systems, l_out, MOST), axis=0), lambda l: scene.picture(l @ scene.P.T)
+    return Recovery(scene.matte, l_d, sums, systems, scene.A, seen)
 
 
 def glossy_box(n: int, smoke: bool) -> Any:
@@ -134,83 +105,51 @@ class LightField(scipy.sparse.linalg.LinearOperator):
         return total
 
 
-def one_camera(smoke: bool, device: ltcl.Device) -> ltcl.Analysis:
-    """What `analyze` says of T as one camera and one projector measure it in a smaller glossy box."""
-    scene = glossy_box(4 if smoke else 6, smoke)
-    return ltcl.analyze(scene.transport(scene.first_bounce, device, on_dark="mask"))
-
-
-def in_shadow(found: Recovery) -> np.ndarray:
-    """Light where the lamp casts none, relative to where it does, for each sum."""
-    dark = found.l_d.sum(axis=0) == 0
-    return np.abs(found.sums[:, :, dark]).mean(axis=(1, 2)) / found.l_d[:, ~dark].mean()
-
-
 def claims(shade: Recovery, gloss: Recovery, camera: float) -> list[Claim]:
-    """Of both boxes."""
-    dark = in_shadow(shade)
+    unlit = shade.l_d.sum(axis=0) == 0  # by the lamp
+    dark = np.abs(shade.sums[:, :, unlit]).mean(axis=(1, 2)) / shade.l_d[:, ~unlit].mean()
+    shade_products, gloss_products = shade.chebyshev(), gloss.chebyshev()
+    shadows = f"light in them {dark[0]:.0%} of that outside, after 10 iterations {dark[10]:.1g}"
+    products = f"shadows {shade_products}, gloss {gloss_products} products to 1 %"
+    is_fewer = shade_products < shade.steps and gloss_products < gloss.steps
+    radius = f"rho(R) = {camera:.2f}, of the light field {gloss.rho:.2f}"
+    one_camera = "one camera's T F^-1 is another operator: gloss makes its rho(R) larger (eq. 28)"
+    rates = []
+    for name, found in (("shadows", shade), ("gloss", gloss)):
+        text, rate = f"{name}: each iteration leaves rho(R) of the error", found.errors[16] / found.errors[15]
+        measured = f"{rate:.3f}, rho(R) = {found.rho:.3f}"
+        rates.append(Claim(text, measured, "within 2%", abs(rate / found.rho - 1) < 0.02))
     return [
         Claim("shadows: direct light in 10 iterations", f"1 % after {shade.steps}", "10", shade.steps <= 10),
-        Claim(
-            "shadows get as dark as they are",
-            f"light in them {dark[0]:.0%} of that outside, after 10 iterations {dark[10]:.1g}",
-            "below 1%",
-            dark[10] < 0.01 < dark[0],
-        ),
+        Claim("shadows get as dark as they are", shadows, "below 1%", dark[10] < 0.01 < dark[0]),
         Claim("gloss: direct light in 20 iterations", f"1 % after {gloss.steps}", "20", gloss.steps <= 20),
-        *(
-            Claim(
-                f"{name}: each iteration leaves rho(R) of the error",
-                f"{found.rate:.3f}, rho(R) = {found.rho:.3f}",
-                "within 2%",
-                abs(found.rate / found.rho - 1) < 0.02,
-            )
-            for name, found in (("shadows", shade), ("gloss", gloss))
-        ),
-        Claim(
-            "ours: Chebyshev needs fewer",
-            f"shadows {shade.chebyshev()}, gloss {gloss.chebyshev()} products to 1 %",
-            "fewer",
-            shade.chebyshev() < shade.steps and gloss.chebyshev() < gloss.steps,
-        ),
-        Claim(
-            "one camera's T F^-1 is another operator: gloss makes its rho(R) larger (eq. 28)",
-            f"rho(R) = {camera:.2f}, of the light field {gloss.rho:.2f}",
-            "larger",
-            camera > gloss.rho,
-        ),
+        *rates,
+        Claim("ours: Chebyshev needs fewer", products, "fewer", is_fewer),
+        Claim(one_camera, radius, "larger", camera > gloss.rho),
     ]
 
 
-def draw_row(
-    figure: Figure, found: Recovery, top: float, shown: tuple[int, ...], names: tuple[str, str]
-) -> None:
-    """The picture, some sums, and the truth."""
-    lefts, width = figures.columns(len(shown) + 2, gap=20)
-    picture = found.seen(found.sums[0])
-    gain = 0.9 / np.quantile(picture, 0.98)
-    columns = [(names[0], f"error {found.errors[0]:.2g}", picture)]
+def draw_row(figure: Figure, found: Recovery, top: float, shown: tuple[int, ...], name: str) -> None:
+    images = [(name, f"error {found.errors[0]:.2g}", found.sums[0])]
     for n in shown:
-        said = f"{n} iteration{'s' * (n > 1)}"
-        columns.append((said, f"error {found.errors[n]:.2g}", found.seen(found.sums[n])))
-    columns.append((names[1], "the truth", found.seen(found.l_d)))
-    for left, (label, note, image) in zip(lefts, columns, strict=True):
-        figures.picture(figure, (left, top, width), figures.light(found.scene, image, gain), label, note)
+        images.append((f"{n} iteration{'s' * (n > 1)}", f"error {found.errors[n]:.2g}", found.sums[n]))
+    images.append((r"direct light $l_d$", "the truth", found.l_d))
+    gain = 0.9 / np.quantile(found.seen(found.sums[0]), 0.98)
+    views = [(figures.light(found.scene, found.seen(l), gain), *text) for *text, l in images]
+    figures.pictures(figure, top, views, gap=20)
 
 
 def draw(shade: Recovery, gloss: Recovery) -> Figure:
-    """Both boxes, and their errors."""
     figure = figures.page(
         900,
         "Figure 6: the inverse series undoes shadowed and glossy scenes alike",
         "Above: a lamp, a block, and light that bounces into its shadows. Below: glossy walls in even light.",
         "Iterations take the bounces out, until shadows and highlights are as they were; below 0 is black.",
     )
-    draw_row(figure, shade, 130, SHADOWS, ("lamp and block", r"direct light $l_d$"))
-    draw_row(figure, gloss, 370, GLOSSES, ("glossy walls", r"direct light $l_d$"))
-    axes = figures.graph(
-        figure, (85, 620, 860, 210), "Error of the direct light", "iteration", "relative error"
-    )
+    draw_row(figure, shade, 130, SHADOWS, "lamp and block")
+    draw_row(figure, gloss, 370, GLOSSES, "glossy walls")
+    box, title = (85, 620, 860, 210), "Error of the direct light"
+    axes = figures.graph(figure, box, title, "iteration", "relative error")
     for found, name, colour in ((shade, "shadows", "#5cc8ff"), (gloss, "gloss", "#ffb347")):
         said = f"{name}: rho(R) = {found.rho:.2f}, 1 % after {found.steps}"
         axes.plot(found.errors, color=colour, lw=2, label=said)
@@ -221,16 +160,19 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
-    shade = with_shadows(4 if given.smoke else 14, given.device)
+    room = box(4 if given.smoke else 14, 5, SHADED, occluder=BLOCK, device=given.device)
+    scene, l_d, systems, l_out = boxes.lit(room, LAMP, given.device)
+    sums = np.cumsum(boxes.terms(systems, l_out, MOST), axis=0)
+    shade = Recovery(scene, l_d, sums, systems, tuple(scene.A), scene.picture)
     gloss = with_gloss(4 if given.smoke else 12, given.smoke)
-    camera = max(channel.spectral_radius for channel in one_camera(given.smoke, given.device).channels)
+    scene = glossy_box(4 if given.smoke else 6, given.smoke)  # smaller, as one camera and projector see it
+    T = scene.transport(scene.first_bounce, given.device, on_dark="mask")
+    camera = max(channel.spectral_radius for channel in ltcl.analyze(T).channels)
+    errors = [[float(f"{e:.3g}") for e in found.errors] for found in (shade, gloss)]
     facts = {
         "unknowns": [found.l_d.shape[1] for found in (shade, gloss)],
-        "relative error after n iterations": [
-            [float(f"{e:.3g}") for e in found.errors] for found in (shade, gloss)
-        ],
+        "relative error after n iterations": errors,
         "largest albedo": [float(found.scene.albedo.max()) for found in (shade, gloss)],
     }
     found = claims(shade, gloss, camera)

@@ -9,10 +9,11 @@ every step, where the paper's score where they end (eq. 26). Errors are those ag
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.stats
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -21,15 +22,9 @@ from _figures import Claim
 from _harness import options
 from ltcl.scenes import Scene, box
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 ALBEDO, LAMP, FEW, MANY = 0.4, (0.85, 0.75, 0.8), 30, 1000
 COUNTS, SEEDS = np.array([8, 16, 32, 64, 128, 256, 512]), 3
-KINDS: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "final gather": {"gather": True},
-}
+KINDS: dict[str, dict[str, Any]] = {"plain": {}, "final gather": {"gather": True}}
 
 
 @dataclass(frozen=True)
@@ -49,75 +44,40 @@ class Inversion:
         """An estimate of the direct light."""
         return ltcl.solve(self.S, self.l_out, "monte_carlo", samples=samples, seed=seed, **KINDS[kind]).x
 
-    def errors(self, kind: str) -> np.ndarray:
-        """Of every number of samples, (COUNTS, SEEDS)."""
-        return np.array([[self.error(self.run(int(n), s, kind)) for s in range(SEEDS)] for n in COUNTS])
-
-
-def prepare(n: int, device: ltcl.Device) -> Inversion:
-    """The box and its light."""
-    scene = boxes.from_the_front(box(n, sides=5, albedo=ALBEDO))
-    l_d = scene.albedo[0] * scene.irradiance(LAMP).reshape(-1)
-    (S,) = scene.transport(scene.first_bounce, device).systems
-    return Inversion(scene, S, boxes.all_bounces(scene, l_d[None])[0], l_d)
-
-
-def slope(errors: np.ndarray) -> tuple[float, float]:
-    """Of log variance over log samples, and half its 99 % confidence interval."""
-    samples = np.repeat(np.log(COUNTS), SEEDS)
-    fit: Any = scipy.stats.linregress(samples, 2 * np.log(errors.ravel()))
-    return float(fit.slope), float(fit.stderr * scipy.stats.t.ppf(0.995, len(samples) - 2))
-
 
 def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
-    """Of the curves, and of 30 samples."""
     plain, gathered = (found.error(found.run(FEW, 0, kind)) for kind in ("plain", "final gather"))
-    many = found.error(found.run(MANY, 0, "plain"))
-    value, half = slope(errors["plain"])
+    many, due = found.error(found.run(MANY, 0, "plain")), (FEW / MANY) ** 0.5
+    samples = np.repeat(np.log(COUNTS), SEEDS)
+    fit: Any = scipy.stats.linregress(samples, 2 * np.log(errors["plain"].ravel()))
+    value, half = fit.slope, fit.stderr * scipy.stats.t.ppf(0.995, len(samples) - 2)
+    variance, slopes = "variance falls as one over the samples", f"slope {value:.3f} +- {half:.3f}"
+    gather = f"{FEW} samples a pixel suffice with final gather"
+    few = f"error {gathered:.1%}, without {plain:.0%}"
+    more = f"error {many:.1%} of {MANY} samples, {plain:.0%} of {FEW}"
+    accurate, is_due = f"{due:.2f} times, within a tenth", abs(many / plain / due - 1) <= 0.1
     return [
-        Claim(
-            "variance falls as one over the samples",
-            f"slope {value:.3f} +- {half:.3f}",
-            "-1 within 99 % confidence",
-            abs(value + 1) <= half,
-        ),
-        Claim(
-            f"{FEW} samples a pixel suffice with final gather",
-            f"error {gathered:.1%}, without {plain:.0%}",
-            "at most 5%, a tenth of that without",
-            gathered <= min(0.05, plain / 10),
-        ),
-        Claim(
-            "more samples make it more accurate",
-            f"error {many:.1%} of {MANY} samples, {plain:.0%} of {FEW}",
-            f"{(FEW / MANY) ** 0.5:.2f} times, within a tenth",
-            abs(many / plain / (FEW / MANY) ** 0.5 - 1) <= 0.1,
-        ),
+        Claim(variance, slopes, "-1 within 99 % confidence", abs(value + 1) <= half),
+        Claim(gather, few, "at most 5%, a tenth of that without", gathered <= min(0.05, plain / 10)),
+        Claim("more samples make it more accurate", more, accurate, is_due),
     ]
 
 
 def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
-    """Pictures above, curves below."""
     figure = figures.page(
         640,
         f"Figure 8: {len(found.l_d)} pixels inverted by random walks",
         "Each pixel by walks of its own; then one exact product, which smooths their noise away.",
     )
-    lefts, width = figures.columns(5, gap=20)
-    gain = 0.9 / np.quantile(found.l_out, 0.98)
-    for left, (label, light) in zip(
-        lefts,
-        (
-            ("the picture", found.l_out),
-            (f"{FEW} samples", found.run(FEW, 0, "plain")),
-            (f"{FEW}, final gather", found.run(FEW, 0, "final gather")),
-            (f"{MANY} samples", found.run(MANY, 0, "plain")),
-            (r"direct light $l_d$", found.l_d),
-        ),
-        strict=True,
-    ):
-        image = figures.light(found.scene, light.reshape(found.scene.grid), gain)
-        figures.picture(figure, (left, 110, width), image, label, f"error {found.error(light):.2g}")
+    gain, images = 0.9 / np.quantile(found.l_out, 0.98), [("the picture", found.l_out)]
+    for samples, kind in ((FEW, "plain"), (FEW, "final gather"), (MANY, "plain")):
+        label = f"{samples}, {kind}" if KINDS[kind] else f"{samples} samples"
+        images.append((label, found.run(samples, 0, kind)))
+    views = []
+    for label, light in (*images, (r"direct light $l_d$", found.l_d)):
+        view = figures.light(found.scene, light.reshape(found.scene.grid), gain)
+        views.append((view, label, f"error {found.error(light):.2g}"))
+    figures.pictures(figure, 110, views, gap=20)
     axes = figures.graph(figure, (85, 360, 860, 210), "Variance", "samples a pixel", "squared error")
     for (kind, values), colour in zip(errors.items(), ("#5cc8ff", "#ffb347"), strict=True):
         axes.loglog(COUNTS, (values**2).mean(axis=1), color=colour, lw=2, label=kind)
@@ -128,22 +88,18 @@ def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
-    found = prepare(6 if given.smoke else 32, given.device)
-    errors = {kind: found.errors(kind) for kind in KINDS}
-    facts = {
-        "pixels": len(found.l_d),
-        "albedo": ALBEDO,
-        "samples": COUNTS.tolist(),
-        **{
-            f"relative error, {kind}": np.round(values.mean(axis=1), 5).tolist()
-            for kind, values in errors.items()
-        },
-    }
-    figures.conclude(
-        given, "Figure 8: Monte Carlo", claims(found, errors), facts, lambda: draw(found, errors)
-    )
+    room = box(6 if given.smoke else 32, sides=5, albedo=ALBEDO)
+    scene, (l_d,), (S,), (l_out,) = boxes.lit(room, LAMP, given.device)
+    found = Inversion(scene, S, l_out, l_d)
+    samples = [(int(count), seed) for count in COUNTS for seed in range(SEEDS)]
+    shape = len(COUNTS), SEEDS
+    errors = {k: np.reshape([found.error(found.run(*each, k)) for each in samples], shape) for k in KINDS}
+    facts = {"pixels": len(found.l_d), "albedo": ALBEDO, "samples": COUNTS.tolist()}
+    for kind, values in errors.items():
+        facts[f"relative error, {kind}"] = np.round(values.mean(axis=1), 5).tolist()
+    listed = claims(found, errors)
+    figures.conclude(given, "Figure 8: Monte Carlo", listed, facts, lambda: draw(found, errors))
 
 
 if __name__ == "__main__":

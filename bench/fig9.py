@@ -11,9 +11,10 @@ The paper's timing, 0.09 s against 4.6 s of dense inversion at 4K x 4K, is measu
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
@@ -23,13 +24,8 @@ from _harness import options
 from ltcl.scenes import Scene, dihedral, glossy
 from ltcl.scenes.walls import Wall
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 WHITE, GREEN = (0.85, 0.8, 0.75), (0.25, 1.0, 0.35)
-BOARD = Wall(
-    "board", corner=(0.41, 0.09, 0.77), right=(-0.32, 0.32, 0), down=(0, 0, -0.54)
-)  # faces the camera
+BOARD = Wall("board", (0.41, 0.09, 0.77), (-0.32, 0.32, 0), (0, 0, -0.54))  # faces the camera
 CAMERA, PROJECTOR = (1.55, 1.55, 0.5), (1.5, 1.65, 0.75)
 BOUNCES = 4
 
@@ -63,7 +59,6 @@ class Parts:
 
 
 def diffuse(n: int, device: ltcl.Device) -> Parts:
-    """The dihedral, and its separation."""
     scene = dihedral(n, albedo=WHITE)
     pattern = np.zeros((*scene.grid, 3))
     pattern[:, :n] = GREEN
@@ -78,16 +73,10 @@ def diffuse(n: int, device: ltcl.Device) -> Parts:
 
 def with_board(n: int, smoke: bool, device: ltcl.Device) -> Parts:
     """The dihedral with the board, as one camera and one projector see it, and its separation."""
-    scene = glossy(
-        [*dihedral(1).walls, BOARD],
-        n,
-        albedo=(WHITE, WHITE, (0.6, 0.6, 0.6)),
-        gloss=(0, 0, 0.3),
-        exponent=120 if smoke else 500,
-        projector=PROJECTOR,
-        camera=CAMERA,
-        directions=16 if smoke else 64,
-    )
+    albedo, gloss = (WHITE, WHITE, (0.6, 0.6, 0.6)), (0, 0, 0.3)
+    exponent, directions = (120, 16) if smoke else (500, 64)
+    place: Any = {"projector": PROJECTOR, "camera": CAMERA, "directions": directions}
+    scene = glossy([*dihedral(1).walls, BOARD], n, albedo, gloss, exponent, **place)
     pattern = np.zeros((*scene.grid, 3))
     pattern[:, :n], pattern[:, 2 * n :] = GREEN, 0.22
     T = scene.transport(scene.first_bounce, device, on_dark="mask")
@@ -96,44 +85,28 @@ def with_board(n: int, smoke: bool, device: ltcl.Device) -> Parts:
     return Parts(scene.matte, picture, separation, scene.bounces(pattern, BOUNCES))
 
 
-def highlight(parts: Parts) -> np.ndarray:
-    """Light where the board has its highlight over that on the rest of it, for direct light and bounces."""
-    n = parts.scene.grid[0]
-    board = parts.found.mean(axis=-1)[:, :, 2 * n :]
-    there = parts.truth[0].mean(axis=-1)[:, 2 * n :]
-    there = there > there.max() / 2
-    return board[:, there].mean(axis=1) / board[:, ~there].mean(axis=1)
-
-
 def claims(plain: Parts, board: Parts) -> list[Claim]:
-    """Of both scenes."""
+    turns, least = plain.walls.min(), board.walls.min()
     total = plain.found.sum(axis=0) + plain.separation.rest
     left = float(np.abs(total - plain.picture).max() / plain.picture.max())
-    bright, turns = highlight(board), board.walls.min()
+    n, off = board.scene.grid[0], board.off
+    there, light = (each.mean(axis=-1)[..., 2 * n :] for each in (board.truth[0], board.found))
+    there = there > there.max() / 2  # on the board, where the direct light has its highlight
+    bright = light[:, there].mean(axis=1) / light[:, ~there].mean(axis=1)
+    beside = "beside a glossy board they still do so in turn"
+    in_turn = f"at least {turns:.2%} of each on its wall"
+    times = f"{bright[0]:.1f} times the rest of the board; in bounces {_list(bright[1:], '.2f')}"
+    is_direct = bright[0] > 2 and bright[1:].max() < 1.5
+    glossy = "with one camera the glossy scene's bounces are approximate (section 8.4)"
+    errors = f"direct light off by {off[0]:.1g}, bounces by {_list(off[1:], '.0%')}"
+    is_near = off[0] <= 1e-2 and off[1] <= 0.2
     return [
-        Claim(
-            "successive bounces light the two walls in turn",
-            f"at least {plain.walls.min():.2%} of each on its wall",
-            "99.9%",
-            plain.walls.min() >= 0.999,
-        ),
+        Claim("successive bounces light the two walls in turn", in_turn, "99.9%", turns >= 0.999),
         Claim("each bounce is A^k l_d", f"off by {_list(plain.off, '.1g')}", "1e-2", plain.off.max() <= 1e-2),
         Claim("they add up to the picture", f"to {left:.1g}", "1e-6", left <= 1e-6),
-        Claim(
-            "beside a glossy board they still do so in turn", f"at least {turns:.0%}", "75%", turns >= 0.75
-        ),
-        Claim(
-            "the highlight is in the direct light alone",
-            f"{bright[0]:.1f} times the rest of the board; in bounces {_list(bright[1:], '.2f')}",
-            "above 2; below 1.5",
-            bright[0] > 2 and bright[1:].max() < 1.5,
-        ),
-        Claim(
-            "with one camera the glossy scene's bounces are approximate (section 8.4)",
-            f"direct light off by {board.off[0]:.1g}, bounces by {_list(board.off[1:], '.0%')}",
-            "direct 1e-2, first bounce 20%",
-            board.off[0] <= 1e-2 and board.off[1] <= 0.2,
-        ),
+        Claim(beside, f"at least {least:.0%}", "75%", least >= 0.75),
+        Claim("the highlight is in the direct light alone", times, "above 2; below 1.5", is_direct),
+        Claim(glossy, errors, "direct 1e-2, first bounce 20%", is_near),
     ]
 
 
@@ -149,15 +122,15 @@ def draw_parts(figure: Figure, parts: Parts, top: float, text: str) -> None:
     for left, label, image in zip(lefts, ("picture", "direct light", "global light"), whole, strict=False):
         figures.picture(figure, (left, top, width), figures.light(parts.scene, image, gain), label)
     figures.label_at(figure, lefts[-1], top - 22, text, size=10, color=figures.FAINT, linespacing=1.5)
-    for k, (left, bounce) in enumerate(zip(lefts, parts.separation.bounces, strict=True), start=1):
+    bounces = []
+    for k, bounce in enumerate(parts.separation.bounces, start=1):
         own = 0.9 / np.quantile(bounce, 0.999)
-        times = float(f"{own / gain:.2g}")
-        seen, note = figures.light(parts.scene, bounce, own), f"\u00d7 {times:g}, error {parts.off[k]:.1g}"
-        figures.picture(figure, (left, top + 196, width), seen, f"bounce {k}", note)
+        note = f"\u00d7 {float(f'{own / gain:.2g}'):g}, error {parts.off[k]:.1g}"
+        bounces.append((figures.light(parts.scene, bounce, own), f"bounce {k}", note))
+    figures.pictures(figure, top + 196, bounces, gap=24)
 
 
 def draw(plain: Parts, board: Parts) -> Figure:
-    """The page."""
     figure = figures.page(
         965,
         "Figure 9: a picture taken apart into its bounces of light",
@@ -173,7 +146,6 @@ def draw(plain: Parts, board: Parts) -> Figure:
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     plain = diffuse(6 if given.smoke else 24, given.device)
     board = with_board(5 if given.smoke else 14, given.smoke, given.device)

@@ -11,12 +11,15 @@ series l <- l_out - R l settles (the paper: about 20 iterations with gloss), and
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
@@ -25,10 +28,6 @@ from _harness import Options, options
 from ltcl.plots.page import COLOURS, FAINT, INK
 from ltcl.scenes import GlossyScene, dihedral, glossy
 from ltcl.separation import LARGEST_NEGATIVE
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 ALBEDO, PROJECTOR = 0.5, (2.4, 1.2, 1.2)
 ROOMS = {"both walls": (1.0, 1.0), "unlit wall": (0.0, 1.0)}  # share of the gloss on each wall
@@ -56,11 +55,6 @@ class Case:
     compensation: float  # ||T p - desired|| / ||desired||
     clipped: float
 
-    @property
-    def name(self) -> str:
-        """For the report."""
-        return f"{self.room}, exponent {self.exponent:g}, gloss {self.gloss:g}"
-
 
 def norms(light: np.ndarray) -> np.ndarray:
     """Of pictures (k, h, w)."""
@@ -76,18 +70,15 @@ def separated(T: ltcl.Transport, picture: np.ndarray) -> tuple[np.ndarray, bool]
 def settles(T: np.ndarray, F: np.ndarray, l_in: np.ndarray) -> tuple[float, int | None]:
     """Spectral radius of R, and iterations of eq. 20 until the direct light is right to 1 %."""
     R, l_out, l_d = T / F - np.eye(len(F)), T @ l_in, F * l_in
-    l = np.zeros_like(l_d)
-    iterations = None
+    radius, l = float(np.abs(np.linalg.eigvals(R)).max()), np.zeros_like(l_d)
     for step in range(1, STEPS + 1):
         l = l_out - R @ l
         if np.linalg.norm(l - l_d) <= 0.01 * np.linalg.norm(l_d):
-            iterations = step
-            break
-    return float(np.abs(np.linalg.eigvals(R)).max()), iterations
+            return radius, step
+    return radius, None
 
 
 def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device: ltcl.Device) -> Case:
-    """Everything about one scene."""
     n, F = scene.grid[0], scene.first_bounce
     pattern = np.zeros(scene.grid)
     pattern[:, :n] = 1.0
@@ -97,25 +88,16 @@ def measure(scene: GlossyScene, room: str, exponent: float, gloss: float, device
     picture = T @ pattern
     found, warned = separated(T, picture)
     by_diagonal, _ = separated(ltcl.Transport(matrix, scene.grid, device=device), picture)
+    error, size = norms(found - truth), norms(truth)
+    negative = -np.minimum(found, 0).sum(axis=(1, 2)) / np.abs(found).sum(axis=(1, 2))
+    errors = error / size, error / np.linalg.norm(picture), norms(by_diagonal - truth) / size, negative
+    reported = T.reciprocity_defect, max(T.negative_bounces)
     desired = T @ np.random.default_rng(0).uniform(0.2, 0.8, scene.grid)
     compensation = ltcl.compensate(T, desired, method="direct")
     radius, iterations = settles(matrix, F, pattern.ravel())
-    return Case(
-        room=room,
-        exponent=exponent,
-        gloss=gloss,
-        off=_digits(norms(found - truth) / norms(truth)),
-        off_picture=_digits(norms(found - truth) / np.linalg.norm(picture)),
-        off_diagonal=_digits(norms(by_diagonal - truth) / norms(truth)),
-        negative=_digits(-np.minimum(found, 0).sum(axis=(1, 2)) / np.abs(found).sum(axis=(1, 2))),
-        defect=_digits(T.reciprocity_defect),
-        taken=_digits(max(T.negative_bounces)),
-        warned=warned,
-        radius=_digits(radius),
-        iterations=iterations,
-        compensation=_digits(compensation.error),
-        clipped=compensation.clipped,
-    )
+    rounded = [_digits(value) for value in (*errors, *reported)]
+    last = [warned, _digits(radius), iterations, _digits(compensation.error), compensation.clipped]
+    return Case(room, exponent, gloss, *rounded + last)
 
 
 def _digits(values: Any) -> Any:
@@ -124,72 +106,43 @@ def _digits(values: Any) -> Any:
 
 
 def cases(given: Options) -> list[Case]:
-    """All scenes."""
     n, directions = (4, 16) if given.smoke else (10, 64)
     shares = (0.0, 0.1, 0.2, 0.4) if given.smoke else (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
-    found = []
-    for room, walls in ROOMS.items():
-        for exponent in (5, 20) if given.smoke else tuple(SHADES):
-            for gloss in shares:
-                scene = glossy(
-                    dihedral(1),
-                    n,
-                    ALBEDO,
-                    [gloss * share for share in walls],
-                    exponent,
-                    projector=PROJECTOR,
-                    directions=directions,
-                )
-                found.append(measure(scene, room, exponent, gloss, given.device))
+    found, place = [], {"projector": PROJECTOR, "directions": directions}
+    for room, exponent in itertools.product(ROOMS, (5, 20) if given.smoke else tuple(SHADES)):
+        for gloss in shares:
+            walls = [gloss * share for share in ROOMS[room]]
+            scene = glossy(dihedral(1), n, ALBEDO, walls, exponent, **place)
+            found.append(measure(scene, room, exponent, gloss, given.device))
     return found
 
 
 def claims(found: Sequence[Case]) -> list[Claim]:
-    """What must hold, and what the paper says."""
     matte = [case for case in found if case.gloss == 0]
     shiny = [case for case in found if 0 < case.gloss <= MODERATE]
-    mild = [case for case in shiny if case.exponent <= 20]
     later = sum(case.off[2] > case.off[1] for case in shiny)
+    worse = f"bounce 2 is worse in {later} of {len(shiny)} scenes of gloss up to {MODERATE:g}"
+    squared = "(PAFQ)(PFQ)^-1, what the camera sees of a bounce, is squared; PA^2FQ is something else"
+    steps = [STEPS + 1 if c.iterations is None else c.iterations for c in shiny if c.exponent <= 20]
+    taken = f"{min(steps)} to {max(steps)} at gloss up to {MODERATE:g}"
     wrong = [case for case in found if case.off[1] > 0.1]
-    told = sum(case.warned for case in wrong)
+    told, false = (sum(case.warned for case in some) for some in (wrong, matte))
+    warning = "the warning of section 8.4 comes where bounce 1 is off by more than 10%"
     ratio = [case.negative[1] / case.off[1] for case in shiny]
+    negative = f"it is {min(ratio):.2f} to {max(ratio):.2f} times the error, at gloss up to {MODERATE:g}"
+    tells = min(ratio) > 0.5 and max(ratio) < 1.5
+    decay = "later bounces are no worse: specular effects decay (section 8.4)"
     return [
         _below("without gloss all bounces are exact", max(max(case.off) for case in matte), 1e-4),
         _below("the direct light is exact of any gloss, F = PFQ given", max(c.off[0] for c in found), 1e-3),
         _below("compensation is exact of any gloss", max(case.compensation for case in found), 1e-4),
         _below("none of it is clipped", max(case.clipped for case in found), 0.0),
         _below(f"bounce 1 is about right at gloss {MODERATE:g}", max(c.off[1] for c in shiny), 0.3),
-        Claim(
-            "later bounces are no worse: specular effects decay (section 8.4)",
-            f"bounce 2 is worse in {later} of {len(shiny)} scenes of gloss up to {MODERATE:g}",
-            "none",
-            later == 0,
-            differs="(PAFQ)(PFQ)^-1, what the camera sees of a bounce, is squared; PA^2FQ is something else",
-        ),
-        Claim(
-            "the plain series needs about 20 iterations with gloss",
-            f"{min(_steps(mild))} to {max(_steps(mild))} at gloss up to {MODERATE:g}",
-            "at most 20",
-            max(_steps(mild)) <= 20,
-        ),
-        Claim(
-            "the warning of section 8.4 comes where bounce 1 is off by more than 10%",
-            f"in {told} of {len(wrong)} scenes",
-            "all",
-            told == len(wrong),
-        ),
-        Claim(
-            "and not without gloss",
-            f"in {sum(case.warned for case in matte)} of {len(matte)} scenes",
-            "none",
-            not any(case.warned for case in matte),
-        ),
-        Claim(
-            "negative light in bounce 1 tells how far it is off",
-            f"it is {min(ratio):.2f} to {max(ratio):.2f} times the error, at gloss up to {MODERATE:g}",
-            "0.5 to 1.5",
-            min(ratio) > 0.5 and max(ratio) < 1.5,
-        ),
+        Claim(decay, worse, "none", later == 0, differs=squared),
+        Claim("the plain series needs about 20 iterations with gloss", taken, "at most 20", max(steps) <= 20),
+        Claim(warning, f"in {told} of {len(wrong)} scenes", "all", told == len(wrong)),
+        Claim("and not without gloss", f"in {false} of {len(matte)} scenes", "none", not false),
+        Claim("negative light in bounce 1 tells how far it is off", negative, "0.5 to 1.5", tells),
     ]
 
 
@@ -197,12 +150,7 @@ def _below(text: str, value: float, most: float) -> Claim:
     return Claim(text, f"{value:.2g}", f"at most {most:g}", value <= most)
 
 
-def _steps(some: Sequence[Case]) -> list[int]:
-    return [STEPS + 1 if case.iterations is None else case.iterations for case in some]
-
-
 def draw(found: Sequence[Case]) -> Figure:
-    """Errors of bounces 1 and 2 above; what T tells, and the plain series, below."""
     figure = figures.page(
         810,
         "Glossy scenes: what one camera and one projector can tell",
@@ -210,33 +158,29 @@ def draw(found: Sequence[Case]) -> Figure:
         "Errors are those of separated bounces against $P A^k F Q$ of the full light field (eq. 29).",
     )
     size, (left, right), (above, below) = (410, 240), (80, 560), (150, 490)
+    xlabel, dotted = "share of gloss", {"color": INK, "lw": 1, "ls": ":"}
     for k, place in ((1, left), (2, right)):
-        axes = _graph(figure, (place, above, *size), f"Bounce {k} of the separation", "relative error")
+        box, title = (place, above, *size), f"Bounce {k} of the separation"
+        axes = figures.graph(figure, box, title, xlabel, "relative error")
         _curves(axes, found, lambda case, k=k: case.off[k])
         axes.set_ylim(3e-3, 30)
         axes.axhline(1, color=FAINT, lw=1, ls=":")
         axes.legend(frameon=False, labelcolor="linecolor", fontsize=9, loc="lower right")
     title = "Reciprocity defect \u25cf, light a bounce takes away \u25bc"
-    axes = _graph(figure, (left, below, *size), title, "share", "linear")
+    axes = figures.graph(figure, (left, below, *size), title, xlabel, "share", "linear")
     axes.set_ylim(0, 0.4)
     _curves(axes, found, lambda case: case.defect)
     _curves(axes, found, lambda case: case.taken, marker="v", lw=1, alpha=0.7)
-    axes.axhline(LARGEST_NEGATIVE, color=INK, lw=1, ls=":")
+    axes.axhline(LARGEST_NEGATIVE, **dotted)
     axes.text(0.79, LARGEST_NEGATIVE, "warning above", color=INK, fontsize=9, ha="right", va="bottom")
     title = "Plain series: iterations to 1 % of the direct light"
-    axes = _graph(figure, (right, below, *size), title, "iterations", "linear")
+    axes = figures.graph(figure, (right, below, *size), title, xlabel, "iterations", "linear")
     _curves(axes, found, lambda case: np.nan if case.iterations is None else case.iterations)
     axes.set_ylim(0, 30)
-    axes.axhline(20, color=INK, lw=1, ls=":")
+    axes.axhline(20, **dotted)
     axes.text(0.02, 20.4, "the paper's glossy scene", color=INK, fontsize=9)
     axes.text(0.02, 28, "curves end where it diverges", color=FAINT, fontsize=9)
     return figure
-
-
-def _graph(figure: Figure, box: figures.Box, title: str, ylabel: str, scale: str = "log") -> Axes:
-    axes = figures.graph(figure, box, title, "share of gloss", ylabel, scale)
-    axes.set_xlim(0, 0.8)
-    return axes
 
 
 def _curves(axes: Axes, found: Sequence[Case], value: Callable[[Case], float], **style: Any) -> None:
@@ -246,14 +190,14 @@ def _curves(axes: Axes, found: Sequence[Case], value: Callable[[Case], float], *
             label = f"exponent {exponent:g}" if line == "-" else None
             look = {"marker": "o", "lw": 2, "ms": 4, "color": SHADES[exponent], "ls": line} | style
             axes.plot([case.gloss for case in some], [value(case) for case in some], label=label, **look)
+    axes.set_xlim(0, 0.8)
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # the warning is among what is measured
     found = cases(given)
-    facts = {case.name: asdict(case) for case in found}
+    facts = {f"{c.room}, exponent {c.exponent:g}, gloss {c.gloss:g}": asdict(c) for c in found}
     title = "The single-view approximation (eq. 28, 29)"
     figures.conclude(given, title, claims(found), facts, lambda: draw(found))
 

@@ -9,8 +9,8 @@ counted from an operator that nothing is known of: row sums, survey and tables i
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from typing import Any
 from unittest import mock
 
@@ -37,47 +37,26 @@ TARGETS = {
 }
 
 
-@dataclass
-class Traffic:
-    """What went to a device: in order the name of each kernel, or WAIT; and bytes over the bus."""
-
-    events: list[str] = field(default_factory=list)
-    bytes: int = 0
-
-
 @contextlib.contextmanager
-def counted() -> Iterator[Traffic]:
-    """Count what goes to a device inside the block."""
-    traffic, launch, copy, finish = Traffic(), Device.launch, Device.copy, Device.finish
+def traffic() -> Iterator[list[tuple[str, int]]]:
+    """What goes to a device inside the block: names of kernels, or WAIT, in order; and bytes over the bus."""
+    events: list[tuple[str, int]] = []
+    launch, copy, finish = Device.launch, Device.copy, Device.finish
 
     def launched(self: Device, name: str, *rest: Any) -> None:
-        traffic.events.append(name)
+        events.append((name, 0))
         launch(self, name, *rest)
 
     def copied(self: Device, to: Any, of: Any, **sizes: Any) -> None:
-        for host in (to, of):
-            if isinstance(host, np.ndarray):
-                traffic.events.append(WAIT)
-                traffic.bytes += host.nbytes
+        events.extend((WAIT, host.nbytes) for host in (to, of) if isinstance(host, np.ndarray))
         copy(self, to, of, **sizes)
 
     def finished(self: Device) -> None:
-        traffic.events.append(WAIT)
+        events.append((WAIT, 0))
         finish(self)
 
     with mock.patch.multiple(Device, launch=launched, copy=copied, finish=finished):
-        yield traffic
-
-
-def count_step(events: list[str], products: int) -> tuple[int, int]:
-    """Kernels and waits of a step of so many products: medians from one product to another.
-
-    Residuals are read every few steps only, and so are not counted where nothing else waits.
-    """
-    marks = [i for i, event in enumerate(events) if "matvec" in event]
-    spans = [events[i:j] for i, j in zip(marks, marks[products:], strict=False)]
-    waits = np.array([span.count(WAIT) for span in spans])
-    return round(np.median([len(span) for span in spans] - waits)), round(np.median(waits))
+        yield events
 
 
 def operators(given: Options) -> dict[str, Any]:
@@ -107,22 +86,27 @@ def solver(method: str, b: np.ndarray, **rules: Any) -> Callable[[IdentityPlus],
 
 
 def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int) -> dict[str, Any]:
-    """What a step and a first solve ask for."""
     target, waits_most, products = TARGETS[method]
     S = IdentityPlus(make())
     b = np.random.default_rng(1).random((S.shape[0],) if k == 1 else (S.shape[0], k), dtype=np.float32)
-    with counted() as first:
+    with traffic() as first:
         solver(method, b, rtol=1e-2)(S)
     options = {"arnoldi": 0, "spectrum": (0.05, 2.0)} if method == "chebyshev" else {}
     run = solver(method, b, rtol=1e-12 if method != "bounded" else 1e-9, maxiter=STEPS, **options)
     run(S)  # builds, tunes, looks at S
     before = device.allocations
-    with counted() as traffic:
+    with traffic() as events:
         iterations = run(S).iterations
     allocations = device.allocations - before
-    launches, waits = count_step(traffic.events, products)
+    # Residuals are read every few steps only, and so are not counted where nothing else waits.
+    names = [name for name, _ in events]
+    marks = [i for i, name in enumerate(names) if "matvec" in name]
+    spans = [names[i:j] for i, j in zip(marks, marks[products:], strict=False)]
+    waits = np.array([span.count(WAIT) for span in spans])
+    launches, waits = round(np.median([len(span) for span in spans] - waits)), round(np.median(waits))
     pixels = method == "bounded" and "wavelets" in kind  # bounds are of pixels: transforms in every product
     hit = launches <= target and waits <= waits_most and allocations == 0
+    first_waits = sum(name == WAIT for name, _ in first)
     return {
         "operator": kind,
         "method": method,
@@ -130,25 +114,20 @@ def row(device: Device, kind: str, make: Callable[[], Any], method: str, k: int)
         "launches a step": launches,
         "waits a step": waits,
         "targets": "none: in pixels" if pixels else f"{target}, {waits_most}",
-        "waits, with checks": round(traffic.events.count(WAIT) / iterations, 2),
+        "waits, with checks": round(names.count(WAIT) / iterations, 2),
         "allocations": allocations,
-        "bytes over the bus a step": round(traffic.bytes / iterations),
-        "first solve: launches": len(first.events) - first.events.count(WAIT),
-        "waits": first.events.count(WAIT),
-        "KB over the bus": round(first.bytes / 1e3, 1),
+        "bytes over the bus a step": round(sum(size for _, size in events) / iterations),
+        "first solve: launches": len(first) - first_waits,
+        "waits": first_waits,
+        "KB over the bus": round(sum(size for _, size in first) / 1e3, 1),
         "verdict": "" if pixels else "hit" if hit else "MISS",
     }
 
 
 def main() -> None:
-    """Count and print."""
     given = options(__doc__ or "")
-    rows = [
-        row(given.device, kind, make, method, k)
-        for kind, make in operators(given).items()
-        for method in TARGETS
-        for k in (1, 3)
-    ]
+    kinds = itertools.product(operators(given).items(), TARGETS, (1, 3))
+    rows = [row(given.device, kind, make, method, k) for (kind, make), method, k in kinds]
     misses = sum(one["verdict"] == "MISS" for one in rows)
     table = Table(*rows[0], caption=f"{misses} of {len(rows)} targets missed")
     for one in rows:

@@ -10,6 +10,7 @@ error of the response, over linear values from 0.02 to 0.9 above black.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 from functools import partial
@@ -24,10 +25,8 @@ from ltcl.images import from_srgb, to_srgb
 SECONDS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 ELECTRONS, READ, BLACK = 10000.0, 0.002, 0.004
 MERGERS = {"MergeDebevec": cv2.createMergeDebevec, "MergeRobertson": cv2.createMergeRobertson}
-CALIBRATORS = {
-    "CalibrateDebevec": cv2.createCalibrateDebevec,
-    "CalibrateRobertson": cv2.createCalibrateRobertson,
-}
+_ROBERTSON = cv2.createCalibrateRobertson
+CALIBRATORS = {"CalibrateDebevec": cv2.createCalibrateDebevec, "CalibrateRobertson": _ROBERTSON}
 
 
 def scene(n: int) -> np.ndarray:
@@ -38,7 +37,6 @@ def scene(n: int) -> np.ndarray:
 
 
 def photographs(light: np.ndarray, levels: int) -> list[np.ndarray]:
-    """Codes of all exposures."""
     rng, kind = np.random.default_rng(0), np.uint8 if levels == 256 else np.uint16
     shots = []
     for t in SECONDS:
@@ -54,7 +52,6 @@ def error(found: np.ndarray, true: np.ndarray) -> float:
 
 
 def speeds(given: Options, n: int) -> list[Row]:
-    """Merging, ours and theirs in turn."""
     light = scene(n)
     shots = {levels: photographs(light, levels) for levels in (256, 4096)}
     response, noise = Response(from_srgb(np.linspace(0, 1, 4097))), NoiseModel(ELECTRONS, READ, BLACK)
@@ -70,20 +67,15 @@ def speeds(given: Options, n: int) -> list[Row]:
     spent = seconds(actions, 1 if given.smoke else 4)
     rate = {name: len(SECONDS) * n * n / t / 1e6 for name, t in spent.items()}
     rows = []
-    for name in MERGERS:
-        for bits in (8, 12):
-            question, ours = (
-                f"merge {len(SECONDS)} x {n * n / 1e6:.3g} Mpixel, {bits} bits",
-                rate[f"ours {bits}"],
-            )
-            rows.append(
-                Row(question, f"OpenCV {name}, 8 bits", rate[name], ours, "Mpixel/s", ours / rate[name])
-            )
+    for name, bits in itertools.product(MERGERS, (8, 12)):
+        question, ours = f"merge {len(SECONDS)} x {n * n / 1e6:.3g} Mpixel, {bits} bits", rate[f"ours {bits}"]
+        better = ours / rate[name]
+        rows.append(Row(question, f"OpenCV {name}, 8 bits", rate[name], ours, "Mpixel/s", better))
     ours = merge(shots[256], SECONDS, response, noise)
     for name in MERGERS:
         theirs = np.asarray(actions[name]())
         off, own = (error(found[ours.valid], light[ours.valid]) for found in (theirs, ours.value))
-        rows.append(Row("noise of the picture, 8 bits", f"OpenCV {name}", off, own, "rms", off / own, 1.0))
+        rows.append(Row.of_times("noise of the picture, 8 bits", f"OpenCV {name}", off, own, "rms", 1.0))
     return rows
 
 
@@ -100,22 +92,19 @@ def responses(n: int) -> list[Row]:
         zero = Response(table).linear(to_srgb(np.array([BLACK])))  # theirs do not tell black: it is given
         return error(Response(table).linear(codes) - zero, used), spent
 
-    ours = timed(lambda: calibrate(shots, SECONDS).values[0])
-    rows = []
+    def theirs(make: Callable) -> np.ndarray:
+        return np.maximum.accumulate(make().process(shots, times=times)[:, 0, 0].astype(np.float64))
+
+    own, spent = timed(lambda: calibrate(shots, SECONDS).values[0])
+    question, rows = f"response of {n} x {n} pixels, 8 bits", []
     for name, make in CALIBRATORS.items():
-        theirs = timed(
-            lambda make=make: np.maximum.accumulate(
-                make().process(shots, times=times)[:, 0, 0].astype(np.float64)
-            )
-        )
-        question = f"response of {n} x {n} pixels, 8 bits"
-        rows.append(Row(question, f"OpenCV {name}", theirs[0], ours[0], "rms", theirs[0] / ours[0], 1.0))
-        rows.append(Row(question, f"OpenCV {name}", theirs[1], ours[1], "s", theirs[1] / ours[1]))
+        off, duration = timed(partial(theirs, make))
+        rows.append(Row.of_times(question, f"OpenCV {name}", off, own, "rms", 1.0))
+        rows.append(Row.of_times(question, f"OpenCV {name}", duration, spent, "s"))
     return rows
 
 
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     rows = speeds(given, 64 if given.smoke else 1200) + responses(64 if given.smoke else 400)
     report(given, "Merging exposures", rows, {"exposures": len(SECONDS), "opencv": cv2.__version__})

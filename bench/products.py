@@ -12,11 +12,14 @@ are given.
 
 from __future__ import annotations
 
+from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import _figures as figures
 from _coefficients import ROWS, analysis, largest, note, relative
@@ -29,10 +32,6 @@ from ltcl.operators import CSR, Compressed, Operator, Tiles, Wavelet, restrict_t
 from ltcl.plots.page import INK
 from ltcl.scenes import landscape
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 ALBEDO, ERROR = 0.8, 0.01
 ERRORS = (0.1, 0.03, ERROR, 0.003)
 AIM = 0.99  # of an error, for what is left out; the rest is for rounding to 16 bits
@@ -43,14 +42,7 @@ OTHERS = "#ff7f9f"
 OURS_TARGET, SCIPY_TARGET = 15.0, 30.0
 
 
-@dataclass(frozen=True)
-class Problem:
-    """R (N, N) float32, a picture, and R times it in float64."""
-
-    R: np.ndarray
-    grid: tuple[int, int]
-    x: np.ndarray
-    y: np.ndarray
+Problem = namedtuple("Problem", "R grid x y")  # R (N, N) float32, a picture, and R times it in float64
 
 
 @dataclass(frozen=True)
@@ -88,7 +80,6 @@ class Point:
 
 
 def problem(smoke: bool) -> Problem:
-    """The corner under a landscape."""
     n = 8 if smoke else 96
     note(f"R of {2 * n * n} pixels")
     R = interreflection(n, ALBEDO, note)
@@ -98,18 +89,14 @@ def problem(smoke: bool) -> Problem:
 
 
 def forms(given: Options, at: Problem) -> list[Form]:
-    """R in pixels, with its rows in wavelets, and in wavelets on both sides."""
     W = Wavelet(given.device, at.grid, "db2")
-    transform = analysis(W)
-    drop = DROP * float(np.linalg.norm(at.R.ravel()))
-
+    transform, drop = analysis(W), DROP * float(np.linalg.norm(at.R.ravel()))
     found = []
     for name, out, into in (("pixels", None, None), ("rows", None, W), ("both", W, W)):
         note(FORMATS[name])
         matrix: Any = at.R
         if into is not None:
-            rows = source("R", at.R)
-            matrix = coefficients(rows, out and transform, transform, drop=drop).core
+            matrix = coefficients(source("R", at.R), out and transform, transform, drop=drop).core
         x, y = (v if V is None else V.matvec(v) for V, v in ((into, at.x), (out, at.y)))
         found.append(Form(name, matrix, out, into, x, y))
     return found
@@ -131,43 +118,27 @@ def measure(
         actions[f"ours, {form}"] = product(A, at.x)
         actions[f"core, {form}"] = product(core, np.resize(at.x, core.shape[1]))
     ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
-    points = [
-        Point(
-            form=form,
-            wanted=wanted,
-            error=relative(A.matvec(at.x), at.y),
-            kept=numbers[form].nnz / len(at.x),
-            nbytes=A.nbytes,
-            pixels=ms[f"ours, {form}"],
-            core=ms[f"core, {form}"],
-        )
-        for form, _, A in ways
-    ]
+    points = []
+    for form, _, A in ways:
+        error, kept = relative(A.matvec(at.x), at.y), numbers[form].nnz / len(at.x)
+        points.append(Point(form, wanted, error, kept, A.nbytes, ms[f"ours, {form}"], ms[f"core, {form}"]))
     return points, {name: ms[name] for name in others}
 
 
-def at_one_percent(points: list[Point]) -> list[Point]:
-    """Sparse rows of R, and ours that a solve runs on."""
-    return [point for point in points if point.wanted == ERROR and point.form in ("pixels", "both")]
-
-
-def compare(at: Problem, points: list[Point], ms: dict[str, float]) -> list[Row]:
+def compare(at: Problem, sparse: Point, best: Point, ms: dict[str, float]) -> list[Row]:
     """What the targets are about: ours at 1 %, beside every other way to the same error."""
-    sparse, best = at_one_percent(points)
     targets = {"our own sparse rows": OURS_TARGET, "scipy": SCIPY_TARGET}
     others = {"our own sparse rows": sparse.pixels} | ms
-    rows = [
-        Row.of_times(f"1 % of R l, {how}", name, theirs, ours, "ms", targets.get(name))
-        for how, ours in (("with transforms", best.pixels), ("in a solve", best.core))
-        for name, theirs in others.items()
-    ]
-    sizes = {"thresholded rows of any peer": sparse.nbytes, "dense numpy": at.R.nbytes}
-    size = [Row.of_times("bytes at 1 %", name, B, best.nbytes, "B", 1.0) for name, B in sizes.items()]
-    return rows + size
+    rows = []
+    for how, ours in (("with transforms", best.pixels), ("in a solve", best.core)):
+        for name, theirs in others.items():
+            rows.append(Row.of_times(f"1 % of R l, {how}", name, theirs, ours, "ms", targets.get(name)))
+    for name, size in (("thresholded rows of any peer", sparse.nbytes), ("dense numpy", at.R.nbytes)):
+        rows.append(Row.of_times("bytes at 1 %", name, size, best.nbytes, "B", 1.0))
+    return rows
 
 
-def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
-    """Error over bytes, and error over time."""
+def draw(at: Problem, points: list[Point], sparse: Point, best: Point, ms: dict[str, float]) -> Figure:
     figure = figures.page(
         470,
         "What a product with a smooth R takes",
@@ -192,7 +163,6 @@ def draw(at: Problem, points: list[Point], ms: dict[str, float]) -> Figure:
     for (name, spent), marker in zip(peers, "v^<>", strict=False):
         time.plot(spent, ERROR, marker, color=OTHERS, label=name, ms=7, zorder=4, ls="none")
     time.plot([], [], ":", color=OTHERS, lw=1, label="NumPy, dense: no error")
-    sparse, best = at_one_percent(points)
     fewer, faster = f"{sparse.nbytes / best.nbytes:.0f}", f"{sparse.pixels / best.core:.0f}"
     across(memory, at.R.nbytes / 1e6, (sparse.nbytes / 1e6, best.nbytes / 1e6), f"{fewer} times less")
     text = f"{faster} times less,\n{sparse.pixels / best.pixels:.0f} with transforms"
@@ -207,34 +177,30 @@ def across(axes: Axes, dense: float, pair: tuple[float, float], text: str) -> No
     axes.vlines(dense, min(ERRORS) / 1.3, max(ERRORS), color=OTHERS, lw=1, ls=":")
     arrow = {"arrowstyle": "->", "color": INK, "shrinkA": 4, "shrinkB": 4}
     axes.annotate("", (ours, ERROR), (theirs, ERROR), arrowprops=arrow)
-    axes.text(
-        (ours * theirs**2) ** (1 / 3), ERROR * 1.1, text, color=INK, fontsize=9, ha="center", va="bottom"
-    )
+    place = (ours * theirs**2) ** (1 / 3), ERROR * 1.1
+    axes.text(*place, text, color=INK, fontsize=9, ha="center", va="bottom")
     axes.set_ylim(min(ERRORS) / 1.3, max(ERRORS) * 3)
     axes.set_yticks(ERRORS, [f"{100 * error:.2g} %" for error in ERRORS])
     axes.minorticks_off()
 
 
 def main() -> None:
-    """Run it."""
     given = options(__doc__ or "")
     at, (memory, nbytes) = problem(given.smoke), triad(given.device, given.smoke)
     found, points, ms = forms(given, at), list[Point](), dict[str, float]()
     for wanted in ERRORS:
         more, others = measure(given, at, found, wanted, memory)
         points, ms = points + more, ms | others
-    facts: dict[str, Any] = {
-        "pixels": len(at.x),
-        "triad, GB/s": nbytes / ms.pop("triad") / 1e6,
-        **{
-            f"{FORMATS[point.form]}, error {point.error:.2%}": f"{point.kept:.4g} a row, "
-            f"{point.nbytes / 1e6:.4g} MB, {point.pixels:.4g} ms, core {point.core:.4g} ms"
-            for point in points
-        },
-        "not installed": ", ".join(missing()) or "none",
-    }
-    rows = compare(at, points, ms)
-    report(given, "Products with a smooth R", rows, facts, lambda: draw(at, points, ms))
+    facts: dict[str, Any] = {"pixels": len(at.x), "triad, GB/s": nbytes / ms.pop("triad") / 1e6}
+    for p in points:
+        times = f"{p.pixels:.4g} ms, core {p.core:.4g} ms"
+        size = f"{p.kept:.4g} a row, {p.nbytes / 1e6:.4g} MB, {times}"
+        facts[f"{FORMATS[p.form]}, error {p.error:.2%}"] = size
+    facts["not installed"] = ", ".join(missing()) or "none"
+    # At 1 %: sparse rows of R, and ours that a solve runs on.
+    sparse, best = (p for p in points if p.wanted == ERROR and p.form != "rows")
+    rows, title = compare(at, sparse, best, ms), "Products with a smooth R"
+    report(given, title, rows, facts, lambda: draw(at, points, sparse, best, ms))
 
 
 if __name__ == "__main__":

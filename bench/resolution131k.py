@@ -20,26 +20,24 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
-from _coefficients import analysis, bisect, note, relative, transport
+from _coefficients import analysis, fewest, note, relative, transport
 from _corner import Bounce
 from _figures import Claim
 from _harness import Options, options, product, seconds
 from ltcl.compression import SparseInverse, invert_coefficients
-from ltcl.compression.coefficients import Coefficients, coefficients, drop_below
+from ltcl.compression.coefficients import Coefficients, coefficients
 from ltcl.compression.sources import source
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
 from ltcl.scenes import dihedral, landscape
 from ltcl.scenes.viewer import draw as draw_view
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 ALBEDO, REFERENCE = (0.8, 0.65, 0.5), 0.5
 THRESHOLD, RTOL = 2e-5, 5e-4  # of numbers of A; of solutions with R
@@ -50,24 +48,9 @@ BOUNCES = 2
 TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
 
 
-@dataclass(frozen=True)
-class Corner:
-    """Rows of A of a reference albedo; A of a channel is a multiple of it."""
-
-    rows: Bounce
-
-    @property
-    def picture(self) -> np.ndarray:
-        """What the walls are to look like, (h, w, 3)."""
-        return 0.05 + 0.4 * landscape(*self.rows.grid).astype(np.float64)
-
-    def bounce(self, light: np.ndarray) -> np.ndarray:
-        """A_c l_c of every channel, (N, 3) float64, with every number of A."""
-        return self.rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
-
-    def direct(self, light: np.ndarray) -> np.ndarray:
-        """Direct light of a picture, (N, 3) float64, in every channel."""
-        return light - self.bounce(light)
+def bounce(rows: Bounce, light: np.ndarray) -> np.ndarray:
+    """A_c l_c of every channel, (N, 3) float64, with every number of A; direct is l - A l."""
+    return rows.matmat(light) * (np.array(ALBEDO) / REFERENCE)
 
 
 class Stopwatch(dict[str, float]):
@@ -75,7 +58,7 @@ class Stopwatch(dict[str, float]):
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time a block and say so."""
+        """Time a block and note it."""
         start = time.perf_counter()
         yield
         self[name] = time.perf_counter() - start
@@ -93,76 +76,74 @@ class Built:
     lighter: ltcl.Transport
     spent: Stopwatch
 
+    def compensate(self, picture: np.ndarray) -> ltcl.Compensation:
+        """The pattern for a picture, whatever light it takes."""
+        return ltcl.compensate(self.lighter, picture, bounds=(-10.0, 10.0), rtol=ERROR)
 
-def build(given: Options, corner: Corner) -> Built:
+
+def build(given: Options, rows: Bounce) -> Built:
     """The transport, from rows of A alone."""
-    W, spent = Wavelet(given.device, corner.rows.grid, "db2"), Stopwatch()
+    W, spent = Wavelet(given.device, rows.grid, "db2"), Stopwatch()
     with spent("compressing A"):
-        rows = source("A", corner.rows, MEMORY)
-        A = coefficients(rows, analysis(W), analysis(W), THRESHOLD, first=THRESHOLD / 4)
+        transform, blocks = analysis(W), source("A", rows, MEMORY)
+        A = coefficients(blocks, transform, transform, THRESHOLD, first=THRESHOLD / 4)
     found = []
     for albedo in ALBEDO:
         with spent(f"R of albedo {albedo:g}"):
             C = (A.core * np.float32(albedo / REFERENCE)).astype(np.float32)
             found.append(invert_coefficients(-C, rtol=RTOL))
-    cores = [-one.D for one in found]
-    with spent("what a pattern needs of R"):
-        fewer = enough(given, corner, cores)
+    cores, fewer, (h, w) = [-one.D for one in found], [], rows.grid
+    with spent("what a pattern needs of R"):  # that the direct light of another picture is off by 0.6 %
+        picture = 0.05 + 0.4 * landscape(h, w).astype(np.float64)
+        grey = np.roll(picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
+        exact = grey[:, None] - bounce(rows, grey[:, None])
+        for C, truth in zip(cores, exact.T, strict=True):
+
+            def error(core: Any, truth: np.ndarray = truth) -> float:
+                core, V = restrict_to_support(core, W)
+                S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
+                return relative(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
+
+            fewer.append(fewest(C, error, SHARE * ERROR))
     return Built(A, found, fewer, transport(W, cores, ALBEDO), transport(W, fewer, ALBEDO), spent)
 
 
-def enough(given: Options, corner: Corner, cores: list[Any]) -> list[Any]:
-    """The largest numbers of R, with which the direct light of another picture is off by 0.6 %."""
-    W, (h, w) = Wavelet(given.device, corner.rows.grid, "db2"), corner.rows.grid
-    grey = np.roll(corner.picture.mean(axis=2), (h // 3, w // 5), (0, 1)).reshape(-1)
-    exact, found = corner.direct(grey[:, None]), []
-    for channel, C in enumerate(cores):
-        truth = exact[:, channel]
-
-        def error(threshold: float, C: Any = C, truth: np.ndarray = truth) -> float:
-            core, V = restrict_to_support(drop_below(C, threshold)[0], W)
-            S = IdentityPlus(Compressed(CSR(given.device, core), V, V))
-            return relative(ltcl.solve(S, grey, "chebyshev", rtol=SEPARATION).x, truth)
-
-        found.append(drop_below(C, bisect(error, SHARE * ERROR, float(np.abs(C.data).max())))[0])
-    return found
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """(h, w, 3) each; errors are of the pattern and the parts."""
-
-    wanted: np.ndarray
-    pattern: np.ndarray
-    parts: list[np.ndarray]
-    errors: list[float]
-
-
-def compensate(built: Built, picture: np.ndarray) -> ltcl.Compensation:
-    """The pattern for a picture, whatever light it takes."""
-    return ltcl.compensate(built.lighter, picture, bounds=(-10.0, 10.0), rtol=ERROR)
-
-
-def pictures(corner: Corner, built: Built) -> Pictures:
-    """Compensate and separate a landscape, and compare with the truth."""
-    wanted = corner.picture
+def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]:
+    """A landscape, its pattern, direct light and bounces, (h, w, 3) each; errors of all but the first."""
+    wanted = 0.05 + 0.4 * landscape(*rows.grid).astype(np.float64)
     with built.spent("compensate, first call"):
-        compensation = compensate(built, wanted)
+        pattern = built.compensate(wanted).pattern
     with built.spent("separate, first call"):
         separation = ltcl.separate(built.T, wanted, BOUNCES, rtol=SEPARATION)
-    exact = [corner.direct(wanted.reshape(-1, 3))]
+    l_out = wanted.reshape(-1, 3)
+    exact = [l_out - bounce(rows, l_out)]
     for _ in range(BOUNCES):
-        exact.append(corner.bounce(exact[-1]))
+        exact.append(bounce(rows, exact[-1]))
     parts = [separation.direct, *separation.bounces]
-    pairs = zip([compensation.pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
-    errors = [relative(part.reshape(-1, 3), truth) for part, truth in pairs]
-    return Pictures(wanted, compensation.pattern, parts, errors)
+    pairs = zip([pattern * ALBEDO, *parts], [exact[0], *exact], strict=True)
+    return [wanted, pattern, *parts], [relative(part.reshape(-1, 3), truth) for part, truth in pairs]
 
 
-def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
-    """Milliseconds of a product, of a solve and of the whole task."""
-    pixels = wanted.reshape(-1, 3).astype(np.float32)
-    R: Any = built.lighter.systems[0].R
+def draw(names: list[str], images: list[np.ndarray]) -> Figure:
+    figure = figures.page(
+        270,
+        "131072 pixels, each of which lights every other",
+        "A picture on a corner of two walls, the pattern that makes it, and its light by bounces (4 times).",
+    )
+    walls, gains, views = dihedral(2), (1.0, 0.6, 1.0, *(BOUNCES * [4.0])), []
+    for label, image, gain in zip(["wanted", *names], images, gains, strict=True):
+        view = draw_view(walls.viewer, walls.walls, image.astype(np.float32), 400, 2)
+        views.append((to_srgb(np.clip(gain * view, 0, 1)), label))
+    figures.pictures(figure, 110, views)
+    return figure
+
+
+def main() -> None:
+    given = options(__doc__ or "")
+    rows = Bounce(8 if given.smoke else 256, REFERENCE)
+    built = build(given, rows)
+    images, errors = pictures(rows, built)
+    pixels, R = images[0].reshape(-1, 3).astype(np.float32), cast(Compressed, built.lighter.systems[0].R)
 
     def solve() -> None:
         for c, S in enumerate(built.lighter.systems):
@@ -172,52 +153,10 @@ def times(built: Built, wanted: np.ndarray) -> dict[str, float]:
         "product, on coefficients": product(R.core, np.zeros(R.core.shape[1], np.float32)),
         "product, in pixels": product(R, pixels[:, 0]),
         "solve in colour": solve,
-        "compensate in colour": lambda: compensate(built, wanted),
+        "compensate in colour": lambda: built.compensate(images[0]),
     }
-    return {name: 1e3 * spent for name, spent in seconds(actions).items()}
-
-
-def claims(found: Pictures, ms: dict[str, float], smoke: bool) -> list[Claim]:
-    """Errors of every picture, and time."""
-    if smoke:
-        return []
-    names = ["pattern", "direct", *(f"bounce {k + 1}" for k in range(BOUNCES))]
-    what, limit = "of 131072 pixels in colour", f"at most {ERROR:.0%}"
-    of_errors = [
-        Claim(f"{name} {what}", f"error {error:.2%}", limit, error <= ERROR)
-        for name, error in zip(names, found.errors, strict=True)
-    ]
-    return of_errors + [
-        Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most)
-        for name, most in TARGETS.items()
-    ]
-
-
-def draw(found: Pictures) -> Figure:
-    """The picture wanted, the pattern for it and where its light comes from."""
-    figure = figures.page(
-        270,
-        "131072 pixels, each of which lights every other",
-        "A picture on a corner of two walls, the pattern that makes it, and its light by bounces (4 times).",
-    )
-    walls = dihedral(2)
-    lefts, width = figures.columns(3 + BOUNCES, gap=14)
-    shown = [("wanted", found.wanted, 1.0), ("pattern", found.pattern, 0.6), ("direct", found.parts[0], 1.0)]
-    shown += [(f"bounce {k + 1}", part, 4.0) for k, part in enumerate(found.parts[1:])]
-    for left, (label, picture, gain) in zip(lefts, shown, strict=True):
-        view = draw_view(walls.viewer, walls.walls, picture.astype(np.float32), 400, 2)
-        figures.picture(figure, (left, 110, width), to_srgb(np.clip(gain * view, 0, 1)), label)
-    return figure
-
-
-def main() -> None:
-    """Run it."""
-    given = options(__doc__ or "")
-    corner = Corner(Bounce(8 if given.smoke else 256, REFERENCE))
-    built = build(given, corner)
-    found = pictures(corner, built)
-    ms = times(built, found.wanted)
-    n = corner.rows.shape[0]
+    ms = {name: 1e3 * spent for name, spent in seconds(actions).items()}
+    n = rows.shape[0]
     facts: dict[str, Any] = {
         "pixels": n,
         "A, numbers a row": built.A.core.nnz / n,
@@ -233,8 +172,15 @@ def main() -> None:
         "peak memory, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "largest buffer allowed, MB": given.device.max_allocation / 2**20,
     }
-    claimed = claims(found, ms, given.smoke)
-    figures.conclude(given, "131072 pixels in colour", claimed, facts, lambda: draw(found))
+    names = ["pattern", "direct", *(f"bounce {k + 1}" for k in range(BOUNCES))]
+    claims, limit = [], f"at most {ERROR:.0%}"
+    for name, error in zip(names, errors, strict=True):
+        text = f"{name} of 131072 pixels in colour"
+        claims.append(Claim(text, f"error {error:.2%}", limit, error <= ERROR))
+    for name, most in TARGETS.items():
+        claims.append(Claim(f"{name}, 1 %", f"{ms[name]:.3g} ms", f"at most {most:g} ms", ms[name] <= most))
+    title = "131072 pixels in colour"
+    figures.conclude(given, title, [] if given.smoke else claims, facts, lambda: draw(names, images))
 
 
 if __name__ == "__main__":

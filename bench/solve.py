@@ -55,13 +55,6 @@ def box(given: Options, rho: float) -> Problem:
     return problem(f"box of {len(R)}, rho {rho:g}", R, T.systems[0])
 
 
-def sparse(given: Options, rho: float) -> Problem:
-    """Nonnegative with equal row sums, which then are rho(R)."""
-    R = matrix(2048, 32, 16) if given.smoke else matrix(131072, 256, 16)
-    R.data *= np.repeat(rho / R.sum(axis=1), np.diff(R.indptr)).astype(np.float32)
-    return problem(f"sparse {R.shape[0]}, rho {rho:g}", R, IdentityPlus(CSR(given.device, R)))
-
-
 def problem(name: str, R: Any, S: IdentityPlus, columns: int | None = None) -> Problem:
     """The picture S l_d of random light l_d; `columns` of them."""
     n = R.shape[0]
@@ -91,7 +84,6 @@ def scipy_gmres(problem: Problem, full: Any) -> tuple[np.ndarray, int]:
 
 
 def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
-    """Products and times of one problem."""
     R, identity = problem.R, scipy.sparse.eye_array(problem.R.shape[0]).astype(np.float32)
     full = scipy.sparse.csr_array(identity + R) if scipy.sparse.issparse(R) else R + identity.toarray()
     first = 1e3 * ltcl.solve(problem.S, problem.b, rtol=RTOL).seconds  # builds kernels, tunes
@@ -108,36 +100,33 @@ def compare(problem: Problem, facts: dict[str, Any]) -> list[Row]:
         "gmres": lambda: scipy_gmres(problem, full),
     }
     times = {name: 1e3 * spent for name, spent in seconds(actions, repeats=REPEATS).items()}
-    loop = f"{'scipy.sparse' if scipy.sparse.issparse(R) else 'numpy'} Neumann loop"
-    targets = (NEUMANN_TARGET, GMRES_TARGET) if problem.b.ndim == 1 else (None, None)
-    name = problem.name
+    loop, name = f"{'scipy.sparse' if scipy.sparse.issparse(R) else 'numpy'} Neumann loop", problem.name
+    of_neumann, of_gmres = (NEUMANN_TARGET, GMRES_TARGET) if problem.b.ndim == 1 else (None, None)
     new = [Row.of_times(name, "3 later solves", 3 * times["ours"], first, "ms", 1.0)] * (problem.b.ndim == 1)
     return [
         *new,
         Row.of_times(name, "Neumann's products", products, ours.products, "products", PRODUCTS_TARGET),
-        Row.of_times(name, loop, times["neumann"], times["ours"], "ms", targets[0]),
-        Row.of_times(name, "scipy GMRES", times["gmres"], times["ours"], "ms", targets[1]),
+        Row.of_times(name, loop, times["neumann"], times["ours"], "ms", of_neumann),
+        Row.of_times(name, "scipy GMRES", times["gmres"], times["ours"], "ms", of_gmres),
     ]
 
 
-def divergent(given: Options, facts: dict[str, Any]) -> Row:
-    """Products where the paper's series diverges."""
-    problem = box(given, 4.0)
-    paper = ltcl.solve(problem.S, problem.b, "neumann", rtol=RTOL, throw=False)
-    facts[f"{problem.name}: Neumann"] = paper.status.name.lower()
-    ours = [ltcl.solve(problem.S, problem.b, rtol=RTOL) for _ in range(3)][2]  # the second surveys S
-    problem.check("ours", ours.x)
-    return Row.of_times(problem.name, "products allowed", DIVERGENT_TARGET, ours.products, "products", 1.0)
-
-
 def main() -> None:
-    """Run the bench."""
     given, facts = options(__doc__ or ""), {}
-    dense, large = box(given, 0.8), sparse(given, 0.8)
+    R = matrix(2048, 32, 16) if given.smoke else matrix(131072, 256, 16)
+    R.data *= np.repeat(0.8 / R.sum(axis=1), np.diff(R.indptr)).astype(np.float32)  # row sums are rho(R)
+    dense, S = box(given, 0.8), IdentityPlus(CSR(given.device, R))
+    large = problem(f"sparse {R.shape[0]}, rho 0.8", R, S)
     rows = compare(dense, facts) + compare(large, facts)
     for k in (3, 8):
-        rows += compare(problem(large.name, large.R, large.S, k), facts)
-    rows.append(divergent(given, facts))
+        rows += compare(problem(large.name, R, S, k), facts)
+    beyond = box(given, 4.0)  # where the paper's series diverges
+    paper = ltcl.solve(beyond.S, beyond.b, "neumann", rtol=RTOL, throw=False)
+    facts[f"{beyond.name}: Neumann"] = paper.status.name.lower()
+    ours = [ltcl.solve(beyond.S, beyond.b, rtol=RTOL) for _ in range(3)][2]  # the second surveys S
+    beyond.check("ours", ours.x)
+    due = DIVERGENT_TARGET
+    rows.append(Row.of_times(beyond.name, "products allowed", due, ours.products, "products", 1.0))
     report(given, "Solve to 1 %", rows, facts)
 
 

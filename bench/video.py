@@ -9,7 +9,6 @@ as `ltcl.batch.compensate_frames` does, which is timed with its pictures on disk
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -59,36 +58,30 @@ def shown(T: ltcl.Transport, codes: np.ndarray, **settings: Any) -> np.ndarray:
     return TO_CODES[(STEPS * done.pattern + 0.5).astype(np.int16)]
 
 
-def actions(T: ltcl.Transport, inverse: ltcl.Inverse, folder: Path) -> dict[str, Callable]:
-    """What is timed, of BATCH frames each."""
-    frames = film(T, BATCH)
-    for number, codes in enumerate(frames):
-        ltcl.images.write(folder / "film" / f"{number}.png", TO_LINEAR[codes])
-
-    def files(**settings: Any) -> None:
-        with tempfile.TemporaryDirectory() as out:
-            given = {"batch": BATCH, "rtol": RTOL, "clamp": True, **settings}
-            ltcl.batch.compensate_frames(T, folder / "film", out, **given)
-
-    kept = {"inverse": inverse}
-    return {
-        "solves, one by one": lambda: [shown(T, codes) for codes in frames],
-        "solves, 8 at a time": lambda: shown(T, frames),
-        "inverse, one by one": lambda: [shown(T, codes, **kept) for codes in frames],
-        "inverse, 8 at a time": lambda: shown(T, frames, **kept),
-        "solves, compensate_frames, .png to .png": files,
-        "inverse, compensate_frames, .png to .png": lambda: files(**kept),
-    }
-
-
 def main() -> None:
-    """Run it."""
     given = options(__doc__ or "")
     grid, coarse = ((16, 32), (4, 8)) if given.smoke else ((256, 512), (32, 64))
     T = transport(given, grid, coarse)
-    inverse = ltcl.invert(T, RTOL)
+    inverse, frames = ltcl.invert(T, RTOL), film(T, BATCH)
+    kept = {"inverse": inverse}
     with tempfile.TemporaryDirectory() as folder:
-        spent = seconds(actions(T, inverse, Path(folder)), 1 if given.smoke else 7)
+        for number, codes in enumerate(frames):
+            ltcl.images.write(Path(folder) / "film" / f"{number}.png", TO_LINEAR[codes])
+
+        def files(**settings: Any) -> None:
+            with tempfile.TemporaryDirectory() as out:
+                rules: Any = {"batch": BATCH, "rtol": RTOL, "clamp": True, **settings}
+                ltcl.batch.compensate_frames(T, Path(folder) / "film", out, **rules)
+
+        actions = {
+            "solves, one by one": lambda: [shown(T, codes) for codes in frames],
+            "solves, 8 at a time": lambda: shown(T, frames),
+            "inverse, one by one": lambda: [shown(T, codes, **kept) for codes in frames],
+            "inverse, 8 at a time": lambda: shown(T, frames, **kept),
+            "solves, compensate_frames, .png to .png": files,
+            "inverse, compensate_frames, .png to .png": lambda: files(**kept),
+        }
+        spent = seconds(actions, 1 if given.smoke else 7)
     rows = []
     for name, time in spent.items():
         rate, target = BATCH / time, KEPT if name.startswith("inverse") else SOLVES

@@ -28,14 +28,7 @@ GO_ON = 0.5
 STEPS = 1.0 / (1.0 - GO_ON)  # of a walk, in the mean
 
 
-def signed(n: int, per_row: int) -> Any:
-    """R of n pixels, entries of row sums around 0.45 at random places, a fifth of them negative."""
-    R = matrix(n, per_row, 1)
-    R.data = (np.random.default_rng(0).uniform(-0.3, 1.2, R.nnz) / per_row).astype(np.float32)
-    return R
-
-
-def numba_walker(R: scipy.sparse.csr_array, b: np.ndarray, made: Tables) -> Callable[[int], Any] | None:
+def numba_walker(R: Any, b: np.ndarray, made: Tables, samples: int) -> Callable[[], np.ndarray] | None:
     """The same by alias tables, or None where Numba is not installed (the extra `bench` brings it)."""
     if "numba" in missing():
         return None
@@ -47,7 +40,7 @@ def numba_walker(R: scipy.sparse.csr_array, b: np.ndarray, made: Tables) -> Call
     sums, pointers, go_on = made.sums(), R.indptr.astype(np.int64), np.float32(GO_ON)
 
     @numba.njit(parallel=True, fastmath=True)
-    def walk(samples: int, pointers, threshold, own, other, sums, b, out) -> None:
+    def walk(pointers, threshold, own, other, sums, b, out) -> np.ndarray:
         for pixel in numba.prange(len(out)):
             total = 0.0
             for _ in range(samples):
@@ -63,14 +56,10 @@ def numba_walker(R: scipy.sparse.csr_array, b: np.ndarray, made: Tables) -> Call
                         break
                     weight /= go_on
             out[pixel] = total / samples
-
-    out = np.zeros(len(b))
-
-    def run(samples: int) -> np.ndarray:
-        walk(samples, pointers, threshold, own, other, sums, b, out)
         return out
 
-    return run
+    out = np.zeros(len(b))
+    return lambda: walk(pointers, threshold, own, other, sums, b, out)
 
 
 def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
@@ -83,9 +72,8 @@ def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
         host = scipy.sparse.csr_array((data.astype(np.float32), R.indices, R.indptr), shape=R.shape)
         Rs.append(CSR(given.device, host, Rs[0].pattern if Rs else None))
     b, lengths = random.random((n, 3), dtype=np.float32), Lengths.geometric(GO_ON, -1.0)
-    walkers = [(Walker(linked(Rs, (1.0, 1.0, 1.0)), lengths, 0), given.device.upload(b))]
-    for M, column in zip(Rs, b.T, strict=True):
-        walkers.append((Walker(tables(M), lengths, 0), given.device.upload(column)))
+    of_light = [(linked(Rs, (1.0, 1.0, 1.0)), b), *((tables(M), l) for M, l in zip(Rs, b.T, strict=True))]
+    walkers = [(Walker(made, lengths, 0), given.device.upload(light)) for made, light in of_light]
 
     def walk(some: list[Any]) -> list[Any]:
         return [walker.rows(light, np.arange(n), samples) for walker, light in some]
@@ -95,30 +83,24 @@ def colours(given: Options, R: scipy.sparse.csr_array, samples: int) -> Row:
     return Row("steps for three colours", "three walks", theirs, ours, "M/s", ours / theirs)
 
 
-def check(name: str, found: np.ndarray, exact: np.ndarray, samples: int) -> None:
-    """Stop where the mean over all pixels is not that of the solution: nobody is timed doing less."""
-    if abs(float(np.mean(found - exact))) > 5.0 / (len(exact) * samples) ** 0.5:
-        raise SystemExit(f"the walks of {name} do not lead to the solution")
-
-
 def main() -> None:
-    """Run the bench."""
     given = options(__doc__ or "")
     n, per_row, samples = (1024, 16, 32) if given.smoke else (131072, 100, 32)
-    R, b = signed(n, per_row), np.random.default_rng(2).random(n, dtype=np.float32)
+    R, b = matrix(n, per_row, 1), np.random.default_rng(2).random(n, dtype=np.float32)
+    values = np.random.default_rng(0).uniform(-0.3, 1.2, R.nnz)  # a fifth negative; row sums around 0.45
+    R.data = (values / per_row).astype(np.float32)
     made, light, pixels = Tables(CSR(given.device, R)), given.device.upload(b), np.arange(n)
     walker = Walker(made, Lengths.geometric(GO_ON, -1.0), 0)
     actions: dict[str, Callable[[], Any]] = {"ours": lambda: walker.rows(light, pixels, samples).mean}
-    if (theirs := numba_walker(R, b, made)) is not None:
-        actions["Numba alias"] = lambda: theirs(samples)
+    if (theirs := numba_walker(R, b, made, samples)) is not None:
+        actions["Numba alias"] = theirs
     exact = scipy.sparse.linalg.bicgstab(scipy.sparse.eye_array(n) + R.astype(float), b, rtol=1e-8)[0] - b
-    for name, action in actions.items():
-        check(name, action(), exact, samples)
+    for name, action in actions.items():  # nobody is timed doing less
+        if abs(float(np.mean(action() - exact))) > 5.0 / (n * samples) ** 0.5:
+            raise SystemExit(f"the walks of {name} do not lead to the solution")
     rate = {name: samples * n * STEPS / time / 1e6 for name, time in seconds(actions).items()}
     ours = rate.pop("ours")
-    rows = [
-        Row("steps of walks", name, peer, ours, "M/s", ours / peer, TARGET) for name, peer in rate.items()
-    ]
+    rows = [Row("steps of walks", who, peer, ours, "M/s", ours / peer, TARGET) for who, peer in rate.items()]
     facts = {
         "pixels": n,
         "nonzeros": R.nnz,

@@ -64,13 +64,13 @@ def unknown_extension(path: Path) -> str:
 def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file under a temporary name; put it at `path` only when the block ends well.
 
-    The temporary lies next to `path`, with its extension. Missing parents are made, and removed on failure;
-    links are followed, permissions stay. FileError where `path` is no file, or of an OSError in the block.
+    The temporary is next to `path`, its extension in lower case (SciPy appends .mtx to .MTX). Missing parents
+    are made, removed on failure; links followed, permissions stay. FileError: no file, OSError in the block.
     """
     with _written(path) as target:
         if target.exists() and not target.is_file():
             raise FileError(f"{path}: is a folder, or no regular file; a file cannot be written there")
-        temporary = _temporary(target.parent, target.stem, target.suffix)
+        temporary = _temporary(target.parent, target.stem, target.suffix.lower())
         try:
             os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             yield temporary

@@ -44,9 +44,9 @@ _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1215, "images": 500, "batch": 500, "cli": 2145, "scenes": 2680}
+_OTHERS = {"acquisition": 6310, "store": 1200, "images": 500, "batch": 500, "cli": 2125, "scenes": 2710}
 _BENCHES = (
-    "_boxes _coefficients _corner _harness _peers _ways claims csr dense4k launches products relax "
+    "_boxes _coefficients _corner _harness _peers claims csr dense4k launches products relax "
     "resolution131k solve video walk"
 )
 BESIDE: dict[str, tuple[int, list[str]]] = {
@@ -58,7 +58,7 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
         + [f"tests/{name}.py" for name in ("bases", "conftest", "gallery", "house", "problems", "reference")],
     ),
     "tests of noise": (1300, ["tests/noise"]),
-    "benches of the core": (2040, [f"bench/{name}.py" for name in _BENCHES.split()]),
+    "benches of the core": (1750, [f"bench/{name}.py" for name in _BENCHES.split()]),
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),
     "tests of these": (

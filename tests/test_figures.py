@@ -83,7 +83,7 @@ def test_a_slope_is_that_above_the_launch_floor(load: Callable[[str], Any]) -> N
 
 
 def test_every_way_finds_the_direct_light(load: Callable[[str], Any], given: Any) -> None:
-    at = load("_ways").problem(4)
+    at = load("fig7").problem(4)
     truth = at.l_out - dihedral(4, albedo=0.8).A @ at.l_out
     np.testing.assert_allclose(at.l_d, truth, rtol=1e-6)
     found = load("fig7").ways(given, at)

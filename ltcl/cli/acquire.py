@@ -16,6 +16,7 @@ import typer
 from ltcl import checks, store
 from ltcl.cli import options, transports
 from ltcl.cli.command import WAITING, Answer, Context, command, percent, table
+from ltcl.cli.options import option
 from ltcl.device import open_device
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing, ScanRefused
 from ltcl.verdict import verdict
@@ -24,10 +25,7 @@ if TYPE_CHECKING:
     from ltcl.acquisition import Project
 
 _TAKE = "Folder with the camera's own files: copied, in the order of their numbers, to what is missing."
-_Overhead = Annotated[float, options.option("Seconds of each photograph beyond its exposure.", min=0.0)]
-_FOLDER = options.argument("FOLDER", "Pictures, or an acquisition with its patterns.")
-_DISPLAY = options.option("Number of the display, from 0.", metavar="N", min=0)
-_EVERY = options.option("Next picture after so many seconds.", metavar="SECONDS")
+_Overhead = Annotated[float, option("Seconds of each photograph beyond its exposure.", min=0.0)]
 _ARRIVAL = "Next pattern when its photograph is in the folder of the acquisition."
 
 app = typer.Typer(
@@ -213,10 +211,10 @@ def _report(context: Context, project: Project, device: Any) -> Answer:
 @command()
 def show(
     context: Context,
-    folder: Annotated[Path, _FOLDER],
-    display: Annotated[int, _DISPLAY] = 1,
-    every: Annotated[float | None, _EVERY] = None,
-    arrival: Annotated[bool, options.option(_ARRIVAL, "--arrival")] = False,
+    folder: Annotated[Path, options.argument("FOLDER", "Pictures, or an acquisition with its patterns.")],
+    display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
+    every: Annotated[float | None, option("Next picture after so many seconds.", metavar="SECONDS")] = None,
+    arrival: Annotated[bool, option(_ARRIVAL, "--arrival")] = False,
 ) -> Answer:
     """Show patterns full screen, next by key, timer or photograph; Escape ends it. Needs extra projector."""
     if every is not None and arrival:

@@ -31,12 +31,10 @@ def _gain(text: str) -> float | str:
         raise typer.BadParameter(f"{text!r} is no gain; write a number, or auto") from None
 
 
-_PICTURE = argument("PICTURE...", "Pictures; or one folder or one video of frames.")
 _GAIN = "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
 _LOSS = "Error that --gain auto may cost. Default: as little as possible."
 _CLAMP = "Clamp what exceeds that light, without making up for it."
 _BACKGROUND = "Picture of the light that stays. Default: as measured, else none."
-_WEIGHTS = "Picture of how much the error at each pixel counts."
 _VIDEO = "Also a video of the patterns: .mkv or .avi, lossless; or .mp4, which changes their codes."
 _FPS = "Frames a second of that video. Default: as the source, else 25."
 _FORMAT = "png: 16 bits (default); exr: the light as it is."
@@ -69,7 +67,7 @@ _FRAMES = tuple(inspect.signature(_film_options).parameters)
 def compensate(
     context: Context,
     transport: options.Matrix,
-    picture: Annotated[list[Path], _PICTURE],
+    picture: Annotated[list[Path], argument("PICTURE...", "Pictures; or one folder or one video of frames.")],
     out: options.Out,
     gain: Annotated[str | None, option(_GAIN, parser=_gain, metavar="FACTOR")] = None,
     loss: Annotated[float | None, option(_LOSS)] = None,
@@ -78,7 +76,7 @@ def compensate(
     clamp: Annotated[bool, option(_CLAMP, "--clamp")] = False,
     background: Annotated[Path | None, file(_BACKGROUND)] = None,
     calibration: Annotated[Path | None, file("The store of 'ltcl acquire' behind TRANSPORT.")] = None,
-    weights: Annotated[Path | None, file(_WEIGHTS)] = None,
+    weights: Annotated[Path | None, file("Picture of how much the error at each pixel counts.")] = None,
 ) -> Answer:
     """Find the projector patterns that make a scene look like PICTURE.
 
@@ -161,16 +159,13 @@ def _compensate_pictures(
             except LtclError as error:
                 error.args = (f"{error} (compensating {files[name]})",)
                 raise
-            high, noisy = settings["bounds"][1], transports.shows_noise(T, settings)
-            written, panels = _write(folder, name, desired[name], result, factor, high, setup, noisy)
+            white, noisy = max(settings["bounds"][1], 0.0) or 1.0, transports.shows_noise(T, settings)
+            written, panels = _write(folder / name, desired[name], result, factor, white, setup, noisy)
             sheet.append(panels)
             facts = {key: getattr(result, key) for key in _RESULTS}
-            facts |= {"too_dark": float(np.mean(result.out_of_reach > 0))}
-            facts |= {"too_bright": float(np.mean(result.out_of_reach < 0))}
-            facts |= {
-                "channels": report.solution(result.solution),
-                "limited": report.solution(result.limited),
-            }
+            lack, solves = result.out_of_reach, {"channels": result.solution, "limited": result.limited}
+            facts |= {"too_dark": float(np.mean(lack > 0)), "too_bright": float(np.mean(lack < 0))}
+            facts |= {key: report.solution(each) for key, each in solves.items()}
             text["pictures"].append({"file": str(files[name]), **facts, **written})
             rows.append(_row(files[name], facts, f"{name}_pattern.png"))
         pictures.contact_sheet(sheet[:_SHEET]).save(folder / "compensate.png")
@@ -180,12 +175,11 @@ def _compensate_pictures(
 
 
 def _write(
-    folder: Path,
-    name: str,
+    place: Path,
     desired: np.ndarray,
     result: Compensation,
     factor: float,
-    high: float,
+    white: float,
     setup: Any,
     noisy: bool,
 ) -> tuple[dict[str, Any], list[Any]]:
@@ -196,7 +190,7 @@ def _write(
     """
     from ltcl import images
 
-    scale, white = factor / result.gain, max(high, 0.0) or 1.0
+    folder, name, scale = place.parent, place.name, factor / result.gain
     seen, pattern = pictures.shades(result.appearance, scale), result.pattern
     missing = pictures.mark(seen, result.out_of_reach * scale)
     panels = {
@@ -212,10 +206,8 @@ def _write(
     for key in ("appearance", "out_of_reach"):
         written[key] = pictures.write(folder, f"{name}_{key}", getattr(result, key), panels[key])
     for key, unit in {"pattern": 1 / white, "appearance": scale}.items() if noisy else ():
-        files, panels[f"{key}_std"] = pictures.deviation(
-            folder, f"{name}_{key}", getattr(result.std, key), unit
-        )
-        written[key]["std"] = files
+        deviation = pictures.deviation(folder, f"{name}_{key}", getattr(result.std, key), unit)
+        written[key]["std"], panels[f"{key}_std"] = deviation
     return written, list(panels.values())
 
 

@@ -73,10 +73,8 @@ def convert(
         if isinstance(record, Record):
             record = dataclasses.replace(record, **sizes)
         elif any(size != record.grid for size in sizes.values()):
-            h, w = record.grid
-            raise InputError(
-                f"grid is {next(iter(sizes.values()))}; this transport is compressed on {h} x {w}"
-            )
+            (h, w), size = record.grid, next(iter(sizes.values()))
+            raise InputError(f"grid is {size}; this transport is compressed on {h} x {w}")
         facts, _ = _describe(target, record)  # refuses what could not be loaded again
     context.progress(f"writing {target}")
     formats.write(target, record)

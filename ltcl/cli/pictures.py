@@ -128,8 +128,7 @@ def panel(codes: np.ndarray, label: str) -> Any:
 
 def deviation(folder: Path, name: str, std: np.ndarray, factor: float) -> tuple[dict[str, str], Any]:
     """Files of standard deviations, which are amplified by a power of two to be seen; and their panel."""
-    times = 2 ** int(np.log2(max(exposure(std) / factor, 1.0)))
-    shown = panel(shades(std, factor * times), f"{name.split('/')[-1]}_std, {times} times as bright")
+    _, shown = _brightened(std, factor, f"{name.split('/')[-1]}_std")
     return write(folder, f"{name}_std", std, shown), shown
 
 
@@ -160,9 +159,10 @@ def write_first_bounces(place: Path, lights: Mapping[str, tuple[np.ndarray, tupl
 
 def amplified(components: Mapping[str, np.ndarray], factor: float) -> list[Any]:
     """Panels of what is too dark to be seen at this exposure, times powers of two that their labels name."""
-    panels = []
-    for name, picture in components.items():
-        times = 2 ** int(np.log2(max(exposure(picture) / factor, 1.0)))
-        if times * _DIM >= 1:
-            panels.append(panel(shades(picture, factor * times), f"{name}, {times} times as bright"))
-    return panels
+    panels = (_brightened(picture, factor, name) for name, picture in components.items())
+    return [shown for times, shown in panels if times * _DIM >= 1]
+
+
+def _brightened(picture: np.ndarray, factor: float, name: str) -> tuple[int, Any]:
+    times = 2 ** int(np.log2(max(exposure(picture) / factor, 1.0)))
+    return times, panel(shades(picture, factor * times), f"{name}, {times} times as bright")

@@ -41,34 +41,29 @@ def separate(
         for name in context.progress.each(list(images)):
             callback = transports.callback(context, T, settings, bounces + 1)
             result = separate(T, images[name], bounces, callback=callback, **settings)
+            solved = ["direct", *(f"bounce_{k}" for k in range(1, len(result.bounces) + 1))]
             light = {"direct": result.direct, "indirect": result.indirect}
-            light |= {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)} | {
-                "rest": result.rest
-            }
-            solutions, deviations = iter(result.solutions), []
-            known = [result.std.direct, *result.std.bounces] if noisy else []
-            known = dict(zip(["direct", *list(light)[2:-1]], known, strict=False))
-            panels, facts = [pictures.panel(pictures.shades(images[name], factor), name)], []
+            light |= dict(zip(solved[1:], result.bounces, strict=True)) | {"rest": result.rest}
+            solutions = dict(zip(solved, result.solutions, strict=True))
+            std = dict(zip(solved, [result.std.direct, *result.std.bounces], strict=True)) if noisy else {}
+            deviations, panels, facts = [], [pictures.panel(pictures.shades(images[name], factor), name)], []
             for component, picture_of in light.items():
                 panels.append(pictures.panel(pictures.shades(picture_of, factor), component))
                 place = f"{name}/{component}" if len(images) > 1 else component
                 written = pictures.write(folder, place, picture_of, panels[-1])
-                solves = [] if component in ("indirect", "rest") else report.solution(next(solutions))
-                share = _share(picture_of, images[name])
-                facts.append(
-                    {"part": component, **written, "share": share, "lowest": float(picture_of.min())}
-                )
+                solves = report.solution(solutions[component]) if component in solutions else []
+                share, lowest = _share(picture_of, images[name]), float(picture_of.min())
+                facts.append({"part": component, **written, "share": share, "lowest": lowest})
                 facts[-1]["channels"] = solves
-                if component in known:
-                    facts[-1]["std"], shown = pictures.deviation(folder, place, known[component], factor)
+                if component in std:
+                    facts[-1]["std"], shown = pictures.deviation(folder, place, std[component], factor)
                     deviations.append(shown)
                 errors += [solve["error"] for solve in solves if solve["error"] is not None]
                 residual = max((each["residual"] for each in solves if each["error"] is None), default=None)
                 products = sum(each["products"] for each in solves) or None
                 rows.append((files[name].name, component, percent(share, 4), products, residual))
-            entries.append(
-                {"file": str(files[name]), "transport_error": result.transport_error, "parts": facts}
-            )
+            entry = {"file": str(files[name]), "transport_error": result.transport_error}
+            entries.append(entry | {"parts": facts})
             sheet += [panels[:3], panels[3:], pictures.amplified(light, factor), deviations]
         pictures.contact_sheet([row for row in sheet if row]).save(folder / "separate.png")
     lines: list[Any] = [table(("picture", "part", "share of light", "products", "residual"), rows)]

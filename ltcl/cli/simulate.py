@@ -114,9 +114,8 @@ def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
     if is_rendered:
         rig |= {"kind": "mitsuba", "projector_grid": asked["grid"] or _GRID}
         rig |= {"scene": source if is_named else str(Path(source).resolve())}
-        return rig | (
-            {"channels": len(albedo), "albedo": albedo[0] if is_grey else albedo} if is_named else {}
-        )
+        paint = {"channels": len(albedo), "albedo": albedo[0] if is_grey else albedo}
+        return rig | (paint if is_named else {})
     if is_named:
         walls = albedo[0] if is_grey else np.array([albedo])
         sides = {"sides": 5} if scene == "box" else {}

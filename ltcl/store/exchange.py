@@ -67,8 +67,7 @@ def write_mtx(path: Path, record: Record) -> None:
         raise InputError("T has three channels, and a .mtx holds one matrix; save it as .npz")
     sizes = (("ltcl grid", record.grid), (", camera grid", record.camera_grid))
     comment = "".join(f"{name} {size[0]} x {size[1]}" for name, size in sizes if size)
-    with path.open("wb") as file:  # by name, SciPy would append .mtx to .MTX
-        scipy.io.mmwrite(file, record.matrices[0], comment=comment, symmetry="general")
+    scipy.io.mmwrite(path, record.matrices[0], comment=comment, symmetry="general")
 
 
 def write_mat(path: Path, record: Record) -> None:
@@ -81,8 +80,7 @@ def write_mat(path: Path, record: Record) -> None:
     variables |= zip(_OF_MATLAB[:1] if len(stacked) == 1 else _OF_MATLAB[1], stacked, strict=True)
     if max(16 * T.nnz if hasattr(T, "nnz") else T.nbytes for T in stacked) >= 1 << 32:
         raise FileError("a variable of .mat has less than 4 GiB; save it as .h5")
-    with path.open("wb") as file:
-        scipy.io.savemat(file, variables)
+    scipy.io.savemat(path, variables)
 
 
 def read_mat(path: Path, variable: str | None = None) -> Record:
@@ -146,8 +144,10 @@ def _record(members: dict[str, Any], variable: str | None, *names: Any) -> Recor
             shapes[name] = getattr(data, "shape", (1, 1) if f"{name}/data" in members else ()) or ()
 
     def load(name: str) -> Any:
-        if not hasattr(members[name], "dtype"):
-            return _sparse(members, name)
+        if not hasattr(members[name], "dtype"):  # a group of one sparse matrix
+            data, ir, jc = (_numbers(members[f"{name}/{array}"]) for array in ("data", "ir", "jc"))
+            size = checks.grid(f"shape of {name!r}", (members[name].attrs["MATLAB_sparse"], len(jc) - 1))
+            return sparse(lambda: scipy.sparse.csc_array((data, ir, jc), shape=size), size, data.size)
         array = _numbers(members[name])
         if names and name == "first_bounce":  # a row or a column of one channel
             return array.ravel() if 1 in array.shape else array
@@ -174,14 +174,6 @@ def _open(path: Path, mode: str) -> Any:
     except ImportError:
         raise FileError(f"{path.suffix} files need h5py; pip install 'ltcl[hdf5]'") from None
     return h5py.File(path, mode)
-
-
-def _sparse(members: dict[str, Any], name: str) -> Any:
-    """A group of one sparse matrix."""
-    data, ir, jc = (_numbers(members[f"{name}/{array}"]) for array in ("data", "ir", "jc"))
-    shape = checks.grid(f"shape of {name!r}", (members[name].attrs["MATLAB_sparse"], len(jc) - 1))
-    make = functools.partial(scipy.sparse.csc_array, (data, ir, jc), shape=shape)
-    return sparse(make, shape, data.size)
 
 
 def _numbers(data: Any) -> np.ndarray:

@@ -258,8 +258,7 @@ def _write_npz(path: Path, content: Record | Parts) -> None:
         header = {"format": RGB if ends[1:] else np.array(b"csr"), "_is_array": True, "shape": content.shape}
         csr = zip(ends, content.matrices, strict=True)
         arrays = content.arrays() | header | {n + end: getattr(T, n) for end, T in csr for n in CSR}
-    with path.open("wb") as file:
-        np.savez(file, **arrays)
+    np.savez(path, **arrays)
 
 
 def _read_npy(path: Path) -> Record:
@@ -271,16 +270,14 @@ def _read_npy(path: Path) -> Record:
 def _write_npy(path: Path, content: Record) -> None:
     if not content.dense:
         raise InputError("T is sparse, and .npy holds dense arrays only; save it as .npz")
-    with path.open("wb") as file:
-        np.save(file, content.arrays()["T"], allow_pickle=False)
+    np.save(path, content.arrays()["T"], allow_pickle=False)
 
 
 FORMATS: dict[str, tuple[Callable[..., Any], Callable[[Path, Any], None]]] = {
     ".npz": (_read_npz, _write_npz),
     ".npy": (_read_npy, _write_npy),
     ".mtx": (exchange.read_mtx, exchange.write_mtx),
-    ".h5": (exchange.read_hdf5, exchange.write_hdf5),
-    ".hdf5": (exchange.read_hdf5, exchange.write_hdf5),
+    **dict.fromkeys((".h5", ".hdf5"), (exchange.read_hdf5, exchange.write_hdf5)),
     ".mat": (exchange.read_mat, exchange.write_mat),
     ".zarr": (block_store.read, block_store.write),
 }
