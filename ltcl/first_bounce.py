@@ -29,6 +29,7 @@ _RTOL = 1e-5  # of the solves of an estimate: far below the scatter of any affor
 _TOGETHER = 32  # probes in one solve
 _ENTRIES = np.ndarray, scipy.sparse.csr_array
 _SIGMAS = 5.0  # standard deviations that noise does not exceed, even in a million pixels
+DARK = 1e-6  # of the median: 20 stops below it, beyond any camera; float32 has 3 bits left of such light
 _FAINT = 0.05  # times the median first bounce: noise is estimated only where some pixel is below
 
 
