@@ -32,6 +32,7 @@ the best other width is 0.05 to 0.6 times that of a wrong grid, and at least 0.9
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,17 +134,23 @@ def negative_bounce(S: IdentityPlus, grid: tuple[int, int]) -> float:
     >>> negative_bounce(dihedral(4).transport().interreflection, (4, 8)) < 1e-3
     True
     """
-    rows, columns = (np.arange(size) * min(_PARTS, size) // size for size in grid)
-    number = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
-    parts = (number[:, None] == np.arange(number[-1] + 1)).astype(np.float64)  # (N, parts), indicators e
     try:
-        bounced = parts - solve(S.as_it_stands(), parts, rtol=1e-3).x  # A e
+        between = between_parts(lambda parts: solve(S.as_it_stands(), parts, rtol=1e-3).x, grid, _PARTS)
     except ConvergenceError:
         return float("nan")
-    between = parts.T @ bounced
-    np.fill_diagonal(between, 0.0)
-    light = np.abs(between).sum()
-    return float(np.abs(between[between < 0.0]).sum() / light) if light > 0.0 else 0.0
+    light = np.nansum(np.abs(between))
+    return float(np.nansum(np.maximum(-between, 0.0)) / light) if light > 0.0 else 0.0
+
+
+def between_parts(inverse: Callable[..., Any], grid: tuple[int, int], side: int) -> np.ndarray:
+    """Mean light that parts of a picture, `side` x `side`, get from each other in one bounce; NaN within."""
+    rows, columns = (np.arange(size) * min(side, size) // size for size in grid)
+    number = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
+    parts = (number[:, None] == np.arange(number[-1] + 1)).astype(np.float64)  # (N, parts), indicators e
+    count = parts.sum(axis=0)
+    between = parts.T @ (parts - inverse(parts)) / (count[:, None] * count)  # e A e
+    np.fill_diagonal(between, np.nan)
+    return between
 
 
 def other_grid(T: Any, grid: tuple[int, int]) -> tuple[int, int] | None:
@@ -235,17 +242,12 @@ def check_energy(T: Any, F: np.ndarray, S: IdentityPlus) -> Energy:
 
 
 def _from_columns(T: Any, F: np.ndarray, lit: np.ndarray) -> float:
-    if hasattr(T, "between"):  # an Operator, or the rows of a store
-        try:
-            sums = T.rmatvec(np.ones(len(F)))
-        except InputError:  # of those that have no transpose
-            return float("nan")
-    elif isinstance(T, (np.ndarray, scipy.sparse.csr_array)):
-        sums = np.asarray(T.sum(axis=0, dtype=np.float64))
-    else:
+    try:
+        arrays = isinstance(T, (np.ndarray, scipy.sparse.csr_array))
+        sums = T.sum(axis=0, dtype=np.float64) if arrays else T.rmatvec(np.ones(len(F)))
+    except (InputError, NotImplementedError):  # of those that have no transpose
         return float("nan")
-    sums = sums[lit] / F[lit] - 1.0
-    largest = max(float(sums.max()), 0.0)
+    largest = max(float(np.max(sums[lit] / F[lit])) - 1.0, 0.0)
     return largest / (1.0 + largest)
 
 
