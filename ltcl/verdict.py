@@ -48,9 +48,9 @@ _DAMAGES: dict[str, tuple[float, float, float, str, str]] = {
     "outliers": (0, 0.02, 0, "outliers{where} change pictures by {p}", "measure these pixels again"),
     "bounce_highest": (1, 1, 1, "pixels return {p} of their light", "check black level and exposures"),
     "irreciprocal": (0.1, 9, 0.1, "T is not reciprocal to {p}, as of gloss", "bounces are approximate"),
-    "negative_bounce": (0.005, 9, 0.005, "{p} of a bounce is negative, as of gloss", "bounces are rough"),
     "pictures": (0.02, 0.02, 9, "pictures are uncertain to {p} because of noise{where}", "{more}"),
     "bounces": (0.05, 9, 0.05, "{which} uncertain to {p} because of noise{where}", "{more}"),
+    "negative_bounce": (0.005, 9, 0.005, "{p} of a bounce is negative, as of gloss", "bounces are rough"),
     "no_bounces": (0, 9, 0, "bounces need one grid for camera and projector", "acquire T so"),
     "dark": (0, 0.05, 0.05, "{p} of projector pixels{where} stay unlit, too dark", "expose them longer"),
 }
