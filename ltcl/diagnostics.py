@@ -153,6 +153,13 @@ def between_parts(inverse: Callable[..., Any], grid: tuple[int, int], side: int)
     return between
 
 
+def ambient(inverse: Callable[..., Any], grid: tuple[int, int]) -> float:
+    """Least light of `between_parts` over its mean: no flat wall lights itself, but ambient light does."""
+    between = between_parts(inverse, grid, 2 * _PARTS)
+    least = max(float(np.median(np.nanmin(between, axis=1))), 0.0)
+    return least / max(float(np.nanmean(np.abs(between))), 1e-300)
+
+
 def other_grid(T: Any, grid: tuple[int, int]) -> tuple[int, int] | None:
     """A grid of as many pixels that fits T (array or csr_array) clearly better; None where none is known.
 
@@ -192,6 +199,36 @@ def other_grid(T: Any, grid: tuple[int, int]) -> tuple[int, int] | None:
     widths = {below(w): w for w in range(2, n) if n % w == 0 and w != grid[1]}
     likely = (w for d, w in sorted(widths.items()) if d < _ALIKE * own and jump(w) > _JUMP)
     return next(((n // w, w) for w in likely), None)
+
+
+def exchanged_colours(T: Any) -> list[str]:
+    """Colours of a Transport that look exchanged: by mixing, by blocks between them, or by the first bounce."""
+    order = np.arange(3)
+    if T.mixing is not None:
+        order = np.argmax(np.abs(T.mixing), axis=1)
+    elif T.blocks is not None:
+        order = np.argmax([[(b @ np.ones(T.shape[1])).sum() for b in row] for row in T.blocks], axis=1)
+    elif T.is_square and T.channels == 3 and hasattr(T.matrices[0], "diagonal"):
+        diagonal = np.array([matrix.diagonal() for matrix in T.matrices], np.float64)
+        lit = ~T.masked & (diagonal > 0).all(axis=0)
+        away = np.median(np.abs(np.log(T.first_bounce[:, None, lit] / diagonal[:, lit])), axis=2)
+        order = np.where(away.min(axis=1) < 0.5 * away.diagonal(), away.argmin(axis=1), order)
+    names = ("red", "green", "blue")
+    return [f"{names[d]} for {names[c]}" for c, d in enumerate(order) if c != d]
+
+
+def outliers(rows: np.ndarray, pixels: np.ndarray, least: np.ndarray, width: int) -> tuple[np.ndarray, float]:
+    """Pixels and light (2-norm) of entries above `least` that are 5 times as bright as all neighbours.
+
+    `rows` (n, N) of T are of the camera's `pixels`, ascending, on a grid of this width. Neighbours are those
+    of the projector's pixel, those of the camera's, and the light the other way.
+    """
+    (n, N), (i, j) = rows.shape, np.nonzero(rows > least)
+    near = [rows[i, np.clip(j + x, 0, N - 1)] for x in (1, -1, width, -width)]
+    others = (i - 1, j), (i + 1, j), (np.searchsorted(pixels, j), pixels[i])
+    near += [rows[np.clip(y, 0, n - 1), x] for y, x in others]
+    lone = rows[i, j] > 5.0 * np.max(near, axis=0)
+    return pixels[i[lone]], float(np.linalg.norm(rows[i, j][lone]))
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a measured T is good for, why not for more, and what to do: two sentences that follow from numbers.
 
-Errors by noise are those of `ltcl.uncertainty`; S^-1 acts in block Krylov spaces, on the host.
-Damages are numbers with limits. No flat wall lights itself in one bounce, so that the least light that
-A = I - S^-1 (eq. 4) brings from part to part of a picture is 0; what is more is ambient light left in T.
-
-T alone cannot tell, since another scene has the same T: a gain of entries, camera pixels or colours; light
-that changes slowly during a scan (`sum_deviation` does); saturation without noise; three channels exchanged
-as a whole; light of one colour in another without `mixing` or blocks; little ambient light, or any where
-gloss has bounces below 0.
+Errors by noise are those of `ltcl.uncertainty`; S^-1 acts in block Krylov spaces on the host, without device.
+Damages are numbers with limits. T alone cannot tell, since another scene has the same T: a gain of entries,
+camera pixels or colours; light that changes slowly during a scan (`sum_deviation` does); saturation without
+noise; three channels exchanged as a whole; light of one colour in another without `mixing` or blocks; little
+ambient light, or any where gloss has bounces below 0.
 """
 
 from __future__ import annotations
@@ -28,7 +25,7 @@ from ltcl.transport import Transport, require
 
 _STEPS, _AT_ONCE = 8, 8  # of a solve; right-hand sides
 _ENTRIES, _LEAST = 1 << 24, 64  # to read of a channel; pixels: fewer have no parts
-_PARTS, _LIT_PARTS = 6, 8  # of a row of the grid, as noise averages out; of a side, that light each other
+_PARTS = 6  # of a row of the grid, over which noise averages out
 _NORMAL, _MARGIN = 0.6745, 1.5  # median of |normal values| in standard deviations; of an estimated noise
 
 Number = tuple[str, float, str]  # its name, its value, and where in the picture
@@ -95,8 +92,7 @@ def verdict(T: Transport, **known: float) -> Verdict:
         if name not in numbers or (value < numbers[name]) == (name == "gain"):
             numbers[name], places[name] = float(value), where
     bad = [k for k in (1, 2, 3) if numbers.get(f"bounce_{k}", 0.0) > _DAMAGES["bounces"][0]]
-    which = " and ".join(map(str, bad)).replace("1 and 2 and 3", "1 to 3")
-    which = f"bounces {which}" if bad[1:] else f"bounce {which}"
+    which = f"bounce{'s' * (len(bad) > 1)} {' and '.join(map(str, bad)).replace('1 and 2 and 3', '1 to 3')}"
     causes, spoilt = dict[str, tuple[bool, bool, str]](), set[str]()
     for name, (most, *limits, text, advice) in _DAMAGES.items():
         hidden = spoilt if name in _SURFACES else spoilt & _GEOMETRY
@@ -126,35 +122,20 @@ def _round(value: float) -> str:
 
 def _numbers(T: Any) -> Iterator[Number]:
     """Of the whole T, and of each channel."""
-    yield from _structure(T)
+    yield "no_bounces", not T.is_square, ""
+    if T.is_square and (other := diagnostics.other_grid(T.matrices[0], T.grid)):
+        yield "other_grid", 1.0, "{}x{}".format(*other)
+    exchanged = diagnostics.exchanged_colours(T)
+    yield "exchanged", len(exchanged), ", ".join(exchanged)
     for c, matrix in enumerate(T.matrices):
         yield from _pictures(T, c)
         if T.is_square and len(T.masked) >= _LEAST and isinstance(matrix, ENTRIES):
-            yield from (_ambient(T, c), _flicker(T, c))
+            yield "ambient", diagnostics.ambient(T.systems[c].solve, T.grid), ""
+            yield _flicker(T, c)
             yield from _entries(T, c)
     if T.is_square:
         yield from _bounces(T)
         yield "dark", T.masked.mean(), _place(T.grid, np.flatnonzero(T.masked))
-
-
-def _structure(T: Transport) -> Iterator[Number]:
-    """Grids; and colours by mixing, by blocks between them, or by the first bounce."""
-    yield "no_bounces", not T.is_square, ""
-    order = np.arange(3)
-    if T.is_square and (other := diagnostics.other_grid(T.matrices[0], T.grid)):
-        yield "other_grid", 1.0, "{}x{}".format(*other)
-    if T.mixing is not None:
-        order = np.argmax(np.abs(T.mixing), axis=1)
-    elif T.blocks is not None:
-        order = np.argmax([[(b @ np.ones(T.shape[1])).sum() for b in row] for row in T.blocks], axis=1)
-    elif T.is_square and T.channels == 3 and hasattr(T.matrices[0], "diagonal"):
-        diagonal = np.array([matrix.diagonal() for matrix in T.matrices], np.float64)
-        lit = ~T.masked & (diagonal > 0).all(axis=0)
-        away = np.median(np.abs(np.log(T.first_bounce[:, None, lit] / diagonal[:, lit])), axis=2)
-        order = np.where(away.min(axis=1) < 0.5 * away.diagonal(), away.argmin(axis=1), order)
-    names = ("red", "green", "blue")
-    exchanged = [f"{names[d]} for {names[c]}" for c, d in enumerate(order) if c != d]
-    yield "exchanged", len(exchanged), ", ".join(exchanged)
 
 
 class _System(NamedTuple):
@@ -234,13 +215,6 @@ def _bounces(T: Any) -> Iterator[Number]:
             yield from (_error(T, c, name, b[k][c], deviation[:, 0]) for name in (f"bounce_{k}", "bounces"))
 
 
-def _ambient(T: Any, c: int) -> Number:
-    """The least light between parts, over its mean."""
-    between = diagnostics.between_parts(T.systems[c].solve, T.grid, _LIT_PARTS)
-    least = max(float(np.median(np.nanmin(between, axis=1))), 0.0)
-    return "ambient", least / max(float(np.nanmean(np.abs(between))), 1e-300), ""
-
-
 def _flicker(T: Any, c: int) -> Number:
     """What differs from column to column in light that is smooth on surfaces, beyond noise."""
     S = T.systems[c]
@@ -282,21 +256,11 @@ def _entries(T: Any, c: int) -> Iterator[Number]:
     spread = np.sqrt(np.add.reduceat(floor**2, groups) * len(wide) / N) / high
     below = -float(np.quantile(blocks + 5.0 * spread[:, None], 0.02))
     yield "offset", max(below, 0.0) / max(float(np.abs(blocks).mean()), 1e-300), ""
-    yield _outliers(T, c, pick, rows, np.where(hot, np.inf, floor))
+    least = np.maximum(np.where((F := T.systems[c].F) > 0, 0.1 * F, np.inf), 10.0 * floor[:, None])
+    least[hot] = np.inf
+    lone, light = diagnostics.outliers(rows, pick, least.astype(rows.dtype), w)
+    yield "outliers", light / max(float(np.linalg.norm(F[pick])), 1e-300), _place(T.grid, lone)
     yield _irreciprocal(T, c, pick, rows)
-
-
-def _outliers(T: Any, c: int, pick: np.ndarray, rows: np.ndarray, floor: np.ndarray) -> Number:
-    """Bright entries that no neighbour shows: of the pixel, of the column, or of light the other way."""
-    F, last, w = T.systems[c].F, len(pick) - 1, T.grid[1]
-    least = np.where(F > 0, 0.1 * F, np.inf).astype(rows.dtype)
-    i, j = np.nonzero((rows > least) & (rows > 10.0 * floor[:, None]))
-    near = [rows[i, np.clip(j + x, 0, len(F) - 1)] for x in (1, -1, w, -w)]
-    back = np.searchsorted(pick, j)
-    near += [rows[np.clip(y, 0, last), x] for y, x in ((i - 1, j), (i + 1, j), (back, pick[i]))]
-    lone = rows[i, j] > 5.0 * np.max(near, axis=0)
-    share = np.linalg.norm(rows[i, j][lone]) / max(float(np.linalg.norm(F[pick])), 1e-300)
-    return "outliers", float(share), _place(T.grid, pick[i[lone]])
 
 
 def _irreciprocal(T: Any, c: int, pick: np.ndarray, rows: np.ndarray) -> Number:
