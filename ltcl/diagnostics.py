@@ -202,7 +202,7 @@ def other_grid(T: Any, grid: tuple[int, int]) -> tuple[int, int] | None:
 
 
 def exchanged_colours(T: Any) -> list[str]:
-    """Colours of a Transport that look exchanged: by mixing, by blocks between them, or by the first bounce."""
+    """Colours of a Transport that look exchanged, by mixing, blocks between them, or by the first bounce."""
     order = np.arange(3)
     if T.mixing is not None:
         order = np.argmax(np.abs(T.mixing), axis=1)
@@ -279,10 +279,11 @@ def check_energy(T: Any, F: np.ndarray, S: IdentityPlus) -> Energy:
 
 
 def _from_columns(T: Any, F: np.ndarray, lit: np.ndarray) -> float:
+    if not (arrays := isinstance(T, (np.ndarray, scipy.sparse.csr_array))) and not hasattr(T, "between"):
+        return float("nan")
     try:
-        arrays = isinstance(T, (np.ndarray, scipy.sparse.csr_array))
         sums = T.sum(axis=0, dtype=np.float64) if arrays else T.rmatvec(np.ones(len(F)))
-    except (InputError, NotImplementedError):  # of those that have no transpose
+    except InputError:  # of those that have no transpose
         return float("nan")
     largest = max(float(np.max(sums[lit] / F[lit])) - 1.0, 0.0)
     return largest / (1.0 + largest)
