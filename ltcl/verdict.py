@@ -217,12 +217,12 @@ def _bounces(T: Any) -> Iterator[Number]:
 
 def _flicker(T: Any, c: int) -> Number:
     """What differs from column to column in light that is smooth on surfaces, beyond noise."""
-    S = T.systems[c]
-    white = S.T @ (ones := np.ones(len(S.F), np.float32))
+    S, ones = T.systems[c], np.ones(T.shape[1])
     deviation, own = _deviation(T, c, ones), T.noise.diagonal(T.first_bounce)[c]
-    indirect = np.maximum(white - S.T.diagonal(), 1e-300)
-    logs = np.log(np.where(S.F > 0, indirect * S.inverse, 1.0)).reshape(T.grid)
-    detail = np.diff(np.diff(logs, axis=0), axis=1) / 2.0 if min(T.grid) > 1 else np.zeros(1)
+    indirect = np.maximum(S.T @ ones - S.T.diagonal(), 1e-300)
+    logs = np.log(np.where(S.F > 0, indirect * S.inverse, np.nan)).reshape(T.grid)
+    detail = np.diff(np.diff(logs, axis=0), axis=1) / 2.0
+    detail = detail[np.isfinite(detail)] if np.isfinite(detail).any() else np.zeros(1)
     doubt = _MARGIN * float(np.median(np.hypot(deviation / indirect, own * (S.inverse + 1.0 / indirect))))
     change = float(np.median(np.abs(detail))) / _NORMAL
     return "flicker", math.sqrt(max(change**2 - doubt**2, 0.0)) if doubt < 0.3 else 0.0, ""
@@ -257,7 +257,7 @@ def _entries(T: Any, c: int) -> Iterator[Number]:
     below = -float(np.quantile(blocks + 5.0 * spread[:, None], 0.02))
     yield "offset", max(below, 0.0) / max(float(np.abs(blocks).mean()), 1e-300), ""
     least = np.maximum(np.where((F := T.systems[c].F) > 0, 0.1 * F, np.inf), 10.0 * floor[:, None])
-    least[hot] = np.inf
+    least[hot | T.masked[pick]] = np.inf
     lone, light = diagnostics.outliers(rows, pick, least.astype(rows.dtype), w)
     yield "outliers", light / max(float(np.linalg.norm(F[pick])), 1e-300), _place(T.grid, lone)
     yield _irreciprocal(T, c, pick, rows)

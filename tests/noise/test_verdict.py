@@ -71,6 +71,7 @@ DAMAGES: list[tuple[str, Callable[..., Any], str, str, str]] = [
     ("photons", noisy(LEVEL, 1e5), f"pictures.*{NOISE}", "b?", "pictures"),
     ("noise in a dark wall", dark_wall, f"{NOISE} in the dark right part: .*{EXPOSURES}", "", "pictures"),
     ("dark pixels, zero column", dark_pixels, "lower left part stay unlit", "cb", "dark"),
+    ("dark columns", lambda A, grid: A * (np.arange(len(A)) % 7 != 3), "14 % of projector", "", "dark"),
     ("wrong grid", lambda A, grid: A, "grid.*--grid", "", "other_grid"),
     ("ambient light of 1 %", lambda A, grid: A + 0.01 * A.sum(axis=1).mean(), "subtract", "", "ambient"),
     ("ambient light of 10 %", lambda A, grid: A + 0.1 * A.sum(axis=1).mean(), "subtract", "", "ambient"),
