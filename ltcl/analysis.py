@@ -112,17 +112,9 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     systems = zip(T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True)
     channels = tuple(_channel(*system, rtol) for system in systems)
-    bounce = {"negative_bounce": max(T.negative_bounces)}
-    bounce["bounce_highest"] = max(channel.energy.bounce_highest for channel in channels)
-    return Analysis(
-        shape=T.shape,
-        grid=T.grid,
-        rtol=rtol,
-        nbytes=T.nbytes,
-        masked=int(T.masked.sum()),
-        channels=channels,
-        verdict=verdict(T, **bounce),
-    )
+    highest = max(channel.energy.bounce_highest for channel in channels)
+    judged = verdict(T, negative_bounce=max(T.negative_bounces), bounce_highest=highest)
+    return Analysis(T.shape, T.grid, rtol, T.nbytes, int(T.masked.sum()), channels, judged)
 
 
 def _channel(T: Any, F: np.ndarray, S: IdentityPlus, negative: float, rtol: float) -> ChannelAnalysis:

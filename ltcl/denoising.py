@@ -104,7 +104,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     noise = dataclasses.replace(noise, photons=noise.photons * left, floor=noise.floor * np.sqrt(left))
     settings = {"device": T._requested_device, "mixing": T.mixing, "noise": noise}
     first = T.first_bounce if T.is_square else "diagonal"
-    result = Transport(matrices, T.grid, first, T.camera_grid, on_dark="mask", **settings)
+    result = Transport(matrices, T.grid, first, T.camera_grid, dark=0.0, **settings)
     result.first_bounce_error = T.first_bounce_error
     return result
 

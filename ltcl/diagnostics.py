@@ -32,6 +32,7 @@ the best other width is 0.05 to 0.6 times that of a wrong grid, and at least 0.9
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,17 +134,30 @@ def negative_bounce(S: IdentityPlus, grid: tuple[int, int]) -> float:
     >>> negative_bounce(dihedral(4).transport().interreflection, (4, 8)) < 1e-3
     True
     """
-    rows, columns = (np.arange(size) * min(_PARTS, size) // size for size in grid)
-    number = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
-    parts = (number[:, None] == np.arange(number[-1] + 1)).astype(np.float64)  # (N, parts), indicators e
     try:
-        bounced = parts - solve(S.as_it_stands(), parts, rtol=1e-3).x  # A e
+        between = between_parts(lambda parts: solve(S.as_it_stands(), parts, rtol=1e-3).x, grid, _PARTS)
     except ConvergenceError:
         return float("nan")
-    between = parts.T @ bounced
-    np.fill_diagonal(between, 0.0)
-    light = np.abs(between).sum()
-    return float(np.abs(between[between < 0.0]).sum() / light) if light > 0.0 else 0.0
+    light = np.nansum(np.abs(between))
+    return float(np.nansum(np.maximum(-between, 0.0)) / light) if light > 0.0 else 0.0
+
+
+def between_parts(inverse: Callable[..., Any], grid: tuple[int, int], side: int) -> np.ndarray:
+    """Mean light that parts of a picture, `side` x `side`, get from each other in one bounce; NaN within."""
+    rows, columns = (np.arange(size) * min(side, size) // size for size in grid)
+    number = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
+    parts = (number[:, None] == np.arange(number[-1] + 1)).astype(np.float64)  # (N, parts), indicators e
+    count = parts.sum(axis=0)
+    between = parts.T @ (parts - inverse(parts)) / (count[:, None] * count)  # e A e
+    np.fill_diagonal(between, np.nan)
+    return between
+
+
+def ambient(inverse: Callable[..., Any], grid: tuple[int, int]) -> float:
+    """Least light of `between_parts` over its mean: no flat wall lights itself, but ambient light does."""
+    between = between_parts(inverse, grid, 2 * _PARTS)
+    least = max(float(np.median(np.nanmin(between, axis=1))), 0.0)
+    return least / max(float(np.nanmean(np.abs(between))), 1e-300)
 
 
 def other_grid(T: Any, grid: tuple[int, int]) -> tuple[int, int] | None:
@@ -185,6 +199,36 @@ def other_grid(T: Any, grid: tuple[int, int]) -> tuple[int, int] | None:
     widths = {below(w): w for w in range(2, n) if n % w == 0 and w != grid[1]}
     likely = (w for d, w in sorted(widths.items()) if d < _ALIKE * own and jump(w) > _JUMP)
     return next(((n // w, w) for w in likely), None)
+
+
+def exchanged_colours(T: Any) -> list[str]:
+    """Colours of a Transport that look exchanged, by mixing, blocks between them, or by the first bounce."""
+    order = np.arange(3)
+    if T.mixing is not None:
+        order = np.argmax(np.abs(T.mixing), axis=1)
+    elif T.blocks is not None:
+        order = np.argmax([[(b @ np.ones(T.shape[1])).sum() for b in row] for row in T.blocks], axis=1)
+    elif T.is_square and T.channels == 3 and hasattr(T.matrices[0], "diagonal"):
+        diagonal = np.array([matrix.diagonal() for matrix in T.matrices], np.float64)
+        lit = ~T.masked & (diagonal > 0).all(axis=0)
+        away = np.median(np.abs(np.log(T.first_bounce[:, None, lit] / diagonal[:, lit])), axis=2)
+        order = np.where(away.min(axis=1) < 0.5 * away.diagonal(), away.argmin(axis=1), order)
+    names = ("red", "green", "blue")
+    return [f"{names[d]} for {names[c]}" for c, d in enumerate(order) if c != d]
+
+
+def outliers(rows: np.ndarray, pixels: np.ndarray, least: np.ndarray, width: int) -> tuple[np.ndarray, float]:
+    """Pixels and light (2-norm) of entries above `least` that are 5 times as bright as all neighbours.
+
+    `rows` (n, N) of T are of the camera's `pixels`, ascending, on a grid of this width. Neighbours are those
+    of the projector's pixel, those of the camera's, and the light the other way.
+    """
+    (n, N), (i, j) = rows.shape, np.nonzero(rows > least)
+    near = [rows[i, np.clip(j + x, 0, N - 1)] for x in (1, -1, width, -width)]
+    others = (i - 1, j), (i + 1, j), (np.searchsorted(pixels, j), pixels[i])
+    near += [rows[np.clip(y, 0, n - 1), x] for y, x in others]
+    lone = rows[i, j] > 5.0 * np.max(near, axis=0)
+    return pixels[i[lone]], float(np.linalg.norm(rows[i, j][lone]))
 
 
 @dataclass(frozen=True)
@@ -235,17 +279,13 @@ def check_energy(T: Any, F: np.ndarray, S: IdentityPlus) -> Energy:
 
 
 def _from_columns(T: Any, F: np.ndarray, lit: np.ndarray) -> float:
-    if hasattr(T, "between"):  # an Operator, or the rows of a store
-        try:
-            sums = T.rmatvec(np.ones(len(F)))
-        except InputError:  # of those that have no transpose
-            return float("nan")
-    elif isinstance(T, (np.ndarray, scipy.sparse.csr_array)):
-        sums = np.asarray(T.sum(axis=0, dtype=np.float64))
-    else:
+    if not (arrays := isinstance(T, (np.ndarray, scipy.sparse.csr_array))) and not hasattr(T, "between"):
         return float("nan")
-    sums = sums[lit] / F[lit] - 1.0
-    largest = max(float(sums.max()), 0.0)
+    try:
+        sums = T.sum(axis=0, dtype=np.float64) if arrays else T.rmatvec(np.ones(len(F)))
+    except InputError:  # of those that have no transpose
+        return float("nan")
+    largest = max(float(np.max(sums[lit] / F[lit])) - 1.0, 0.0)
     return largest / (1.0 + largest)
 
 

@@ -27,8 +27,9 @@ logger = logging.getLogger(__name__)
 _BYTES = 3 * 8  # of a dense inverse, per entry: the matrix, its inverse and what LAPACK works with
 _RTOL = 1e-5  # of the solves of an estimate: far below the scatter of any affordable number of probes
 _TOGETHER = 32  # probes in one solve
-_ENTRIES = np.ndarray, scipy.sparse.csr_array
+ENTRIES = np.ndarray, scipy.sparse.csr_array
 _SIGMAS = 5.0  # standard deviations that noise does not exceed, even in a million pixels
+DARK = 1e-6  # of the median: 20 stops below it, beyond any camera; float32 has 3 bits left of such light
 _FAINT = 0.05  # times the median first bounce: noise is estimated only where some pixel is below
 
 
@@ -44,7 +45,7 @@ def find(
         F = checks.shape("first_bounce", F, (n,), (len(matrices), n))
         return np.broadcast_to(F, (len(matrices), n)), None
     checks.one_of("first_bounce", requested, ("diagonal", "exact", "estimate"))
-    if requested == "exact" and (bare := [type(T).__name__ for T in matrices if not isinstance(T, _ENTRIES)]):
+    if requested == "exact" and (bare := [type(T).__name__ for T in matrices if not isinstance(T, ENTRIES)]):
         raise InputTypeError(f"first_bounce is 'exact', but a {bare[0]} has no entries; give 'estimate' or F")
     F = np.stack([_diagonal(T) for T in matrices])
     if requested == "diagonal":
@@ -117,7 +118,7 @@ def dark(matrices: Sequence[Any], share: float, noise: Any, known: bool, F: np.n
     What is not `known` but estimated counts up to the scatter of the pixel's column: dim light is not dark.
     """
     light, sigma = F, 0.0
-    if entries := all(isinstance(T, _ENTRIES) for T in matrices):
+    if entries := all(isinstance(T, ENTRIES) for T in matrices):
         light = np.minimum(F, [_diagonal(T) for T in matrices])
     median = np.array([[np.median(f[f > 0]) if np.any(f > 0) else 0.0] for f in light])
     least = np.maximum(1e-300, share * median)  # 0 is dark as well, whose inverse is no number

@@ -53,7 +53,7 @@ class Transport:
         Pixels whose first bounce is 0 or within 5 standard deviations of its noise, estimated if need be:
         leave them dark in compensations and warn of it, or refuse them. Relighting stays exact.
     dark : float
-        First bounces below that many times the median one are dark, too.
+        First bounces below that many times the median one are dark, too; 0 leaves them lit.
     mixing : (3, 3), optional
         Of the projector's colours: channel c of T answers to mixing[c] @ (red, green, blue) of the pattern.
     noise : Noise or Transport, optional
@@ -95,7 +95,7 @@ class Transport:
         device: Device | str | None = None,
         *,
         on_dark: str = "mask",
-        dark: float = 0.0,
+        dark: float = _first_bounce.DARK,
         mixing: Any = None,
         noise: Any = None,
         probes: int = 128,
@@ -389,7 +389,7 @@ def from_arrays(
     grid: Any = None,
     first_bounce: Any = None,
     on_dark: str = "mask",
-    dark: float = 0.0,
+    dark: float = _first_bounce.DARK,
     device: Device | str | None = None,
     noise: Any = None,
 ) -> Transport:

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a measured T is good for, why not for more, and what to do: two sentences that follow from numbers.
 
-A picture T p has errors E p, of variance sum_j v_ij p_j^2 by `T.noise`. Of bounces under white, b_0 = F 1 and
-b_k = A^k b_0, errors are E F^-1 (b_(k-1) - b_k) to first order, without the diagonal of E, as S^-1 hardly
-changes noise; A = I - S^-1 acts in a Krylov space. Within a factor of 2, of diffuse scenes, below 50 %.
-
-Damages are numbers with limits. Of flat walls the smallest indirect light between parts of the picture
-bounced twice or more, a share rho / (1 + rho) of it at most; what is more is ambient light. T alone cannot
-tell, since another scene has the same T: a gain of entries, camera pixels or colours; light that changes
-slowly during a scan (`sum_deviation` does); saturation without noise; three channels exchanged as a whole;
-light of one colour in another without `mixing` or blocks; little ambient light, or in a closed bright room.
+Errors by noise are those of `ltcl.uncertainty`; S^-1 acts in block Krylov spaces on the host, without device.
+Damages are numbers with limits. T alone cannot tell, since another scene has the same T: a gain of entries,
+camera pixels or colours; light that changes slowly during a scan (`sum_deviation` does); saturation without
+noise; three channels exchanged as a whole; light of one colour in another without `mixing` or blocks; little
+ambient light, or any where gloss has bounces below 0.
 """
 
 from __future__ import annotations
@@ -17,57 +13,41 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse
 
-from ltcl import diagnostics
+from ltcl import diagnostics, layout, uncertainty
 from ltcl.errors import InputError
+from ltcl.first_bounce import ENTRIES
 from ltcl.transport import Transport, require
 
-_STEPS, _ENTRIES = 7, 1 << 24  # of the Krylov space; to read of a channel
-_LEAST = 64  # pixels: fewer have no parts
+_STEPS, _AT_ONCE = 8, 8  # of a solve; right-hand sides
+_ENTRIES, _LEAST = 1 << 24, 64  # to read of a channel; pixels: fewer have no parts
 _PARTS = 6  # of a row of the grid, over which noise averages out
-_CLOSED = 0.75  # albedo of closed rooms at most
 _NORMAL, _MARGIN = 0.6745, 1.5  # median of |normal values| in standard deviations; of an estimated noise
+
+Number = tuple[str, float, str]  # its name, its value, and where in the picture
 
 # By importance: a number, beyond what it is named, spoils compensation, spoils bounces; cause, what to do.
 _DAMAGES: dict[str, tuple[float, float, float, str, str]] = {
     "other_grid": (0, 0, 0, "T fits a grid of {where} pixels better", "give --grid {where}"),
     "exchanged": (0, 0, 0, "colour channels look exchanged, {where}", "put them in one order"),
     "shifted": (0.2, 0.2, 0.2, "{p} of pixels are brightest {where} away", "align camera and projector"),
-    "hot_rows": (
-        0,
-        0,
-        0,
-        "{n} hot camera pixel(s){where} see the same in all patterns",
-        "mask or replace them",
-    ),
+    "hot_rows": (0, 0, 0, "{n} hot camera pixel(s){where} see all patterns alike", "mask or replace them"),
     "saturated": (2, 2, 2, "{n} entries of T{where} saturate at one value", "take shorter exposures, too"),
     "saturation": (0.01, 0.01, 0.01, "{p} of the camera saturates", "take shorter exposures, too"),
-    "sum_deviation": (
-        0.03,
-        0.03,
-        0.03,
-        "row sums deviate by {p} from white: drift",
-        "warm up, and scan again",
-    ),
-    "ambient": (0.05, 0.05, 0.05, "{p} of the indirect light is ambient light left in T", "subtract black"),
+    "sum_deviation": (0.03, 0.03, 0.03, "row sums deviate by {p} from white", "warm up, and scan again"),
+    "ambient": (0.05, 0.05, 0.05, "{p} of a bounce is ambient light left in T", "subtract black"),
     "offset": (0.02, 0.02, 0.02, "T has a negative offset, {p} of its mean light", "subtract less black"),
     "flicker": (0.02, 0.02, 0.02, "the light drifted by {p} from column to column", "scan again"),
     "outliers": (0, 0.02, 0, "outliers{where} change pictures by {p}", "measure these pixels again"),
     "bounce_highest": (1, 1, 1, "pixels return {p} of their light", "check black level and exposures"),
     "irreciprocal": (0.1, 9, 0.1, "T is not reciprocal to {p}, as of gloss", "bounces are approximate"),
-    "negative_bounce": (
-        0.005,
-        9,
-        0.005,
-        "{p} of a bounce is negative, as of gloss",
-        "bounces are approximate",
-    ),
     "pictures": (0.02, 0.02, 9, "pictures are uncertain to {p} because of noise{where}", "{more}"),
     "bounces": (0.05, 9, 0.05, "{which} uncertain to {p} because of noise{where}", "{more}"),
+    "negative_bounce": (0.005, 9, 0.005, "{p} of a bounce is negative, as of gloss", "bounces are rough"),
     "no_bounces": (0, 9, 0, "bounces need one grid for camera and projector", "acquire T so"),
     "dark": (0, 0.05, 0.05, "{p} of projector pixels{where} stay unlit, too dark", "expose them longer"),
 }
@@ -108,12 +88,11 @@ def verdict(T: Transport, **known: float) -> Verdict:
         require(T, square=False).noise  # noqa: B018 - which is not known where entries are not
     except InputError as error:
         return Verdict(f"Unknown: {error}.", numbers=numbers)
-    for name, value, where in [*_structure(T), *(n for c in range(T.channels) for n in _noise(T, c))]:
+    for name, value, where in _numbers(_on_host(T)):
         if name not in numbers or (value < numbers[name]) == (name == "gain"):
             numbers[name], places[name] = float(value), where
     bad = [k for k in (1, 2, 3) if numbers.get(f"bounce_{k}", 0.0) > _DAMAGES["bounces"][0]]
-    which = " and ".join(map(str, bad)).replace("1 and 2 and 3", "1 to 3")
-    which = f"bounces {which}" if bad[1:] else f"bounce {which}"
+    which = f"bounce{'s' * (len(bad) > 1)} {' and '.join(map(str, bad)).replace('1 and 2 and 3', '1 to 3')}"
     causes, spoilt = dict[str, tuple[bool, bool, str]](), set[str]()
     for name, (most, *limits, text, advice) in _DAMAGES.items():
         hidden = spoilt if name in _SURFACES else spoilt & _GEOMETRY
@@ -141,99 +120,119 @@ def _round(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def _structure(T: Transport) -> Iterator[tuple[str, float, str]]:
-    """Grids; and colours by mixing, by blocks between them, or by the first bounce."""
+def _numbers(T: Any) -> Iterator[Number]:
+    """Of the whole T, and of each channel."""
     yield "no_bounces", not T.is_square, ""
-    order = np.arange(3)
     if T.is_square and (other := diagnostics.other_grid(T.matrices[0], T.grid)):
         yield "other_grid", 1.0, "{}x{}".format(*other)
-    if T.mixing is not None:
-        order = np.argmax(np.abs(T.mixing), axis=1)
-    elif T.blocks is not None:
-        order = np.argmax([[(b @ np.ones(T.shape[1])).sum() for b in row] for row in T.blocks], axis=1)
-    elif T.is_square and T.channels == 3 and hasattr(T.matrices[0], "diagonal"):
-        diagonal = np.array([matrix.diagonal() for matrix in T.matrices], np.float64)
-        lit = ~T.masked & (diagonal > 0).all(axis=0)
-        away = np.median(np.abs(np.log(T.first_bounce[:, None, lit] / diagonal[:, lit])), axis=2)
-        order = np.where(away.min(axis=1) < 0.5 * away.diagonal(), away.argmin(axis=1), order)
-    names = ("red", "green", "blue")
-    exchanged = [f"{names[d]} for {names[c]}" for c, d in enumerate(order) if c != d]
+    exchanged = diagnostics.exchanged_colours(T)
     yield "exchanged", len(exchanged), ", ".join(exchanged)
+    for c, matrix in enumerate(T.matrices):
+        yield from _pictures(T, c)
+        if T.is_square and len(T.masked) >= _LEAST and isinstance(matrix, ENTRIES):
+            yield "ambient", diagnostics.ambient(T.systems[c].solve, T.grid), ""
+            yield _flicker(T, c)
+            yield from _entries(T, c)
+    if T.is_square:
+        yield from _bounces(T)
+        yield "dark", T.masked.mean(), _place(T.grid, np.flatnonzero(T.masked))
 
 
-def _noise(T: Transport, c: int) -> Iterator[tuple[str, float, str]]:
-    """Errors by noise of a channel, and where they are largest; then what its entries show."""
-    noise, matrix = T.noise, T.matrices[c]
-    matrix = matrix.tocsr() if hasattr(matrix, "row_blocks") else matrix  # of a store
+class _System(NamedTuple):
+    """S = T F^-1 of a channel, (N, N), on the host."""
 
-    def product(x: np.ndarray) -> np.ndarray:  # T x, (M, k)
-        return np.asarray(matrix @ x.astype(np.float32), np.float64)
+    T: Any
+    F: np.ndarray
+    inverse: np.ndarray  # F^-1, 0 where F is
 
-    def variances(squares: np.ndarray) -> np.ndarray:  # v_ij times squares (N, k)
-        weights = noise.columns[c][:, None] * squares
-        light = noise.photons[c] * product(weights) if noise.photons[c] else 0.0
-        variance = noise.rows[c][:, None] * (light + noise.floor[c] ** 2 * weights.sum(axis=0))
-        return variance - noise.less_direct(T.first_bounce)[c][:, None] * squares if T.is_square else variance
+    def matmat(self, x: np.ndarray) -> np.ndarray:
+        light = np.asarray(self.T @ (self.inverse[:, None] * x).astype(np.float32), np.float64)
+        return light + (self.F == 0)[:, None] * x
 
-    def deviation(a: np.ndarray, own: Any = 0.0) -> np.ndarray:
-        """Of E a, (M,), less its diagonal, of covariances `own` * a; row sums of E may be those of white."""
-        q, q_1, V = variances(np.stack([a * a, a, np.ones(len(a))], axis=1)).T
-        u = noise.white[c]
-        fixed = np.divide(u - V, V**2, out=np.zeros(len(V)), where=np.isfinite(u) & (V > 0))
-        return np.sqrt(np.maximum(q - own * a[: len(q)] + fixed * (q_1 - own) ** 2, 0.0))
-
-    def judged(name: str, error: np.ndarray, light: np.ndarray) -> tuple[str, float, str]:
-        doubt = error / np.maximum(np.abs(light), 1e-300)
-        worst = np.flatnonzero(doubt > 2.0 * np.median(doubt)) if T.is_square else np.zeros(0)
-        size = float(np.linalg.norm(light)) or 1.0
-        return name, float(np.linalg.norm(error)) / size, _place(T.grid, worst, F)
-
-    F = np.atleast_2d(T.first_bounce)[c] if T.is_square else np.zeros(0)
-    white, of_white = product(np.ones((T.shape[1], 1)))[:, 0], deviation(np.ones(T.shape[1]))
-    yield judged("pictures", of_white, white)
-    if not T.is_square:
-        return
-    lit, own, radius = F > 0, noise.diagonal(T.first_bounce)[c], 0.0
-    inverse = np.divide(1.0, F, out=np.zeros(len(F)), where=lit)
-    space, seen = [np.stack([lit / math.sqrt(lit.sum()), F / np.linalg.norm(F)], axis=1)], []
-    for _ in range(_STEPS):  # R^k x and S R^k x, (N, 2) each
-        seen.append(product(inverse[:, None] * space[-1]) * lit[:, None])
-        radius = float(np.linalg.norm((step := seen[-1] - space[-1])[:, 1]))
-        space.append(step / max(radius, 1e-300))
-    Q, triangle = np.linalg.qr(np.hstack(seen))
-
-    def undo(b: np.ndarray) -> np.ndarray:  # S^-1 b
-        return np.hstack(space[:-1]) @ np.linalg.lstsq(triangle, Q.T @ b, rcond=1e-6)[0]
-
-    light = inverse * undo(lit.astype(np.float64))
-    gain = 1.0 / max(float(np.quantile(light[lit], 0.9)), 1e-6 * float(np.abs(light).max()), 1e-30)
-    yield "spectral_radius", radius, ""
-    yield "gain", gain / max(float(np.median(white[lit])), 1e-300), ""
-    yield judged("pictures", deviation(np.clip(gain * light, 0.0, 1.0)) * lit, gain * lit)
-    b = F
-    for k in (1, 2, 3):
-        a, b = inverse * (x := undo(b)), b - x
-        yield from (judged(n, deviation(a, own**2 * a) * lit, b) for n in (f"bounce_{k}", "bounces"))
-    yield "dark", T.masked.mean(), _place(T.grid, np.flatnonzero(T.masked))
-    if isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) and len(F) >= _LEAST:
-        indirect = np.maximum(white - matrix.diagonal(), 1e-300)
-        logs = np.log(np.where(lit, indirect * inverse, 1.0)).reshape(T.grid)  # smooth on surfaces
-        detail = np.diff(np.diff(logs, axis=0), axis=1) / 2.0 if min(T.grid) > 1 else np.zeros(1)
-        doubt = _MARGIN * float(np.median(np.hypot(of_white / indirect, own * (inverse + 1.0 / indirect))))
-        change = float(np.median(np.abs(detail))) / _NORMAL
-        yield "flicker", math.sqrt(max(change**2 - doubt**2, 0.0)) if doubt < 0.3 else 0.0, ""
-        floor = noise.floor[c] * np.sqrt(noise.rows[c] * noise.columns[c].mean())
-        power = inverse @ variances(inverse[:, None])[:, 0] - np.sum((own * inverse) ** 2)
-        yield from _entries(matrix, F, T.grid, floor, float(power), radius)
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        """S^-1 b, (N, k), of least residual in block Krylov spaces."""
+        if b.shape[1] > _AT_ONCE:
+            return np.hstack([self.solve(b[:, :_AT_ONCE]), self.solve(b[:, _AT_ONCE:])])
+        basis, first = np.linalg.qr(b)
+        H = np.zeros((k := len(first), 0))
+        for _ in range(_STEPS):
+            x = self.matmat(basis[:, -k:])
+            h = basis.T @ x
+            q, r = np.linalg.qr(x - basis @ h)
+            basis, H = np.hstack([basis, q]), np.block([[H, h], [np.zeros((k, H.shape[1])), r]])
+        e = np.pad(first, ((0, len(H) - k), (0, 0)))
+        return basis[:, :-k] @ np.linalg.lstsq(H, e, rcond=1e-6)[0]
 
 
-def _entries(
-    T: Any, F: np.ndarray, grid: tuple[int, int], floor: np.ndarray, power: float, radius: float
-) -> Iterator[tuple[str, float, str]]:
-    """What rows of T show; noise is `floor` of their dark entries (N,), `power` of F^-1/2 R F^1/2."""
-    N, w = len(F), grid[1]
+def _on_host(T: Transport) -> Any:
+    """T with matrices and S on the host, as far as `ltcl.uncertainty` and this module need it."""
+    host = Transport.__new__(Transport)
+    matrices = tuple(matrix.tocsr() if hasattr(matrix, "row_blocks") else matrix for matrix in T.matrices)
+    pairs = zip(matrices, np.atleast_2d(T.first_bounce) if T.is_square else (), strict=False)
+    systems = [_System(matrix, f, 1.0 / np.where(f > 0, f, np.inf)) for matrix, f in pairs]
+    vars(host).update(vars(T), matrices=matrices, systems=systems)
+    return host
+
+
+def _error(T: Any, c: int, name: str, light: np.ndarray, deviation: np.ndarray) -> Number:
+    """The relative one of a picture (M,), and where it is largest."""
+    F = T.systems[c].F if T.is_square else np.ones(len(light))
+    light, deviation = np.where(F > 0, [light, deviation], 0.0)
+    doubt = deviation / np.maximum(np.abs(light), 1e-300)
+    place = _place(T.camera_grid, np.flatnonzero(doubt > 2.0 * np.median(doubt)), F)
+    return name, float(np.linalg.norm(deviation) / (np.linalg.norm(light) or 1.0)), place
+
+
+def _deviation(T: Any, c: int, pattern: np.ndarray) -> np.ndarray:
+    """Of the picture (M,) under a pattern."""
+    return np.sqrt(np.maximum(uncertainty.covariance(T, T.noise, c, pattern[:, None, None]), 0.0))[:, 0, 0, 0]
+
+
+def _pictures(T: Any, c: int) -> Iterator[Number]:
+    """Of white, and of a plain picture, as bright as nine tenths of the pixels can be."""
+    matrices = [T.matrices[c]] if T.blocks is None else T.blocks[c]
+    white = np.sum([matrix @ np.ones(T.shape[1], np.float32) for matrix in matrices], axis=0)
+    yield _error(T, c, "pictures", white, _deviation(T, c, np.ones(T.shape[1] * len(matrices))))
+    if T.is_square:
+        S = T.systems[c]
+        light = S.inverse * S.solve(lit := np.sign(S.F)[:, None])[:, 0]
+        gain = 1.0 / max(float(np.quantile(light[S.F > 0], 0.9)), 1e-6 * float(np.abs(light).max()), 1e-30)
+        yield "gain", gain / max(float(np.median(white[S.F > 0])), 1e-300), ""
+        yield _error(T, c, "pictures", gain * lit[:, 0], _deviation(T, c, np.clip(gain * light, 0.0, 1.0)))
+
+
+def _bounces(T: Any) -> Iterator[Number]:
+    """Of bounces 1 to 3 under white: b_k = A b_(k-1), b_0 = F."""
+    b = [np.atleast_2d(T.first_bounce)]  # (channels, N)
+    for _ in range(3):
+        b.append(b[-1] - [S.solve(f[:, None])[:, 0] for S, f in zip(T.systems, b[-1], strict=True)])
+    shape = layout.Layout(False, None, T.channels == 3)
+    pictures = [shape.pack([f[:, None] for f in each], T.grid) for each in b]
+    inverse: Any = SimpleNamespace(solve=lambda b, c: SimpleNamespace(x=T.systems[c].solve(b)))
+    std = uncertainty.of_separation(T, T.noise, pictures, inverse)
+    for k, picture in enumerate(std.bounces, 1):
+        for c, deviation in enumerate(layout.unpack("bounces", picture, T.grid, T.channels)[0]):
+            yield from (_error(T, c, name, b[k][c], deviation[:, 0]) for name in (f"bounce_{k}", "bounces"))
+
+
+def _flicker(T: Any, c: int) -> Number:
+    """What differs from column to column in light that is smooth on surfaces, beyond noise."""
+    S, ones = T.systems[c], np.ones(T.shape[1])
+    deviation, own = _deviation(T, c, ones), T.noise.diagonal(T.first_bounce)[c]
+    indirect = np.maximum(S.T @ ones - S.T.diagonal(), 1e-300)
+    logs = np.log(np.where(S.F > 0, indirect * S.inverse, np.nan)).reshape(T.grid)
+    detail = np.diff(np.diff(logs, axis=0), axis=1) / 2.0
+    detail = detail[np.isfinite(detail)] if np.isfinite(detail).any() else np.zeros(1)
+    doubt = _MARGIN * float(np.median(np.hypot(deviation / indirect, own * (S.inverse + 1.0 / indirect))))
+    change = float(np.median(np.abs(detail))) / _NORMAL
+    return "flicker", math.sqrt(max(change**2 - doubt**2, 0.0)) if doubt < 0.3 else 0.0, ""
+
+
+def _entries(T: Any, c: int) -> Iterator[Number]:
+    """What rows of T show: where they are brightest, at most, all over, and at least."""
+    matrix, noise, (N, w) = T.matrices[c], T.noise, (T.shape[1], T.grid[1])
     pick = np.unique(np.linspace(0, N - 1, max(min(N, _ENTRIES // N), 1)).astype(int))
-    rows, k = T[pick] if isinstance(T, np.ndarray) else T[pick].toarray(), np.arange(len(pick))
+    rows, k = matrix[pick] if isinstance(matrix, np.ndarray) else matrix[pick].toarray(), np.arange(len(pick))
     rows = rows.astype(np.result_type(rows, np.float32), copy=False)
     direct, brightest = rows[k, pick].copy(), rows.argmax(axis=1)
     away = np.where(rows[k, brightest] > np.maximum(direct, 0.0), brightest - pick, 0)
@@ -248,29 +247,31 @@ def _entries(
     level = np.add.reduceat(rows, columns, axis=1).astype(np.float64) / wide
     mean = level.mean(axis=1)
     hot = (mean > 5.0 * np.median(np.abs(mean))) & (level.min(axis=1) > 0.5 * mean)
-    yield "hot_rows", hot.sum(), _place(grid, pick[hot])
+    yield "hot_rows", hot.sum(), _place(T.grid, pick[hot])
     top[hot] = level[hot] = 0
     measured = len(np.unique(lower)) > 0.9 * len(lower)  # without noise values repeat everywhere
-    yield "saturated", top.sum() * measured, _place(grid, pick[top > 0])
+    yield "saturated", top.sum() * measured, _place(T.grid, pick[top > 0])
+    floor = noise.floor[c] * np.sqrt(noise.rows[c] * noise.columns[c].mean())[pick]
     blocks = np.add.reduceat(level, groups) / high[:, None]
-    constant = float(blocks.min(axis=1).mean()) / max(float(blocks.mean()), 1e-300)
-    yield "ambient", max(constant - min(radius / (1.0 + radius), _CLOSED), 0.0), ""
-    spread = np.sqrt(np.add.reduceat(floor[pick] ** 2, groups) * len(wide) / N) / high
+    spread = np.sqrt(np.add.reduceat(floor**2, groups) * len(wide) / N) / high
     below = -float(np.quantile(blocks + 5.0 * spread[:, None], 0.02))
     yield "offset", max(below, 0.0) / max(float(np.abs(blocks).mean()), 1e-300), ""
-    least = np.where(F > 0, 0.1 * F, np.inf).astype(rows.dtype)
-    i, j = np.nonzero((rows > least) & (rows > np.where(hot, np.inf, 10.0 * floor[pick])[:, None]))
-    near = [rows[i, np.clip(j + x, 0, N - 1)] for x in (1, -1, w, -w)]
-    back = np.searchsorted(pick, j)  # light the other way
-    near += [rows[np.clip(y, 0, k[-1]), x] for y, x in ((i - 1, j), (i + 1, j), (back, pick[i]))]
-    lone = rows[i, j] > 5.0 * np.max(near, axis=0)
-    share = np.linalg.norm(rows[i, j][lone]) / max(float(np.linalg.norm(direct)), 1e-300)
-    yield "outliers", float(share), _place(grid, pick[i[lone]])
-    rows *= (root := np.divide(1.0, np.sqrt(F), out=np.zeros(N), where=F > 0)).astype(rows.dtype)
-    signal = float(np.einsum("ij,ij->i", rows, rows) @ root[pick] ** 2)
-    expected = _MARGIN**2 * power * len(pick) / N / max(signal, 1e-300)
-    defect = diagnostics.reciprocity_defect(T, F, entries=diagnostics.QUICK)
-    yield "irreciprocal", math.sqrt(max(defect**2 - min(expected, 1.0), 0.0)), ""
+    least = np.maximum(np.where((F := T.systems[c].F) > 0, 0.1 * F, np.inf), 10.0 * floor[:, None])
+    least[hot | T.masked[pick]] = np.inf
+    lone, light = diagnostics.outliers(rows, pick, least.astype(rows.dtype), w)
+    yield "outliers", light / max(float(np.linalg.norm(F[pick])), 1e-300), _place(T.grid, lone)
+    yield _irreciprocal(T, c, pick, rows)
+
+
+def _irreciprocal(T: Any, c: int, pick: np.ndarray, rows: np.ndarray) -> Number:
+    """The defect of reciprocity beyond that of noise, both of F^-1/2 R F^1/2."""
+    (matrix, F, inverse), own = T.systems[c], T.noise.diagonal(T.first_bounce)[c]
+    variances = uncertainty.variance(T, T.noise, c, inverse[:, None])[:, 0]
+    power = float(inverse @ variances - np.sum((own * inverse) ** 2)) * len(pick) / len(F)
+    light = np.square(rows * np.sqrt(inverse).astype(rows.dtype)).sum(axis=1, dtype=np.float64)
+    expected = min(_MARGIN**2 * power / max(float(light @ inverse[pick]), 1e-300), 1.0)
+    defect = diagnostics.reciprocity_defect(matrix, F, entries=diagnostics.QUICK)
+    return "irreciprocal", math.sqrt(max(defect**2 - expected, 0.0)), ""
 
 
 def _place(grid: tuple[int, int], pixels: np.ndarray, F: np.ndarray | None = None) -> str:

@@ -31,7 +31,8 @@ LAYERS: list[set[str]] = [
     {"solvers"},
     {"diagnostics", "first_bounce", "noise"},
     {"transport"},
-    {"uncertainty", "verdict"},
+    {"uncertainty"},
+    {"verdict"},
     {"compensation", "compression", "separation", "relighting", "analysis", "denoising"}
     | {"scenes", "store", "acquisition", "report"},
     {"plots"},

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from ltcl.acquisition import Project
 from ltcl.cli.main import main
 
-README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def block(pattern: str) -> str:
@@ -43,6 +45,23 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     seen, target = (rig.radiance(names["setup"].codes(names["c"].pattern)), names["target"])
     scale = np.vdot(seen, target) / np.vdot(seen, seen)
     assert np.linalg.norm(scale * seen - target) < 0.02 * np.linalg.norm(target)
+
+
+def test_the_page_on_noise_runs(device, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "noise.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(code, names)  # noqa: S102
+    for T in (names["T"], names["twice"]):
+        np.testing.assert_allclose(T.noise.floor, names["sigma"], rtol=0.15)
+    np.testing.assert_array_equal(names["holes"].masked, names["unlit"])
+    assert "3 of 288 pixels" in names["holes"].dark
+    assert names["errors"]["denoised"] < 0.5 * names["errors"]["raw"]
+    assert names["within"] == pytest.approx(0.68, abs=0.06)
+    assert (names["verdict"].compensation, names["verdict"].bounces) == (True, False)
+    for command in re.findall(r"^ltcl .*", page, re.MULTILINE):
+        _run(command, capsys)
 
 
 def _run(command, capsys):

@@ -295,7 +295,7 @@ def test_relighting_has_all_digits_whatever_the_first_bounce(device, form, share
 
 @pytest.mark.filterwarnings("error")
 def test_a_first_bounce_too_small_for_float32_is_refused():
-    T = ltcl.Transport([[1, 0.5], [0.3, 1e-39]], (1, 2), noise=Noise.uniform((2, 2), 0.0))
+    T = ltcl.Transport([[1, 0.5], [0.3, 1e-39]], (1, 2), noise=Noise.uniform((2, 2), 0.0), dark=0.0)
     with pytest.raises(InputError, match=r"float32.* first bounce"):
         ltcl.relight(T, np.ones((1, 2)))
 

@@ -124,7 +124,8 @@ def _describe_record(record: Record) -> tuple[np.ndarray | None, dict[str, Any]]
     if F is not None:
         F, grid = np.atleast_2d(checks.finite("first_bounce", F)), record.grid or (1, columns)
         noise = lambda: record.noise or estimate(matrices, grid, record.camera_grid or grid)  # noqa: E731
-        F = np.where(first_bounce.dark(matrices, 0.0, noise, record.noise is not None, F), 0.0, F)
+        known, share = record.noise is not None, first_bounce.DARK
+        F = np.where(first_bounce.dark(matrices, share, noise, known, F), 0.0, F)
     return F, {
         "channels": len(matrices),
         "stored": "dense" if record.dense else "row blocks" if record.stored else "sparse",

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ltcl.errors import FileError
+from ltcl.first_bounce import DARK
 from ltcl.solvers.solve import METHODS
 
 
@@ -92,6 +93,7 @@ _FIRST = "Direct light: the diagonal of T, or 1 / diag(T^-1), dense or estimated
 _NOISE = "A second measurement of the same scene, of which the noise of TRANSPORT follows; else estimated."
 _ON_DARK = "Projector pixels whose direct light is 0 or within its noise: leave unlit, or refuse."
 _SHOW_DARK = "Picture, a PNG, of direct light; pixels without it are orange."
+_DARK = "Direct light below DARK times its median is dark, too; 0 leaves it lit."
 Matrix = Annotated[Path, argument("TRANSPORT", FORMATS)]
 Matrices = Annotated[list[Path], argument("FILE...", FORMATS)]
 Pictures = Annotated[list[Path], argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")]
@@ -114,7 +116,7 @@ def file_options(
 def transport_options(
     first_bounce: Annotated[Literal["diagonal", "exact", "estimate"] | None, option(_FIRST)] = None,
     on_dark: OnDark = "mask",
-    dark: Annotated[float, option("Direct light below DARK times its median is dark, too.")] = 0.0,
+    dark: Annotated[float, option(_DARK)] = DARK,
     noise: Annotated[Path | None, file(_NOISE)] = None,
     device: Device = None,
 ) -> None:

@@ -77,7 +77,7 @@ def callback(context: Context, T: Transport, settings: dict[str, Any], solves: i
 def _load_exact(path: Path, T: Transport, variable: str | None) -> Transport:
     """What T was compressed from, with its first bounce; InputError where it is another transport."""
     on_dark, same = "mask" if T.masked.any() else "raise", {"grid": T.grid, "first_bounce": T.first_bounce}
-    exact = store.load(path, variable=variable, on_dark=on_dark, device=T.device, **same)
+    exact = store.load(path, variable=variable, on_dark=on_dark, dark=0.0, device=T.device, **same)
     resolve_reference(T, exact)  # refuses other colours
     pattern = np.random.default_rng(0).random((*T.grid, *(3,) * (T.channels == 3)))
     picture = T @ pattern

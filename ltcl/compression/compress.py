@@ -264,7 +264,7 @@ def compress_inputs(
         note("done", 1.0)
     on_dark = "mask" if inputs.masked else "raise"
     settings: dict[str, Any] = {"on_dark": on_dark, "mixing": inputs.mixing, "noise": inputs.noise}
-    C = Transport(matrices, inputs.grid, first_bounce=inputs.F, **settings)
+    C = Transport(matrices, inputs.grid, first_bounce=inputs.F, dark=0.0, **settings)
     return C, tuple(reports)
 
 

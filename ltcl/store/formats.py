@@ -22,6 +22,7 @@ import scipy.sparse
 from ltcl import checks
 from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
+from ltcl.first_bounce import DARK
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, exchange, record
 from ltcl.store.record import CSR, Matrix, Parts, Record, about
@@ -39,7 +40,7 @@ def load(
     camera_grid: tuple[int, int] | None = None,
     first_bounce: str | np.ndarray | None = None,
     on_dark: str = "mask",
-    dark: float = 0.0,
+    dark: float = DARK,
     device: Any = None,
     noise: Any = None,
 ) -> Transport:

@@ -118,12 +118,16 @@ SMALL = ltcl.scenes.dihedral(4, albedo=[[0.6], [0.3]])
 T32 = SMALL.matrices()[0]
 SOME = np.arange(32) % 7 == 3
 DIM, SIGMA = np.where(SOME, 0.01, 1.0), Noise.uniform((32, 32), 0.02)
+QUIET = Noise.uniform((32, 32), 0.0)
 
 
 @pytest.mark.parametrize(
     ("matrix", "options", "dark"),
     [
         (T32 * DIM, {}, False),  # dim, without noise
+        (T32 * DIM**2, {"noise": QUIET}, False),
+        (T32 * DIM**4, {"noise": QUIET}, True),  # of which no camera and no float32 sees anything
+        (T32 * DIM**4, {"noise": QUIET, "dark": 0.0}, False),
         (np.linalg.inv(np.diag(1 / (0.6 * DIM)) - SMALL.form_factors), {}, False),  # dark paint
         (T32 * DIM, {"dark": 0.05}, True),
         (T32 * DIM, {"noise": SIGMA}, True),
@@ -135,6 +139,15 @@ DIM, SIGMA = np.where(SOME, 0.01, 1.0), Noise.uniform((32, 32), 0.02)
 )
 def test_what_is_dark(matrix, options, dark) -> None:
     np.testing.assert_array_equal(ltcl.Transport(matrix, (4, 8), **options).masked, SOME & dark)
+
+
+@pytest.mark.parametrize(("options", "gain"), [({}, 1.0), ({"dark": 0.0}, 1e-12)])
+def test_pixels_without_light_do_not_decide_the_gain(options, gain) -> None:
+    """Projector pixels with 1e-12 of the others' light, and noise as small."""
+    desired, without = np.full((4, 8), 0.5), ltcl.Transport(T32 * ~SOME, (4, 8))
+    best = ltcl.compensate(without, desired, gain="auto").gain
+    T = ltcl.Transport(T32 * np.where(SOME, 1e-12, 1.0), (4, 8), noise=QUIET, **options)
+    assert ltcl.compensate(T, desired, gain="auto").gain == pytest.approx(gain * best, rel=0.1)
 
 
 def test_noise_is_not_estimated_without_need(monkeypatch) -> None:
