@@ -6,8 +6,9 @@ and E b of pixel i have the covariance
 
     q_ab = sum_j v_ij a_j b_j = rows_i (photons T (columns a b) + floor^2 columns . (a b))_i
 
-or q_ab + (u / V - 1) q_a1 q_b1 / V, V = q_11, where the row adds up to a measured white of variance u. To
-first order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k = F^-1 b_k and the bounces of eq. 27:
+of pictures a, b less a share of what their neighbours are (`Noise.filtered`), or q_ab + (u / V - 1) q_a1 q_b1
+/ V, V = q_11, where the row adds up to a sum of variance u: a measured white's, or `Noise.sums` V. To first
+order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k = F^-1 b_k and the bounces of eq. 27:
 
     T p:    E p
     p:      -F^-1 X E p
@@ -188,21 +189,25 @@ def _clipped(
 
 def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:
     """Covariances (M, k, n, n) of E a, for a (N, k, n) and channel c; and of diag(E) as one more."""
-    n, known = a.shape[-1], np.isfinite(noise.white[c])
-    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1) if known.any() else a
+    n, known, own = a.shape[-1], np.isfinite(noise.white[c]), 0.0
+    white = known.any() or noise.sums[c] != 1.0
+    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1) if white else a
     i, j = np.triu_indices(w.shape[-1])
-    pairs = w[..., i] * w[..., j]
+    seen = noise.filtered(w, T.grid, c)
+    pairs = seen[..., i] * seen[..., j]
     sums = variance(T, noise, c, pairs.reshape(len(pairs), -1)).reshape(-1, *pairs.shape[1:])
+    if T.is_square:
+        own = noise.diagonal(T.first_bounce)[c, :, None, None] ** 2
+        sums += own * (w[..., i] * w[..., j] - pairs)  # the first bounce has no part in its neighbours
     q = np.zeros((*sums.shape[:2], *2 * (w.shape[-1] + diagonal,)))
     q[..., i, j] = q[..., j, i] = sums
     if diagonal:
-        v = noise.diagonal(T.first_bounce)[c, :, None, None] ** 2
-        q[..., -1, :-1] = q[..., :-1, -1] = v * w
-        q[..., -1, -1] = v[..., 0]
-    if not known.any():
+        q[..., -1, :-1] = q[..., :-1, -1] = own * w
+        q[..., -1, -1] = own[..., 0]
+    if not white:
         return q
-    V = np.where(known[:, None], np.maximum(q[..., n, n], 1e-300), 1.0)
-    factor = np.where(known[:, None], (np.where(known, noise.white[c], 0.0)[:, None] / V - 1.0) / V, 0.0)
+    V = np.maximum(q[..., n, n], 1e-300)
+    factor = (np.where(known[:, None], noise.white[c][:, None] / V, noise.sums[c]) - 1.0) / V
     q += factor[..., None, None] * q[..., n, :, None] * q[..., n, None, :]
     return np.delete(np.delete(q, n, axis=-1), n, axis=-2)
 

@@ -4,9 +4,10 @@
     variance of T_c[i, j] = rows_c[i] columns_c[j] (photons_c max(T_c[i, j], 0) + floor_c^2)
 
 for channel c, times `direct_c` on the diagonal of a square T, whose light came straight from the projector.
-Entries are independent of each other; but where the rows of T were made to add up to a measured
-white, whose variance is `white`, errors of a row are those that add up to it (`covariance` in
-`ltcl.uncertainty`).
+Errors of rows are independent of each other; those of a row may cancel in its pictures, in two ways
+(`covariance` in `ltcl.uncertainty`). A path tracer whose paths are stratified moves light between
+neighbouring columns: a row is e (1 - c G) / ||1 - c G||, of independent e, c = `neighbours`, and G the
+binomial mean of 3 x 3 columns. And rows may add up to a sum that is known better, as of a measured white.
 
 Known limits: pictures of a scan by S-matrices share their noise, so that all entries of a batch are as noisy
 as its brightest; the model spreads that over the row. First bounce and sums are right, errors of smooth
@@ -17,10 +18,11 @@ of pictures are 0.9 to 1.2 times those of the model, as of a scan by pixels.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, Self
 
 import numpy as np
+import scipy.ndimage
 import scipy.optimize
 import scipy.sparse
 
@@ -33,6 +35,8 @@ _PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; s
 _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
 _AT_ONCE = 1 << 22  # samples
 _FIRST = 64  # first bounces at least, whose variance may have a factor of its own
+_WINDOW, _CHANCE = 6, 3.0  # side of windows whose sums are compared; standard deviations that mean nothing
+_SHARES = np.linspace(0.0, 0.95, 20)  # c
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -51,6 +55,9 @@ class Noise:
         "acquired", "measured twice", "given", or "estimated" from T alone.
     direct : (channels,) float64
         Factor of the variance of the first bounce: far below 1 of a path-traced T.
+    neighbours, sums : (channels,) float64
+        c above, and the variance of row sums over that by c, where `white` is infinite; 0 and 1 where errors
+        are independent.
 
     InputError for other shapes, NaN, and negative numbers.
 
@@ -68,14 +75,17 @@ class Noise:
     white: np.ndarray
     source: str = "given"
     direct: Any = 1.0
+    neighbours: Any = 0.0
+    sums: Any = 1.0
 
     def __post_init__(self) -> None:
         n = np.size(self.photons)
         checks.one_of("noise.source", self.source, SOURCES)
-        object.__setattr__(self, "direct", np.broadcast_to(self.direct, n))
-        ndims = {"photons": 1, "floor": 1, "rows": 2, "columns": 2, "white": 2, "direct": 1}
-        for name, ndim in ndims.items():
+        for name in ("direct", "neighbours", "sums"):
+            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), n))
+        for name in (f.name for f in fields(self) if f.name != "source"):
             value = checks.real(f"noise.{name}", getattr(self, name)).astype(np.float64)
+            ndim = 2 if name in ("rows", "columns", "white") else 1
             largest = np.inf if name == "white" else np.finfo(float).max
             if value.ndim != ndim or len(value) != n or not np.all((value >= 0) & (value <= largest)):
                 text = f"noise.{name} has shape {value.shape}; it must be {ndim}-dimensional, channels first"
@@ -113,6 +123,13 @@ class Noise:
         light = self.photons[:, None] * np.maximum(np.atleast_2d(F), 0.0) + self.floor[:, None] ** 2
         return (1.0 - self.direct[:, None]) * self.rows * self.columns * light
 
+    def filtered(self, pictures: np.ndarray, grid: tuple[int, int], channel: int = 0) -> np.ndarray:
+        """`pictures` (N, ...) or (3 N, ...) as independent errors see them: (1 - c G) a / ||1 - c G||."""
+        if self.neighbours[channel] == 0.0:
+            return pictures
+        a = pictures.reshape(-1, *grid, *pictures.shape[1:])
+        return _less_neighbours(a, self.neighbours[channel], "nearest").reshape(pictures.shape)
+
     @classmethod
     def fit(
         cls, shape: tuple[int, int], samples: Sequence[Samples], source: str, white: Any = np.inf
@@ -128,7 +145,7 @@ class Noise:
         return cls(photons, floor, rows, columns, np.broadcast_to(white, rows.shape), source, direct)
 
     @classmethod
-    def measured_twice(cls, matrices: Sequence[Any], others: Sequence[Any]) -> Self:
+    def measured_twice(cls, matrices: Sequence[Any], others: Sequence[Any], grid: tuple[int, int]) -> Self:
         """Of a T (M, N) and of a second measurement, equally noisy: (T_1 - T_2)^2 / 2 has its variance.
 
         What changed smoothly between both, as a lamp does, counts as noise. InputError where entries are the
@@ -141,7 +158,8 @@ class Noise:
         noise = cls.fit(matrices[0].shape, [_differences(*pair) for pair in pairs], "measured twice")
         if not np.any(noise.floor + noise.photons):
             raise InputError("noise has the same entries as matrix; it must be a second measurement")
-        return noise
+        pictures = [_of_sums(*pair, grid) for pair in pairs]
+        return replace(noise, **dict(zip(("neighbours", "sums"), np.transpose(pictures), strict=True)))
 
     def require(self, channels: int, shape: tuple[int, int]) -> None:
         """InputError where this is the noise of a T of other channels or another shape (M, N)."""
@@ -160,7 +178,7 @@ class Noise:
         if "noise_floor" not in arrays:
             return None
         if missing := [f.name for f in fields(cls) if f"noise_{f.name}" not in arrays]:
-            raise InputError(f"noise_{missing[0]} is missing; noise has seven arrays")
+            raise InputError(f"noise_{missing[0]} is missing; noise has {len(fields(cls))} arrays")
         values = {f.name: arrays[f"noise_{f.name}"] for f in fields(cls)}
         return cls(**{**values, "source": SOURCES[int(values["source"]) % len(SOURCES)]})
 
@@ -220,6 +238,59 @@ def _differences(first: Any, second: Any) -> Iterator[tuple[np.ndarray, ...]]:
         i, j = np.nonzero((A != 0) | (B != 0))
         a, b = A[i, j].astype(np.float64), B[i, j].astype(np.float64)
         yield i + start, j, (a + b) / 2, (a - b) ** 2 / 2
+
+
+def _of_sums(first: Any, second: Any, grid: tuple[int, int]) -> tuple[float, float]:
+    """c and `sums`, by sums of the differences of two T (M, N) over windows of columns, and over rows."""
+    (M, N), sides = first.shape, tuple(min(_WINDOW, n) for n in grid)
+    tiled, ratios = [n // side * side for n, side in zip(grid, sides, strict=True)], []
+    for start in range(0, M, step := max(1, _AT_ONCE // N)):
+        stop = min(start + step, M)
+        E = _rows(first, start, stop).astype(np.float64) - _rows(second, start, stop)
+        if M == N:
+            E[np.arange(stop - start), np.arange(start, stop)] = 0.0
+        tiles = E.reshape(-1, *grid)[:, : tiled[0], : tiled[1]]
+        tiles = tiles.reshape(len(E), tiled[0] // sides[0], sides[0], -1, sides[1])
+        square = [np.sum(tiles.sum(axis=(2, 4)) ** 2, axis=(1, 2)), E.sum(axis=1) ** 2]
+        ratios.append(
+            square / np.maximum([np.sum(tiles**2, axis=(1, 2, 3, 4)), np.sum(E**2, axis=1)], 1e-300)
+        )
+    windows, rows = (x[x > 0] for x in np.concatenate(ratios, axis=1))
+    counts = len(windows) * np.prod(tiled) // np.prod(sides), len(rows)
+    return cancellation(windows.mean(), rows.mean(), (counts[0], counts[1]), np.ones((1, *sides)))
+
+
+def cancellation(
+    windows: float, rows: float, counts: tuple[int, int], window: np.ndarray, detail: np.ndarray | None = None
+) -> tuple[float, float]:
+    """c and `sums` of variances over those of independent errors, from samples of these counts.
+
+    `windows` is of sums over a window (1, h, w), or over that of its `detail` (k, h, w); `rows` of row sums.
+    """
+    known = [
+        ratio * (1.0 + _CHANCE * (2.0 / n) ** 0.5) < 1.0
+        for ratio, n in zip((windows, rows), counts, strict=True)
+    ]
+    gains = _gains(window) / (1.0 if detail is None else _gains(detail))
+    c = float(np.interp(windows, gains[::-1], _SHARES[::-1])) if known[0] else 0.0
+    return c, min(rows, 1.0) / float(
+        _less_neighbours(np.ones((1, 3, 3)), c, "nearest")[0, 1, 1]
+    ) ** 2 if known[1] else 1.0
+
+
+def _gains(vectors: np.ndarray) -> np.ndarray:
+    """Variances of E a for a of `vectors` (k, h, w), over those of independent errors, for all shares."""
+    padded = np.pad(vectors, ((0, 0), (1, 1), (1, 1)))
+    squares = [np.sum(_less_neighbours(padded, c, "constant") ** 2) for c in _SHARES]
+    return np.array(squares) / np.sum(vectors**2)
+
+
+def _less_neighbours(a: np.ndarray, c: float, mode: Literal["nearest", "constant"]) -> np.ndarray:
+    """(1 - c G) a / ||1 - c G|| of a (k, h, w, ...)."""
+    mean = a
+    for axis in (1, 2):
+        mean = scipy.ndimage.correlate1d(mean, [0.25, 0.5, 0.25], axis=axis, mode=mode)
+    return (a - c * mean) / (1.0 - 0.5 * c + (0.375 * c) ** 2) ** 0.5
 
 
 def _rows(T: Any, start: int, stop: int) -> np.ndarray:
