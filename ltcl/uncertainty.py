@@ -36,14 +36,13 @@ from ltcl import layout
 from ltcl.noise import Noise
 from ltcl.operators import Operator
 from ltcl.solvers import Inverse, solve
-from ltcl.solvers.bounded import minimise
 from ltcl.transport import Transport, default_rtol
 
 _DRAWS, _FRAME_DRAWS = 8, 4  # of one picture, and of each of several
 _WHOLE_DRAWS = 16  # of errors that have no part in closed form
 _TOGETHER = 8  # pictures whose draws are solved at once
 _RTOL = 0.05  # of solves, whose solutions are the smaller part
-_FAR = 100.0  # times the largest error: bounds of free pixels
+_STEPS = 100  # of least squares
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -171,20 +170,41 @@ def _clipped(
     weights: np.ndarray,
     random: np.random.Generator,
 ) -> np.ndarray:
-    """Variances (N, k) of light that solves least squares, frame by frame, from q (M, k) of the picture."""
+    """Variances (N, k) of light that solves least squares, from q (M, k) of the picture."""
     (A, scale), direct = system, T.is_square and not T.couples
     variances = np.empty(free.shape)
-    for k in range(q.shape[1]):
-        e = _draws(q[:, k, None, None, None], random, q.shape[1] if direct else 0)[:, 0, :, 0]
-        most = np.where(free[:, k] & (scale > 0), _FAR * np.abs(e).max(), 0.0)
-        W = np.repeat(weights[:, k, None], e.shape[1], axis=1)
-        x = minimise(A, e, -most, most, np.zeros((len(free), e.shape[1])), weights=W, rtol=_RTOL).x
+    for start in range(0, q.shape[1], _TOGETHER):
+        some = slice(start, start + _TOGETHER)
+        e = _draws(q[:, some, None, None], random, q.shape[1] if direct else 0)[..., 0]
+        x = _least_squares(A, e, free[:, some, None] & (scale > 0)[:, None, None], weights[:, some, None])
         if direct:  # of A = S: e of the pixel itself, and a rest as above
-            total = q[:, k] + _square(T, noise, c, x[:, None], (x - e)[:, None])[:, 0]
+            variances[:, some] = q[:, some] + _square(T, noise, c, x, x - e)
         else:
-            total = np.mean(np.square(x, dtype=np.float64), axis=1)
-        variances[:, k] = _ratio(total, scale**2)
-    return variances
+            variances[:, some] = np.mean(x**2, axis=-1)
+    return _ratio(variances, scale[:, None] ** 2)
+
+
+def _least_squares(A: Operator, e: np.ndarray, free: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The x (N, k, draws), 0 but where `free`, for which w A x is nearest to w e (M, k, draws)."""
+
+    def product(a: np.ndarray, transpose: bool = False) -> np.ndarray:
+        flat = a.reshape(len(a), -1).astype(np.float32)
+        return (A.T @ flat if transpose else A @ flat).reshape(-1, *e.shape[1:])
+
+    r, square = e, weights**2
+    p = s = free * product(square * r, transpose=True)
+    x, first = np.zeros(s.shape), np.sum(s**2, axis=0)
+    size = first
+    for _ in range(_STEPS):  # of conjugate gradients for the normal equations
+        if (size <= _RTOL**2 * first).all():
+            break
+        Ap = product(p)
+        alpha = _ratio(size, np.sum(square * Ap**2, axis=0))
+        x, r = x + alpha * p, r - alpha * Ap
+        s = free * product(square * r, transpose=True)
+        before, size = size, np.sum(s**2, axis=0)
+        p = s + _ratio(size, before) * p
+    return x
 
 
 def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:
