@@ -117,13 +117,11 @@ def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tup
     V = floor2 * rows * (columns.sum() + q * light[:, 1] - own * columns[:M] * (1.0 + q * F))
     d = ((light[:, 0] - F)[camera.pixels] * camera.weight) @ camera.detail.T / camera.gain
     z = d**2 / np.maximum(V, _LEAST)[camera.pixels].mean(axis=1)[:, None]
-    sides = [min(size[0], n) for n in grid]
     cancelled = cancellation(
         float(np.nanmedian(sums / v)),
         float(np.median(z)) / _SQUARE,
         (int(np.isfinite(v).sum()), z.size // 8),
-        np.ones((1, *sides)),
-        projector.detail.reshape(-1, *sides),
+        [min(size[0], n) for n in grid],
     )
     return q * floor2, floor2**0.5, rows, columns, direct, *cancelled
 

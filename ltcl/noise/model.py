@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 import scipy.ndimage
@@ -36,7 +36,7 @@ _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of n
 _AT_ONCE = 1 << 22  # samples
 _FIRST = 64  # first bounces at least, whose variance may have a factor of its own
 _WINDOW, _CHANCE = 6, 3.0  # side of windows whose sums are compared; standard deviations that mean nothing
-_SHARES = np.linspace(0.0, 0.95, 20)  # c
+_G = 0.375  # ||G||
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -125,10 +125,10 @@ class Noise:
 
     def filtered(self, pictures: np.ndarray, grid: tuple[int, int], channel: int = 0) -> np.ndarray:
         """`pictures` (N, ...) or (3 N, ...) as independent errors see them: (1 - c G) a / ||1 - c G||."""
-        if self.neighbours[channel] == 0.0:
-            return pictures
-        a = pictures.reshape(-1, *grid, *pictures.shape[1:])
-        return _less_neighbours(a, self.neighbours[channel], "nearest").reshape(pictures.shape)
+        c, mean = self.neighbours[channel], pictures.reshape(-1, *grid, *pictures.shape[1:])
+        for axis in (1, 2):
+            mean = scipy.ndimage.correlate1d(mean, [0.25, 0.5, 0.25], axis=axis, mode="nearest")
+        return (pictures - c * mean.reshape(pictures.shape)) / _norm2(c) ** 0.5
 
     @classmethod
     def fit(
@@ -158,8 +158,8 @@ class Noise:
         noise = cls.fit(matrices[0].shape, [_differences(*pair) for pair in pairs], "measured twice")
         if not np.any(noise.floor + noise.photons):
             raise InputError("noise has the same entries as matrix; it must be a second measurement")
-        pictures = [_of_sums(*pair, grid) for pair in pairs]
-        return replace(noise, **dict(zip(("neighbours", "sums"), np.transpose(pictures), strict=True)))
+        neighbours, sums = np.transpose([_cancellation(*pair, grid) for pair in pairs])
+        return replace(noise, neighbours=neighbours, sums=sums)
 
     def require(self, channels: int, shape: tuple[int, int]) -> None:
         """InputError where this is the noise of a T of other channels or another shape (M, N)."""
@@ -231,69 +231,55 @@ def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ..
 
 def _differences(first: Any, second: Any) -> Iterator[tuple[np.ndarray, ...]]:
     """Rows, columns, light and half of the squared difference of the entries of two T (M, N)."""
-    M, N = first.shape
-    for start in range(0, M, step := max(1, _AT_ONCE // N)):
-        stop = min(start + step, M)
-        A, B = (_rows(T, start, stop) for T in (first, second))
+    for start, A, B in _rows(first, second):
         i, j = np.nonzero((A != 0) | (B != 0))
-        a, b = A[i, j].astype(np.float64), B[i, j].astype(np.float64)
+        a, b = A[i, j], B[i, j]
         yield i + start, j, (a + b) / 2, (a - b) ** 2 / 2
 
 
-def _of_sums(first: Any, second: Any, grid: tuple[int, int]) -> tuple[float, float]:
-    """c and `sums`, by sums of the differences of two T (M, N) over windows of columns, and over rows."""
-    (M, N), sides = first.shape, tuple(min(_WINDOW, n) for n in grid)
-    tiled, ratios = [n // side * side for n, side in zip(grid, sides, strict=True)], []
-    for start in range(0, M, step := max(1, _AT_ONCE // N)):
-        stop = min(start + step, M)
-        E = _rows(first, start, stop).astype(np.float64) - _rows(second, start, stop)
-        if M == N:
-            E[np.arange(stop - start), np.arange(start, stop)] = 0.0
-        tiles = E.reshape(-1, *grid)[:, : tiled[0], : tiled[1]]
-        tiles = tiles.reshape(len(E), tiled[0] // sides[0], sides[0], -1, sides[1])
-        square = [np.sum(tiles.sum(axis=(2, 4)) ** 2, axis=(1, 2)), E.sum(axis=1) ** 2]
-        ratios.append(
-            square / np.maximum([np.sum(tiles**2, axis=(1, 2, 3, 4)), np.sum(E**2, axis=1)], 1e-300)
+def _cancellation(first: Any, second: Any, grid: tuple[int, int]) -> tuple[float, float]:
+    """`cancellation` of the differences of two T (M, N), but for their diagonal."""
+    sides, ratios = [min(_WINDOW, n) for n in grid], []
+    (h, w), (a, b) = grid, sides
+    for start, A, B in _rows(first, second):
+        E = A - B
+        E[np.arange(len(E)), np.arange(start, start + len(E)) % E.shape[1]] *= (
+            first.shape[0] != first.shape[1]
         )
-    windows, rows = (x[x > 0] for x in np.concatenate(ratios, axis=1))
-    counts = len(windows) * np.prod(tiled) // np.prod(sides), len(rows)
-    return cancellation(windows.mean(), rows.mean(), (counts[0], counts[1]), np.ones((1, *sides)))
+        tiles = E.reshape(-1, h, w)[:, : h // a * a, : w // b * b].reshape(len(E), h // a, a, -1, b)
+        sums = [np.sum(tiles.sum(axis=(2, 4)) ** 2, axis=(1, 2)), E.sum(axis=1) ** 2]
+        squares = [np.sum(tiles**2, axis=(1, 2, 3, 4)), np.sum(E**2, axis=1)]
+        ratios.append(np.divide(sums, squares, out=np.ones((2, len(E))), where=np.array(squares) > 0))
+    windows, rows = np.concatenate(ratios, axis=1)
+    return cancellation(windows.mean(), rows.mean(), (len(rows) * (h // a) * (w // b), len(rows)), sides)
 
 
 def cancellation(
-    windows: float, rows: float, counts: tuple[int, int], window: np.ndarray, detail: np.ndarray | None = None
+    windows: float, rows: float, counts: tuple[int, int], sides: Sequence[int]
 ) -> tuple[float, float]:
-    """c and `sums` of variances over those of independent errors, from samples of these counts.
+    """c and `sums` from variances of sums over windows and over rows, over those of independent errors.
 
-    `windows` is of sums over a window (1, h, w), or over that of its `detail` (k, h, w); `rows` of row sums.
+    `counts` are of samples, `sides` of a window, over which 1 - c G sums to 1 - 2 c crossed + c^2 squared.
     """
-    known = [
-        ratio * (1.0 + _CHANCE * (2.0 / n) ** 0.5) < 1.0
-        for ratio, n in zip((windows, rows), counts, strict=True)
+    few = [
+        x * (1.0 + _CHANCE * (2.0 / n) ** 0.5) >= 1.0 for x, n in zip((windows, rows), counts, strict=True)
     ]
-    gains = _gains(window) / (1.0 if detail is None else _gains(detail))
-    c = float(np.interp(windows, gains[::-1], _SHARES[::-1])) if known[0] else 0.0
-    return c, min(rows, 1.0) / float(
-        _less_neighbours(np.ones((1, 3, 3)), c, "nearest")[0, 1, 1]
-    ) ** 2 if known[1] else 1.0
+    crossed, squared = (float(np.prod(1.0 - edge / np.array(sides))) for edge in (0.5, 0.75))
+    roots = np.roots([squared - _G**2 * windows, 0.5 * windows - 2.0 * crossed, 1.0 - windows])
+    c = 0.0 if few[0] else float(np.clip(roots.real.min(), 0.0, 0.95))
+    return c, 1.0 if few[1] else min(rows, 1.0) * _norm2(c) / (1.0 - c) ** 2
 
 
-def _gains(vectors: np.ndarray) -> np.ndarray:
-    """Variances of E a for a of `vectors` (k, h, w), over those of independent errors, for all shares."""
-    padded = np.pad(vectors, ((0, 0), (1, 1), (1, 1)))
-    squares = [np.sum(_less_neighbours(padded, c, "constant") ** 2) for c in _SHARES]
-    return np.array(squares) / np.sum(vectors**2)
+def _norm2(c: float) -> float:
+    return 1.0 - 0.5 * c + (_G * c) ** 2
 
 
-def _less_neighbours(a: np.ndarray, c: float, mode: Literal["nearest", "constant"]) -> np.ndarray:
-    """(1 - c G) a / ||1 - c G|| of a (k, h, w, ...)."""
-    mean = a
-    for axis in (1, 2):
-        mean = scipy.ndimage.correlate1d(mean, [0.25, 0.5, 0.25], axis=axis, mode=mode)
-    return (a - c * mean) / (1.0 - 0.5 * c + (0.375 * c) ** 2) ** 0.5
-
-
-def _rows(T: Any, start: int, stop: int) -> np.ndarray:
-    if hasattr(T, "rows"):
-        return T.rows(start, stop)
-    return T[start:stop].toarray() if scipy.sparse.issparse(T) else T[start:stop]
+def _rows(*matrices: Any) -> Iterator[tuple[Any, ...]]:
+    """First row and rows of T (M, N), some at a time, float64."""
+    M, N = matrices[0].shape
+    for start in range(0, M, step := max(1, _AT_ONCE // N)):
+        some = (
+            T.rows(start, min(start + step, M)) if hasattr(T, "rows") else T[start : start + step]
+            for T in matrices
+        )
+        yield start, *(np.asarray(A.toarray() if scipy.sparse.issparse(A) else A, np.float64) for A in some)
