@@ -195,7 +195,7 @@ class Transport:
         InputError where T does not show its entries (compressed, or a LinearOperator) and none is given.
         """
         if isinstance(self._noise, Transport):
-            return Noise.measured_twice(self.matrices, self._noise.matrices, self.grid)
+            return Noise.measured_twice(self.matrices, self._noise.matrices)
         return self._noise or estimate(self.matrices, self.grid, self.camera_grid)
 
     @property

@@ -6,9 +6,8 @@ and E b of pixel i have the covariance
 
     q_ab = sum_j v_ij a_j b_j = rows_i (photons T (columns a b) + floor^2 columns . (a b))_i
 
-of pictures a, b less a share of what their neighbours are (`Noise.filtered`), or q_ab + (u / V - 1) q_a1 q_b1
-/ V, V = q_11, where the row adds up to a sum of variance u: a measured white's, or `Noise.sums` V. To first
-order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k = F^-1 b_k and the bounces of eq. 27:
+of a and b as `Noise.filtered` has them, or q_ab + (u / V - 1) q_a1 q_b1 / V, V = q_11, where the row adds up
+to a measured white of variance u. To first order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k = F^-1 b_k and the bounces of eq. 27:
 
     T p:    E p
     p:      -F^-1 X E p
@@ -210,8 +209,7 @@ def _least_squares(A: Operator, e: np.ndarray, free: np.ndarray, weights: np.nda
 def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:
     """Covariances (M, k, n, n) of E a, for a (N, k, n) and channel c; and of diag(E) as one more."""
     n, known, own = a.shape[-1], np.isfinite(noise.white[c]), 0.0
-    white = known.any() or noise.sums[c] != 1.0
-    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1) if white else a
+    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1) if known.any() else a
     i, j = np.triu_indices(w.shape[-1])
     seen = noise.filtered(w, T.grid, c)
     pairs = seen[..., i] * seen[..., j]
@@ -224,10 +222,10 @@ def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool
     if diagonal:
         q[..., -1, :-1] = q[..., :-1, -1] = own * w
         q[..., -1, -1] = own[..., 0]
-    if not white:
+    if not known.any():
         return q
-    V = np.maximum(q[..., n, n], 1e-300)
-    factor = (np.where(known[:, None], noise.white[c][:, None] / V, noise.sums[c]) - 1.0) / V
+    V = np.where(known[:, None], np.maximum(q[..., n, n], 1e-300), 1.0)
+    factor = np.where(known[:, None], (np.where(known, noise.white[c], 0.0)[:, None] / V - 1.0) / V, 0.0)
     q += factor[..., None, None] * q[..., n, :, None] * q[..., n, None, :]
     return np.delete(np.delete(q, n, axis=-1), n, axis=-2)
 

@@ -9,8 +9,7 @@ the wall has no texture. The smaller one counts. Blocks of different mean light 
 on anything else: of v ~ floor^2 (1 + q L) the dimmest blocks tell the floor, and those q are likely with
 which most blocks agree. Light off the diagonal is dim and leaves a range of q, in which the detail of the
 diagonal decides. Factors of rows are from the detail within a row, as far as its two halves agree; those of
-columns likewise. Where errors of a row cancel, the mean over the projector's window has less noise than the
-detail, and row sums less than their entries: that shows in their detail in the camera's window.
+columns likewise. Errors of a row that cancel show as row sums whose detail is below the noise of entries.
 
 Known limits: smooth errors are not seen; where less than a third of the blocks is smooth the result is an
 upper bound; entries that are exactly 0 were cut off by somebody and do not count; photon noise that only a
@@ -88,21 +87,21 @@ def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[
 
 
 def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tuple[Any, ...]:
-    """Photons, floor, rows (M,), columns (N,), direct, neighbours and sums."""
+    """Photons, floor, rows (M,), columns (N,), direct and neighbours."""
     (M, N), own = T.shape, camera_grid == grid and hasattr(T, "diagonal")
     F, texture = np.asarray(T.diagonal() if own else [], np.float64), np.ones(max(M, N))
     rows, columns = np.ones(M), np.ones(N)
     for size in _WINDOW:
-        camera, projector, v, light, sums = _blocks(T, grid, camera_grid, size, texture)
+        camera, projector, v, light = _blocks(T, grid, camera_grid, size, texture)
         if np.isfinite(v).sum() >= _ENOUGH:
             break
     else:
-        return 0.0, _of_neighbours(T), rows, columns, 1.0, 0.0, 1.0
-    first = _first_bounce(F, grid) if own else None
+        return 0.0, _of_neighbours(T), rows, columns, 1.0, 0.0
+    first = _picture(F, grid, np.ones(N)) if own else None
     if first and first[0] > 0.0:
         other = _blocks(T, grid, camera_grid, size, np.maximum(F / first[0], 0.1))
         if np.nanmedian(other[2]) < _TEXTURE * np.nanmedian(v):
-            (camera, projector, v, light, sums), first = other, None
+            (camera, projector, v, light), first = other, None
     width = _AGREE / (len(camera.detail) * len(projector.detail)) ** 0.5
     floor2, q, _ = _agreement(v, light, first, width)
     if _is_array(T) or hasattr(T, "row_blocks"):  # of an operator, N products
@@ -115,21 +114,14 @@ def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tup
     direct = 1.0 if first is None else min(first[1] / (floor2 * (1.0 + q * first[0])), 1.0)
     light, F = T @ np.stack([np.ones(N), columns], axis=1).astype(np.float32), F if own else np.zeros(M)
     V = floor2 * rows * (columns.sum() + q * light[:, 1] - own * columns[:M] * (1.0 + q * F))
-    d = ((light[:, 0] - F)[camera.pixels] * camera.weight) @ camera.detail.T / camera.gain
-    z = d**2 / np.maximum(V, _LEAST)[camera.pixels].mean(axis=1)[:, None]
-    cancelled = cancellation(
-        float(np.nanmedian(sums / v)),
-        float(np.median(z)) / _SQUARE,
-        (int(np.isfinite(v).sum()), z.size // 8),
-        [min(size[0], n) for n in grid],
-    )
-    return q * floor2, floor2**0.5, rows, columns, direct, *cancelled
+    sums = _picture(light[:, 0] - F, camera_grid, np.maximum(V, _LEAST))[1]
+    return q * floor2, floor2**0.5, rows, columns, direct, cancellation(sums, M // 8)
 
 
 def _blocks(
     T: Any, grid: tuple[int, int], camera_grid: tuple[int, int], size: tuple[int, int], texture: np.ndarray
-) -> tuple[Windows, Windows, np.ndarray, np.ndarray, np.ndarray]:
-    """Windows of camera and projector; v, NaN where not known, L, and v of sums, all for pairs of windows."""
+) -> tuple[Windows, Windows, np.ndarray, np.ndarray]:
+    """Windows of camera and projector, v and L (camera windows, projector windows); NaN where not known."""
     camera, projector = (Windows.of(pixels, *size, texture) for pixels in (camera_grid, grid))
     (a, p), (b, q) = camera.pixels.shape, projector.pixels.shape
     X = _entries(T, camera.pixels.ravel(), projector.pixels.ravel()).reshape(a, p, b, q)
@@ -140,9 +132,7 @@ def _blocks(
     d = np.einsum("ip,apbq,jq->abij", camera.detail, scaled, projector.detail, optimize=True)
     d /= camera.gain[:, None, :, None] * projector.gain[:, None, :]
     v = np.median(d**2, axis=(2, 3)) / _SQUARE
-    d = np.einsum("ip,apbq->abi", camera.detail, scaled) / camera.gain[:, None]
-    sums = np.median(d**2, axis=2) / _SQUARE / np.sum(projector.weight**2, axis=1)
-    return camera, projector, np.where(out, np.nan, v), np.maximum(X.mean(axis=(1, 3)), 0.0), sums
+    return camera, projector, np.where(out, np.nan, v), np.maximum(X.mean(axis=(1, 3)), 0.0)
 
 
 def _agreement(
@@ -173,12 +163,13 @@ def _agreement(
     return floor2(q), q, counts.max() / len(v)
 
 
-def _first_bounce(F: np.ndarray, grid: tuple[int, int]) -> tuple[float, float]:
-    """Median of F (N,), and an upper bound on its variance."""
+def _picture(F: np.ndarray, grid: tuple[int, int], variance: np.ndarray) -> tuple[float, float]:
+    """Median of a first bounce or other picture F (N,), and an upper bound on its noise over `variance`."""
     bounds = []
     for side, order in _DIAGONAL:
         window = Windows.of(grid, side, order, np.ones(len(F)), overlap=True)
-        bounds.append(np.median((F[window.pixels] @ window.detail.T) ** 2) / _SQUARE)
+        d2 = (F[window.pixels] @ window.detail.T) ** 2 / variance[window.pixels].mean(axis=1)[:, None]
+        bounds.append(np.median(d2) / _SQUARE)
     return max(float(np.median(F)), 0.0), float(min(bounds))
 
 

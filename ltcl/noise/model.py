@@ -4,15 +4,16 @@
     variance of T_c[i, j] = rows_c[i] columns_c[j] (photons_c max(T_c[i, j], 0) + floor_c^2)
 
 for channel c, times `direct_c` on the diagonal of a square T, whose light came straight from the projector.
-Errors of rows are independent of each other; those of a row may cancel in its pictures, in two ways
-(`covariance` in `ltcl.uncertainty`). A path tracer whose paths are stratified moves light between
-neighbouring columns: a row is e (1 - c G) / ||1 - c G||, of independent e, c = `neighbours`, and G the
-binomial mean of 3 x 3 columns. And rows may add up to a sum that is known better, as of a measured white.
+Errors of rows are independent of each other. Those of a row are, too, but where rows were made to add up to
+a measured white, whose variance is `white`: then they are those that add up to it (`covariance` in
+`ltcl.uncertainty`). And paths of a path tracer that miss a column meet its neighbours: a row of errors is
+e (1 - c G) / ||1 - c G||, e independent, G the binomial mean of 3 x 3 columns, c = `neighbours`, by row sums.
 
 Known limits: pictures of a scan by S-matrices share their noise, so that all entries of a batch are as noisy
 as its brightest; the model spreads that over the row. First bounce and sums are right, errors of smooth
 pictures up to 2.4 times smaller. Cells of an adaptive scan count as one pixel with the noise of all; errors
-of pictures are 0.9 to 1.2 times those of the model, as of a scan by pixels.
+of pictures are 0.9 to 1.2 times those of the model, as of a scan by pixels. Those of a path-traced T may be
+half of it where one wall is lit alone, and 1.3 times it where a small patch is.
 """
 
 from __future__ import annotations
@@ -35,8 +36,7 @@ _PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; s
 _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
 _AT_ONCE = 1 << 22  # samples
 _FIRST = 64  # first bounces at least, whose variance may have a factor of its own
-_WINDOW, _CHANCE = 6, 3.0  # side of windows whose sums are compared; standard deviations that mean nothing
-_G = 0.375  # ||G||
+_G, _CHANCE = 0.375, 3.0  # ||G||; standard deviations of row sums that mean nothing
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -55,9 +55,8 @@ class Noise:
         "acquired", "measured twice", "given", or "estimated" from T alone.
     direct : (channels,) float64
         Factor of the variance of the first bounce: far below 1 of a path-traced T.
-    neighbours, sums : (channels,) float64
-        c above, and the variance of row sums over that by c, where `white` is infinite; 0 and 1 where errors
-        are independent.
+    neighbours : (channels,) float64
+        Share c of its neighbours that an entry's error lacks, 0 to 1; 0 where errors are independent.
 
     InputError for other shapes, NaN, and negative numbers.
 
@@ -76,12 +75,11 @@ class Noise:
     source: str = "given"
     direct: Any = 1.0
     neighbours: Any = 0.0
-    sums: Any = 1.0
 
     def __post_init__(self) -> None:
         n = np.size(self.photons)
         checks.one_of("noise.source", self.source, SOURCES)
-        for name in ("direct", "neighbours", "sums"):
+        for name in ("direct", "neighbours"):
             object.__setattr__(self, name, np.broadcast_to(getattr(self, name), n))
         for name in (f.name for f in fields(self) if f.name != "source"):
             value = checks.real(f"noise.{name}", getattr(self, name)).astype(np.float64)
@@ -125,10 +123,12 @@ class Noise:
 
     def filtered(self, pictures: np.ndarray, grid: tuple[int, int], channel: int = 0) -> np.ndarray:
         """`pictures` (N, ...) or (3 N, ...) as independent errors see them: (1 - c G) a / ||1 - c G||."""
+        if not self.neighbours[channel]:
+            return pictures
         c, mean = self.neighbours[channel], pictures.reshape(-1, *grid, *pictures.shape[1:])
         for axis in (1, 2):
             mean = scipy.ndimage.correlate1d(mean, [0.25, 0.5, 0.25], axis=axis, mode="nearest")
-        return (pictures - c * mean.reshape(pictures.shape)) / _norm2(c) ** 0.5
+        return (pictures - c * mean.reshape(pictures.shape)) / (1.0 - 0.5 * c + (_G * c) ** 2) ** 0.5
 
     @classmethod
     def fit(
@@ -145,7 +145,7 @@ class Noise:
         return cls(photons, floor, rows, columns, np.broadcast_to(white, rows.shape), source, direct)
 
     @classmethod
-    def measured_twice(cls, matrices: Sequence[Any], others: Sequence[Any], grid: tuple[int, int]) -> Self:
+    def measured_twice(cls, matrices: Sequence[Any], others: Sequence[Any]) -> Self:
         """Of a T (M, N) and of a second measurement, equally noisy: (T_1 - T_2)^2 / 2 has its variance.
 
         What changed smoothly between both, as a lamp does, counts as noise. InputError where entries are the
@@ -158,8 +158,7 @@ class Noise:
         noise = cls.fit(matrices[0].shape, [_differences(*pair) for pair in pairs], "measured twice")
         if not np.any(noise.floor + noise.photons):
             raise InputError("noise has the same entries as matrix; it must be a second measurement")
-        neighbours, sums = np.transpose([_cancellation(*pair, grid) for pair in pairs])
-        return replace(noise, neighbours=neighbours, sums=sums)
+        return replace(noise, neighbours=[_cancellation(*pair) for pair in pairs])
 
     def require(self, channels: int, shape: tuple[int, int]) -> None:
         """InputError where this is the noise of a T of other channels or another shape (M, N)."""
@@ -237,41 +236,28 @@ def _differences(first: Any, second: Any) -> Iterator[tuple[np.ndarray, ...]]:
         yield i + start, j, (a + b) / 2, (a - b) ** 2 / 2
 
 
-def _cancellation(first: Any, second: Any, grid: tuple[int, int]) -> tuple[float, float]:
-    """`cancellation` of the differences of two T (M, N), but for their diagonal."""
-    sides, ratios = [min(_WINDOW, n) for n in grid], []
-    (h, w), (a, b) = grid, sides
+def _cancellation(first: Any, second: Any) -> float:
+    """c by the differences of two T (M, N), but for their diagonal."""
+    ratios: list[np.ndarray] = []
     for start, A, B in _rows(first, second):
         E = A - B
-        E[np.arange(len(E)), np.arange(start, start + len(E)) % E.shape[1]] *= (
-            first.shape[0] != first.shape[1]
-        )
-        tiles = E.reshape(-1, h, w)[:, : h // a * a, : w // b * b].reshape(len(E), h // a, a, -1, b)
-        sums = [np.sum(tiles.sum(axis=(2, 4)) ** 2, axis=(1, 2)), E.sum(axis=1) ** 2]
-        squares = [np.sum(tiles**2, axis=(1, 2, 3, 4)), np.sum(E**2, axis=1)]
-        ratios.append(np.divide(sums, squares, out=np.ones((2, len(E))), where=np.array(squares) > 0))
-    windows, rows = np.concatenate(ratios, axis=1)
-    return cancellation(windows.mean(), rows.mean(), (len(rows) * (h // a) * (w // b), len(rows)), sides)
+        if first.shape[0] == first.shape[1]:
+            np.fill_diagonal(E[:, start:], 0.0)
+        noisy = E[E.any(axis=1)]
+        ratios.append(np.sum(noisy, axis=1) ** 2 / np.sum(noisy**2, axis=1))
+    sums = np.concatenate(ratios)
+    return cancellation(float(np.mean(sums)) if len(sums) else 1.0, len(sums))
 
 
-def cancellation(
-    windows: float, rows: float, counts: tuple[int, int], sides: Sequence[int]
-) -> tuple[float, float]:
-    """c and `sums` from variances of sums over windows and over rows, over those of independent errors.
+def cancellation(ratio: float, rows: int) -> float:
+    """c, so that (1 - c)^2 / ||1 - c G||^2 is the variance of row sums over that of independent errors.
 
-    `counts` are of samples, `sides` of a window, over which 1 - c G sums to 1 - 2 c crossed + c^2 squared.
+    0 where it may be below 1 by chance, of so many rows.
     """
-    few = [
-        x * (1.0 + _CHANCE * (2.0 / n) ** 0.5) >= 1.0 for x, n in zip((windows, rows), counts, strict=True)
-    ]
-    crossed, squared = (float(np.prod(1.0 - edge / np.array(sides))) for edge in (0.5, 0.75))
-    roots = np.roots([squared - _G**2 * windows, 0.5 * windows - 2.0 * crossed, 1.0 - windows])
-    c = 0.0 if few[0] else float(np.clip(roots.real.min(), 0.0, 0.95))
-    return c, 1.0 if few[1] else min(rows, 1.0) * _norm2(c) / (1.0 - c) ** 2
-
-
-def _norm2(c: float) -> float:
-    return 1.0 - 0.5 * c + (_G * c) ** 2
+    if ratio * (1.0 + _CHANCE * (2.0 / max(rows, 1)) ** 0.5) >= 1.0:
+        return 0.0
+    a, b = 1.0 - _G**2 * ratio, 1.0 - 0.25 * ratio  # of a c^2 - 2 b c + 1 - ratio = 0
+    return (b - (b * b - a * (1.0 - ratio)) ** 0.5) / a
 
 
 def _rows(*matrices: Any) -> Iterator[tuple[Any, ...]]:
