@@ -7,7 +7,8 @@ and E b of pixel i have the covariance
     q_ab = sum_j v_ij a_j b_j = rows_i (photons T (columns a b) + floor^2 columns . (a b))_i
 
 of a and b as `Noise.filtered` has them, or q_ab + (u / V - 1) q_a1 q_b1 / V, V = q_11, where the row adds up
-to a measured white of variance u. To first order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k = F^-1 b_k and the bounces of eq. 27:
+to a measured white of variance u. To first order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k =
+F^-1 b_k and the bounces of eq. 27:
 
     T p:    E p
     p:      -F^-1 X E p
@@ -28,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -44,8 +46,14 @@ _RTOL = 0.05  # of solves, whose solutions are the smaller part
 _STEPS = 100  # of least squares
 
 
+class _Deviations:
+    def __repr__(self) -> str:
+        rms = (f"{k} {np.sqrt(np.mean(np.square(x, dtype=np.float64))):.2g}" for k, x in vars(self).items())
+        return f"<ltcl standard deviations, rms of {', '.join(rms)}>"
+
+
 @dataclass(frozen=True, repr=False, eq=False)
-class SeparationStd:
+class SeparationStd(_Deviations):
     """Standard deviations of the result of `ltcl.separate`, in the units of the image, float32.
 
     `direct` is like the image, `bounces` (bounces, ...): of errors against what the true T makes of the same
@@ -56,12 +64,9 @@ class SeparationStd:
     direct: np.ndarray
     bounces: np.ndarray
 
-    def __repr__(self) -> str:
-        return f"<ltcl standard deviations, rms of direct and bounces {_rms(self.direct, *self.bounces)}>"
-
 
 @dataclass(frozen=True, repr=False, eq=False)
-class CompensationStd:
+class CompensationStd(_Deviations):
     """Standard deviations of the result of `ltcl.compensate`, float32.
 
     `pattern` at this gain, in light of the projector: 0 where it is masked, or at a bound and clipped.
@@ -70,16 +75,6 @@ class CompensationStd:
 
     pattern: np.ndarray
     appearance: np.ndarray
-
-    def __repr__(self) -> str:
-        return (
-            f"<ltcl standard deviations, rms of pattern and appearance {_rms(self.pattern, self.appearance)}>"
-        )
-
-
-def _rms(*pictures: np.ndarray) -> str:
-    values = (np.sqrt(np.mean(np.square(picture, dtype=np.float64))) for picture in pictures)
-    return ", ".join(f"{value:.2g}" for value in values)
 
 
 def of_separation(
@@ -134,81 +129,53 @@ def of_compensation(
     q = [covariance(T, noise, c, a[..., None].astype(np.float64))[..., 0, 0] for c, a in enumerate(mixed)]
     q = [np.maximum(variance, 0.0) for variance in q]
     appearance = shape.pack([np.sqrt(variance) for variance in q], T.camera_grid)
-    random = np.random.default_rng(0)
-    if systems:
-        joint = q if len(systems) == len(q) else [np.concatenate(q)]
-        parts = free if len(systems) == len(q) else [np.concatenate(free)]
-        W = weights or [np.ones((1, 1))] * len(systems)
-        variances = [
-            _clipped(T, noise, c, system, joint[c], parts[c], np.broadcast_to(W[c], joint[c].shape), random)
-            for c, system in enumerate(systems)
-        ]
-        variances = variances if len(systems) == len(q) else np.split(variances[0], 3)
-    else:
-        variances = []
-        for c, (variance, f) in enumerate(zip(q, np.atleast_2d(T.first_bounce), strict=True)):
-            e = _draws(variance[..., None, None], random, variance.shape[1])[..., 0]
-            parts = [slice(start, start + _TOGETHER) for start in range(0, variance.shape[1], _TOGETHER)]
-            x = np.concatenate([_solve(T, c, e[:, some], inverse) for some in parts], axis=1)
-            variances.append(_ratio(variance + _square(T, noise, c, x, x - e), f[:, None] ** 2))
-        if T.mixing is not None:
-            variances = list(np.einsum("cd,dnk->cnk", np.linalg.inv(T.mixing) ** 2, np.stack(variances)))
-    deviations = [np.sqrt(variance * lit) for variance, lit in zip(variances, free, strict=True)]
-    return CompensationStd(
-        *(picture.astype(np.float32) for picture in (shape.pack(deviations, T.grid), appearance))
-    )
-
-
-def _clipped(
-    T: Transport,
-    noise: Noise,
-    c: int,
-    system: tuple[Operator, np.ndarray],
-    q: np.ndarray,
-    free: np.ndarray,
-    weights: np.ndarray,
-    random: np.random.Generator,
-) -> np.ndarray:
-    """Variances (N, k) of light that solves least squares, from q (M, k) of the picture."""
-    (A, scale), direct = system, T.is_square and not T.couples
-    variances = np.empty(free.shape)
-    for start in range(0, q.shape[1], _TOGETHER):
-        some = slice(start, start + _TOGETHER)
-        e = _draws(q[:, some, None, None], random, q.shape[1] if direct else 0)[..., 0]
-        x = _least_squares(A, e, free[:, some, None] & (scale > 0)[:, None, None], weights[:, some, None])
-        if direct:  # of A = S: e of the pixel itself, and a rest as above
-            variances[:, some] = q[:, some] + _square(T, noise, c, x, x - e)
-        else:
-            variances[:, some] = np.mean(x**2, axis=-1)
-    return _ratio(variances, scale[:, None] ** 2)
+    scales = [scale for _, scale in systems] or list(np.atleast_2d(T.first_bounce))
+    own, random, variances = not (systems and T.couples) and T.is_square, np.random.default_rng(0), []
+    errors, lit = (x if len(scales) == len(q) else [np.concatenate(x)] for x in (q, free))
+    for c, (variance, f, scale) in enumerate(zip(errors, lit, scales, strict=True)):
+        k, w = variance.shape[1], np.broadcast_to(weights[c] if weights else 1.0, variance.shape)
+        light, f = np.empty(f.shape), f & (scale > 0)[:, None]
+        for some in (slice(start, start + _TOGETHER) for start in range(0, k, _TOGETHER)):
+            e = _draws(variance[:, some, None, None], random, k if own else 0)[..., 0]
+            if systems:
+                x = _least_squares(systems[c][0], e, f[:, some, None], w[:, some, None])
+            else:
+                x = _solve(T, c, e, inverse)
+            rest = _square(T, noise, c, x, x - e) + variance[:, some] if own else np.mean(x**2, axis=-1)
+            light[:, some] = rest  # of S: e of the pixel itself, and a rest as above
+        variances.append(_ratio(light, scale[:, None] ** 2))
+    if T.mixing is not None and not systems:
+        variances = list(np.einsum("cd,dnk->cnk", np.linalg.inv(T.mixing) ** 2, np.stack(variances)))
+    variances = variances if len(scales) == len(q) else np.split(variances[0], 3)
+    deviations = [np.sqrt(variance * f) for variance, f in zip(variances, free, strict=True)]
+    pictures = shape.pack(deviations, T.grid), appearance
+    return CompensationStd(*(picture.astype(np.float32) for picture in pictures))
 
 
 def _least_squares(A: Operator, e: np.ndarray, free: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The x (N, k, draws), 0 but where `free`, for which w A x is nearest to w e (M, k, draws)."""
 
-    def product(a: np.ndarray, transpose: bool = False) -> np.ndarray:
-        flat = a.reshape(len(a), -1).astype(np.float32)
-        return (A.T @ flat if transpose else A @ flat).reshape(-1, *e.shape[1:])
+    def product(matrix: Any, a: np.ndarray) -> np.ndarray:
+        return (matrix @ a.reshape(len(a), -1).astype(np.float32)).reshape(-1, *e.shape[1:])
 
-    r, square = e, weights**2
-    p = s = free * product(square * r, transpose=True)
-    x, first = np.zeros(s.shape), np.sum(s**2, axis=0)
-    size = first
-    for _ in range(_STEPS):  # of conjugate gradients for the normal equations
+    r, square, size = e, weights**2, np.ones(e.shape[1:])
+    x, p, first = np.zeros((len(free), *e.shape[1:])), 0.0, size
+    for step in range(_STEPS):  # of conjugate gradients for the normal equations
+        s, before = free * product(A.T, square * r), size
+        size = np.sum(s**2, axis=0)
+        first = first if step else size
         if (size <= _RTOL**2 * first).all():
             break
-        Ap = product(p)
+        p = s + _ratio(size, before) * p
+        Ap = product(A, p)
         alpha = _ratio(size, np.sum(square * Ap**2, axis=0))
         x, r = x + alpha * p, r - alpha * Ap
-        s = free * product(square * r, transpose=True)
-        before, size = size, np.sum(s**2, axis=0)
-        p = s + _ratio(size, before) * p
     return x
 
 
 def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:
     """Covariances (M, k, n, n) of E a, for a (N, k, n) and channel c; and of diag(E) as one more."""
-    n, known, own = a.shape[-1], np.isfinite(noise.white[c]), 0.0
+    n, known, own = a.shape[-1], np.isfinite(noise.white[c]), np.zeros((1, 1, 1))
     w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1) if known.any() else a
     i, j = np.triu_indices(w.shape[-1])
     seen = noise.filtered(w, T.grid, c)
