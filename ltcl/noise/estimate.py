@@ -112,9 +112,11 @@ def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tup
         if share >= _TRUSTED:
             (floor2, q), rows, columns = other, r, c
     direct = 1.0 if first is None else min(first[1] / (floor2 * (1.0 + q * first[0])), 1.0)
-    light, F = T @ np.stack([np.ones(N), columns], axis=1).astype(np.float32), F if own else np.zeros(M)
-    V = floor2 * rows * (columns.sum() + q * light[:, 1] - own * columns[:M] * (1.0 + q * F))
-    sums = _picture(light[:, 0] - F, camera_grid, np.maximum(V, _LEAST))[1]
+    white, weighted = (T @ np.stack([np.ones(N), columns], axis=1).astype(np.float32)).T
+    V = columns.sum() + q * weighted
+    if own:
+        white, V = white - F, V - columns * (1.0 + q * F)
+    sums = _picture(white, camera_grid, np.maximum(floor2 * rows * V, _LEAST))[1]
     return q * floor2, floor2**0.5, rows, columns, direct, cancellation(sums, M // 8)
 
 

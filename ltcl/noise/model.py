@@ -238,15 +238,14 @@ def _differences(first: Any, second: Any) -> Iterator[tuple[np.ndarray, ...]]:
 
 def _cancellation(first: Any, second: Any) -> float:
     """c by the differences of two T (M, N), but for their diagonal."""
-    ratios: list[np.ndarray] = []
+    sums: list[float] = []
     for start, A, B in _rows(first, second):
         E = A - B
         if first.shape[0] == first.shape[1]:
             np.fill_diagonal(E[:, start:], 0.0)
         noisy = E[E.any(axis=1)]
-        ratios.append(np.sum(noisy, axis=1) ** 2 / np.sum(noisy**2, axis=1))
-    sums = np.concatenate(ratios)
-    return cancellation(float(np.mean(sums)) if len(sums) else 1.0, len(sums))
+        sums.extend(np.sum(noisy, axis=1) ** 2 / np.sum(noisy**2, axis=1))
+    return cancellation(float(np.mean(sums or [1.0])), len(sums))
 
 
 def cancellation(ratio: float, rows: int) -> float:
@@ -264,8 +263,6 @@ def _rows(*matrices: Any) -> Iterator[tuple[Any, ...]]:
     """First row and rows of T (M, N), some at a time, float64."""
     M, N = matrices[0].shape
     for start in range(0, M, step := max(1, _AT_ONCE // N)):
-        some = (
-            T.rows(start, min(start + step, M)) if hasattr(T, "rows") else T[start : start + step]
-            for T in matrices
-        )
+        stop = min(start + step, M)
+        some = (T.rows(start, stop) if hasattr(T, "rows") else T[start:stop] for T in matrices)
         yield start, *(np.asarray(A.toarray() if scipy.sparse.issparse(A) else A, np.float64) for A in some)
