@@ -190,9 +190,9 @@ def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ..
         for rows, columns, *rest in samples
     ]
     i, j, light, square = map(np.concatenate, zip(*parts, strict=True))
-    own = (i == j) & (shape[0] == shape[1]) & (not exact)
+    own = (i == j) & (shape[0] == shape[1])
     first = [x[own] for x in (i, light, square)]
-    i, j, light, square = (x[~own] for x in (i, j, light, square))
+    i, j, light, square = (x if exact else x[~own] for x in (i, j, light, square))
     factors, photons = [np.ones(n) for n in shape], 0.0
     top, floor2, scale = light.max(initial=0.0) or 1.0, float(square.mean()) if len(square) else 0.0, 1.0
     octave = np.clip(_LIGHTS - 2 + np.frexp(light / top)[1], 1, _LIGHTS - 2)
@@ -221,10 +221,10 @@ def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ..
             x = scipy.optimize.nnls(A * weight[:, None], mean * weight)[0]
         photons, floor2 = x[0] / top, max(x[1], 1e-6 * mean.max())
     photons, floor2, direct = scale * photons, scale * floor2, 1.0
-    if len(first[0]) >= _FIRST:
+    if len(first[0]) >= (1 if exact else _FIRST):
         model = factors[0][first[0]] * factors[1][first[0]] * (photons * np.maximum(first[1], 0.0) + floor2)
         z = first[2] / np.maximum(model, 1e-300)
-        direct = float(np.minimum(z, _CLIPPED * z.mean()).mean())
+        direct = float(np.average(np.minimum(z, _CLIPPED * z.mean()), weights=model if exact else None))
     return photons, floor2**0.5, *factors, direct
 
 
