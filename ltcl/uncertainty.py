@@ -141,8 +141,9 @@ def of_compensation(
                 x = _least_squares(systems[c][0], e, f[:, some, None], w[:, some, None])
             else:
                 x = _solve(T, c, e, inverse)
-            rest = _square(T, noise, c, x, x - e) + variance[:, some] if own else np.mean(x**2, axis=-1)
-            light[:, some] = rest  # of S: e of the pixel itself, and a rest as above
+            light[:, some] = np.mean(x**2, axis=-1)
+            if own:  # of S: e of the pixel itself, and a rest as above
+                light[:, some] = variance[:, some] + _square(T, noise, c, x, x - e)
         variances.append(_ratio(light, scale[:, None] ** 2))
     if T.mixing is not None and not systems:
         variances = list(np.einsum("cd,dnk->cnk", np.linalg.inv(T.mixing) ** 2, np.stack(variances)))
@@ -176,7 +177,7 @@ def _least_squares(A: Operator, e: np.ndarray, free: np.ndarray, weights: np.nda
 def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:
     """Covariances (M, k, n, n) of E a, for a (N, k, n) and channel c; and of diag(E) as one more."""
     n, known, own = a.shape[-1], np.isfinite(noise.white[c]), np.zeros((1, 1, 1))
-    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1) if known.any() else a
+    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1)[..., : n + known.any()]
     i, j = np.triu_indices(w.shape[-1])
     seen = noise.filtered(w, T.grid, c)
     pairs = seen[..., i] * seen[..., j]

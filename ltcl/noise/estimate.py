@@ -144,7 +144,6 @@ def _agreement(
     dim = np.argsort(light[np.isfinite(v)])
     v, light = (x[np.isfinite(v)][dim] for x in (np.maximum(v, _LEAST), light))
     ratios = _RATIOS / max(float(np.median(light)), _LEAST)
-
     dimmest = slice(0, max(len(v) // 4, _ENOUGH))
 
     def floor2(q: float) -> float:

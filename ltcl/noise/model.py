@@ -4,16 +4,15 @@
     variance of T_c[i, j] = rows_c[i] columns_c[j] (photons_c max(T_c[i, j], 0) + floor_c^2)
 
 for channel c, times `direct_c` on the diagonal of a square T, whose light came straight from the projector.
-Errors of rows are independent of each other. Those of a row are, too, but where rows were made to add up to
-a measured white, whose variance is `white`: then they are those that add up to it (`covariance` in
-`ltcl.uncertainty`). And paths of a path tracer that miss a column meet its neighbours: a row of errors is
-e (1 - c G) / ||1 - c G||, e independent, G the binomial mean of 3 x 3 columns, c = `neighbours`, by row sums.
+Entries are independent of each other; but where the rows of T were made to add up to a measured white, whose
+variance is `white`, errors of a row are those that add up to it (`covariance` in `ltcl.uncertainty`). Paths
+of a path tracer that miss a column meet its neighbours: errors of a row are e (1 - c G) / ||1 - c G||, e
+independent, G the binomial mean of 3 x 3 columns, c = `neighbours`, by row sums.
 
 Known limits: pictures of a scan by S-matrices share their noise, so that all entries of a batch are as noisy
 as its brightest; the model spreads that over the row. First bounce and sums are right, errors of smooth
-pictures up to 2.4 times smaller. Cells of an adaptive scan count as one pixel with the noise of all; errors
-of pictures are 0.9 to 1.2 times those of the model, as of a scan by pixels. Those of a path-traced T may be
-half of it where one wall is lit alone, and 1.3 times it where a small patch is.
+pictures up to 2.4 times smaller. Cells of an adaptive scan count as one pixel. Errors of a path-traced T are
+0.5 of those of the model where one wall is lit alone, and 1.3 times those where a patch is.
 """
 
 from __future__ import annotations
@@ -95,9 +94,8 @@ class Noise:
     def uniform(cls, shape: tuple[int, int], floor: Any, photons: Any = 0.0, source: str = "given") -> Self:
         """The same for all entries of a T (M, N); `floor` and `photons` are floats, or one a channel."""
         f, p = np.broadcast_arrays(np.atleast_1d(floor), np.atleast_1d(photons))
-        M, N = shape
-        n = len(f)
-        return cls(p, f, np.ones((n, M)), np.ones((n, N)), np.full((n, M), np.inf), source)
+        rows, columns = (np.ones((len(f), n)) for n in shape)
+        return cls(p, f, rows, columns, np.full(rows.shape, np.inf), source)
 
     def __repr__(self) -> str:
         floor = ", ".join(f"{value:.2g}" for value in self.floor)
@@ -162,9 +160,9 @@ class Noise:
 
     def require(self, channels: int, shape: tuple[int, int]) -> None:
         """InputError where this is the noise of a T of other channels or another shape (M, N)."""
-        own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
-        if own != (channels, shape):
-            raise InputError(f"noise is of {own[0]} channel(s) {own[1]}; T has {channels} {shape}")
+        n, own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
+        if (n, own) != (channels, shape):
+            raise InputError(f"noise is of {n} channel(s) {own}; T has {channels} {shape}")
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Numbers for files, by names that begin with ``noise_``."""
@@ -253,10 +251,9 @@ def cancellation(ratio: float, rows: int) -> float:
 
     0 where it may be below 1 by chance, of so many rows.
     """
-    if ratio * (1.0 + _CHANCE * (2.0 / max(rows, 1)) ** 0.5) >= 1.0:
-        return 0.0
+    certain = ratio * (1.0 + _CHANCE * (2.0 / max(rows, 1)) ** 0.5) < 1.0
     a, b = 1.0 - _G**2 * ratio, 1.0 - 0.25 * ratio  # of a c^2 - 2 b c + 1 - ratio = 0
-    return (b - (b * b - a * (1.0 - ratio)) ** 0.5) / a
+    return (b - (b * b - a * (1.0 - ratio)) ** 0.5) / a if certain else 0.0
 
 
 def _rows(*matrices: Any) -> Iterator[tuple[Any, ...]]:
