@@ -29,7 +29,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -37,13 +36,12 @@ from ltcl import layout
 from ltcl.noise import Noise
 from ltcl.operators import Operator
 from ltcl.solvers import Inverse, solve
+from ltcl.solvers.bounded import least_squares
 from ltcl.transport import Transport, default_rtol
 
-_DRAWS, _FRAME_DRAWS = 8, 4  # of one picture, and of each of several
-_WHOLE_DRAWS = 16  # of errors that have no part in closed form
+_DRAWS, _FRAME_DRAWS, _WHOLE_DRAWS = 8, 4, 16  # of one picture, of each of several, without a closed form
 _TOGETHER = 8  # pictures whose draws are solved at once
 _RTOL = 0.05  # of solves, whose solutions are the smaller part
-_STEPS = 100  # of least squares
 
 
 class _Deviations:
@@ -138,7 +136,7 @@ def of_compensation(
         for some in (slice(start, start + _TOGETHER) for start in range(0, k, _TOGETHER)):
             e = _draws(variance[:, some, None, None], random, k if own else 0)[..., 0]
             if systems:
-                x = _least_squares(systems[c][0], e, f[:, some, None], w[:, some, None])
+                x = least_squares(systems[c][0], e, f[:, some, None], w[:, some, None], rtol=_RTOL)
             else:
                 x = _solve(T, c, e, inverse)
             light[:, some] = np.mean(x**2, axis=-1)
@@ -151,27 +149,6 @@ def of_compensation(
     deviations = [np.sqrt(variance * f) for variance, f in zip(variances, free, strict=True)]
     pictures = shape.pack(deviations, T.grid), appearance
     return CompensationStd(*(picture.astype(np.float32) for picture in pictures))
-
-
-def _least_squares(A: Operator, e: np.ndarray, free: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The x (N, k, draws), 0 but where `free`, for which w A x is nearest to w e (M, k, draws)."""
-
-    def product(matrix: Any, a: np.ndarray) -> np.ndarray:
-        return (matrix @ a.reshape(len(a), -1).astype(np.float32)).reshape(-1, *e.shape[1:])
-
-    r, square, size = e, weights**2, np.ones(e.shape[1:])
-    x, p, first = np.zeros((len(free), *e.shape[1:])), 0.0, size
-    for step in range(_STEPS):  # of conjugate gradients for the normal equations
-        s, before = free * product(A.T, square * r), size
-        size = np.sum(s**2, axis=0)
-        first = first if step else size
-        if (size <= _RTOL**2 * first).all():
-            break
-        p = s + _ratio(size, before) * p
-        Ap = product(A, p)
-        alpha = _ratio(size, np.sum(square * Ap**2, axis=0))
-        x, r = x + alpha * p, r - alpha * Ap
-    return x
 
 
 def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:

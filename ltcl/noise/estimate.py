@@ -40,7 +40,7 @@ _TRUSTED = 0.7  # share of blocks that agree: from there on, the detail of singl
 _CHANCE = 2.0  # standard deviations of a count, or of a correlation, that mean nothing
 _TEXTURE = 0.5  # of the variance: where texture leaves less than this, it is divided by
 _ROWS, _AT_ONCE = 512, 4096  # rows: of pairs of neighbours at most; in memory
-_LEAST = 1e-60
+_LEAST, _ARRAYS = 1e-60, (np.ndarray, scipy.sparse.csr_array)
 
 
 class Windows(NamedTuple):
@@ -78,7 +78,7 @@ def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[
     InputError for compressed ones, whose noise has no detail of its own, and what shows no entries.
     """
     for T in matrices:
-        if made_with(T) is not None or not (_is_array(T) or hasattr(T, "between")):
+        if made_with(T) is not None or not (isinstance(T, _ARRAYS) or hasattr(T, "between")):
             text = f"T is made of {type(T).__name__}, whose noise does not show in its entries"
             raise InputError(f"noise is None, but {text}; give noise=, as that of what it was made from")
     channels = [_channel(T, grid, camera_grid) for T in matrices]
@@ -104,7 +104,7 @@ def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tup
             (camera, projector, v, light), first = other, None
     width = _AGREE / (len(camera.detail) * len(projector.detail)) ** 0.5
     floor2, q, _ = _agreement(v, light, first, width)
-    if _is_array(T) or hasattr(T, "row_blocks"):  # of an operator, N products
+    if isinstance(T, _ARRAYS) or hasattr(T, "row_blocks"):  # of an operator, N products
         r = _factors(lambda i: _entries(T, i, projector.pixels.ravel()), M, projector, q)
         c = _factors(lambda j: _entries(T, camera.pixels.ravel(), j).T, N, camera, q)
         mean = r[camera.pixels].mean(axis=1)[:, None] * c[projector.pixels].mean(axis=1)
@@ -200,21 +200,16 @@ def _factors(entries: Callable[[np.ndarray], np.ndarray], n: int, window: Window
 
 def _entries(T: Any, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """T[rows][:, columns], float64."""
-    if not _is_array(T):
+    if not isinstance(T, _ARRAYS):
         order, back = np.unique(rows, return_inverse=True)  # a store reads rows in ascending order
         return np.asarray(T.between(order, columns), np.float64)[back]
-    some = T[rows][:, columns] if len(rows) < len(columns) else T[:, columns][rows]
+    some: Any = T[rows][:, columns] if len(rows) < len(columns) else T[:, columns][rows]
     return np.asarray(some.toarray() if scipy.sparse.issparse(some) else some, np.float64)
-
-
-def _is_array(T: Any) -> bool:
-    return isinstance(T, (np.ndarray, scipy.sparse.csr_array))
 
 
 def _of_neighbours(T: Any) -> float:
     """Of neighbours in a row that are both not 0."""
     rows = np.unique(np.linspace(0, T.shape[0] - 1, _ROWS).astype(int))
     X = _entries(T, rows, np.arange(T.shape[1]))
-    pairs = (X[:, 1:] != 0) & (X[:, :-1] != 0)
-    d = np.diff(X)[pairs]
+    d = np.diff(X)[(X[:, 1:] != 0) & (X[:, :-1] != 0)]
     return float(np.median(np.abs(d)) / _SQUARE**0.5 / 2**0.5) if len(d) >= _ENOUGH else 0.0

@@ -33,8 +33,7 @@ SOURCES = ("given", "acquired", "measured twice", "estimated")
 Samples = Iterable[Sequence[np.ndarray]]
 _PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; samples of a row, about
 _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
-_AT_ONCE = 1 << 22  # samples
-_FIRST = 64  # first bounces at least, whose variance may have a factor of its own
+_AT_ONCE, _FIRST = 1 << 22, 64  # samples; first bounces at least, whose variance has a factor of its own
 _G, _CHANCE = 0.375, 3.0  # ||G||; standard deviations of row sums that mean nothing
 
 
@@ -183,10 +182,7 @@ class Noise:
 def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ...]:
     """Photons, floor, rows (M,), columns (N,) and direct: means in octaves of light, and factors."""
     stride = max(1, min(shape) // _ENTRIES)
-    parts = [
-        [x[(rows - columns) % stride == 0] for x in (rows, columns, *rest)]
-        for rows, columns, *rest in samples
-    ]
+    parts = [[x[(i - j) % stride == 0] for x in (i, j, *rest)] for i, j, *rest in samples]
     i, j, light, square = map(np.concatenate, zip(*parts, strict=True))
     own = (i == j) & (shape[0] == shape[1])
     first = [x[own] for x in (i, light, square)]
