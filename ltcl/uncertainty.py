@@ -153,14 +153,14 @@ def of_compensation(
 
 def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:
     """Covariances (M, k, n, n) of E a, for a (N, k, n) and channel c; and of diag(E) as one more."""
-    n, known, own = a.shape[-1], np.isfinite(noise.white[c]), np.zeros((1, 1, 1))
+    n, known = a.shape[-1], np.isfinite(noise.white[c])
+    own = noise.diagonal(T.first_bounce)[c, :, None, None] ** 2 if T.is_square else np.zeros((1, 1, 1))
     w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1)[..., : n + known.any()]
     i, j = np.triu_indices(w.shape[-1])
     seen = noise.filtered(w, T.grid, c)
     pairs = seen[..., i] * seen[..., j]
     sums = variance(T, noise, c, pairs.reshape(len(pairs), -1)).reshape(-1, *pairs.shape[1:])
-    if T.is_square:
-        own = noise.diagonal(T.first_bounce)[c, :, None, None] ** 2
+    if noise.neighbours[c]:
         sums += own * (w[..., i] * w[..., j] - pairs)  # the first bounce has no part in its neighbours
     q = np.zeros((*sums.shape[:2], *2 * (w.shape[-1] + diagonal,)))
     q[..., i, j] = q[..., j, i] = sums
