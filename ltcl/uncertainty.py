@@ -6,8 +6,9 @@ and E b of pixel i have the covariance
 
     q_ab = sum_j v_ij a_j b_j = rows_i (photons T (columns a b) + floor^2 columns . (a b))_i
 
-or q_ab + (u / V - 1) q_a1 q_b1 / V, V = q_11, where the row adds up to a measured white of variance u. To
-first order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k = F^-1 b_k and the bounces of eq. 27:
+of a and b as `Noise.filtered` has them, or q_ab + (u / V - 1) q_a1 q_b1 / V, V = q_11, where the row adds up
+to a measured white of variance u. To first order, with F = diag(T), D = diag(E), X = S^-1 = F T^-1, p_k =
+F^-1 b_k and the bounces of eq. 27:
 
     T p:    E p
     p:      -F^-1 X E p
@@ -35,18 +36,22 @@ from ltcl import layout
 from ltcl.noise import Noise
 from ltcl.operators import Operator
 from ltcl.solvers import Inverse, solve
-from ltcl.solvers.bounded import minimise
+from ltcl.solvers.bounded import least_squares
 from ltcl.transport import Transport, default_rtol
 
-_DRAWS, _FRAME_DRAWS = 8, 4  # of one picture, and of each of several
-_WHOLE_DRAWS = 16  # of errors that have no part in closed form
+_DRAWS, _FRAME_DRAWS, _WHOLE_DRAWS = 8, 4, 16  # of one picture, of each of several, without a closed form
 _TOGETHER = 8  # pictures whose draws are solved at once
 _RTOL = 0.05  # of solves, whose solutions are the smaller part
-_FAR = 100.0  # times the largest error: bounds of free pixels
+
+
+class _Deviations:
+    def __repr__(self) -> str:
+        rms = (f"{k} {np.sqrt(np.mean(np.square(x, dtype=np.float64))):.2g}" for k, x in vars(self).items())
+        return f"<ltcl standard deviations, rms of {', '.join(rms)}>"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class SeparationStd:
+class SeparationStd(_Deviations):
     """Standard deviations of the result of `ltcl.separate`, in the units of the image, float32.
 
     `direct` is like the image, `bounces` (bounces, ...): of errors against what the true T makes of the same
@@ -57,12 +62,9 @@ class SeparationStd:
     direct: np.ndarray
     bounces: np.ndarray
 
-    def __repr__(self) -> str:
-        return f"<ltcl standard deviations, rms of direct and bounces {_rms(self.direct, *self.bounces)}>"
-
 
 @dataclass(frozen=True, repr=False, eq=False)
-class CompensationStd:
+class CompensationStd(_Deviations):
     """Standard deviations of the result of `ltcl.compensate`, float32.
 
     `pattern` at this gain, in light of the projector: 0 where it is masked, or at a bound and clipped.
@@ -71,16 +73,6 @@ class CompensationStd:
 
     pattern: np.ndarray
     appearance: np.ndarray
-
-    def __repr__(self) -> str:
-        return (
-            f"<ltcl standard deviations, rms of pattern and appearance {_rms(self.pattern, self.appearance)}>"
-        )
-
-
-def _rms(*pictures: np.ndarray) -> str:
-    values = (np.sqrt(np.mean(np.square(picture, dtype=np.float64))) for picture in pictures)
-    return ", ".join(f"{value:.2g}" for value in values)
 
 
 def of_separation(
@@ -135,70 +127,46 @@ def of_compensation(
     q = [covariance(T, noise, c, a[..., None].astype(np.float64))[..., 0, 0] for c, a in enumerate(mixed)]
     q = [np.maximum(variance, 0.0) for variance in q]
     appearance = shape.pack([np.sqrt(variance) for variance in q], T.camera_grid)
-    random = np.random.default_rng(0)
-    if systems:
-        joint = q if len(systems) == len(q) else [np.concatenate(q)]
-        parts = free if len(systems) == len(q) else [np.concatenate(free)]
-        W = weights or [np.ones((1, 1))] * len(systems)
-        variances = [
-            _clipped(T, noise, c, system, joint[c], parts[c], np.broadcast_to(W[c], joint[c].shape), random)
-            for c, system in enumerate(systems)
-        ]
-        variances = variances if len(systems) == len(q) else np.split(variances[0], 3)
-    else:
-        variances = []
-        for c, (variance, f) in enumerate(zip(q, np.atleast_2d(T.first_bounce), strict=True)):
-            e = _draws(variance[..., None, None], random, variance.shape[1])[..., 0]
-            parts = [slice(start, start + _TOGETHER) for start in range(0, variance.shape[1], _TOGETHER)]
-            x = np.concatenate([_solve(T, c, e[:, some], inverse) for some in parts], axis=1)
-            variances.append(_ratio(variance + _square(T, noise, c, x, x - e), f[:, None] ** 2))
-        if T.mixing is not None:
-            variances = list(np.einsum("cd,dnk->cnk", np.linalg.inv(T.mixing) ** 2, np.stack(variances)))
-    deviations = [np.sqrt(variance * lit) for variance, lit in zip(variances, free, strict=True)]
-    return CompensationStd(
-        *(picture.astype(np.float32) for picture in (shape.pack(deviations, T.grid), appearance))
-    )
-
-
-def _clipped(
-    T: Transport,
-    noise: Noise,
-    c: int,
-    system: tuple[Operator, np.ndarray],
-    q: np.ndarray,
-    free: np.ndarray,
-    weights: np.ndarray,
-    random: np.random.Generator,
-) -> np.ndarray:
-    """Variances (N, k) of light that solves least squares, frame by frame, from q (M, k) of the picture."""
-    (A, scale), direct = system, T.is_square and not T.couples
-    variances = np.empty(free.shape)
-    for k in range(q.shape[1]):
-        e = _draws(q[:, k, None, None, None], random, q.shape[1] if direct else 0)[:, 0, :, 0]
-        most = np.where(free[:, k] & (scale > 0), _FAR * np.abs(e).max(), 0.0)
-        W = np.repeat(weights[:, k, None], e.shape[1], axis=1)
-        x = minimise(A, e, -most, most, np.zeros((len(free), e.shape[1])), weights=W, rtol=_RTOL).x
-        if direct:  # of A = S: e of the pixel itself, and a rest as above
-            total = q[:, k] + _square(T, noise, c, x[:, None], (x - e)[:, None])[:, 0]
-        else:
-            total = np.mean(np.square(x, dtype=np.float64), axis=1)
-        variances[:, k] = _ratio(total, scale**2)
-    return variances
+    scales = [scale for _, scale in systems] or list(np.atleast_2d(T.first_bounce))
+    own, random, variances = not (systems and T.couples) and T.is_square, np.random.default_rng(0), []
+    errors, lit = (x if len(scales) == len(q) else [np.concatenate(x)] for x in (q, free))
+    for c, (variance, f, scale) in enumerate(zip(errors, lit, scales, strict=True)):
+        k, w = variance.shape[1], np.broadcast_to(weights[c] if weights else 1.0, variance.shape)
+        light, f = np.empty(f.shape), f & (scale > 0)[:, None]
+        for some in (slice(start, start + _TOGETHER) for start in range(0, k, _TOGETHER)):
+            e = _draws(variance[:, some, None, None], random, k if own else 0)[..., 0]
+            if systems:
+                x = least_squares(systems[c][0], e, f[:, some, None], w[:, some, None], rtol=_RTOL)
+            else:
+                x = _solve(T, c, e, inverse)
+            light[:, some] = np.mean(x**2, axis=-1)
+            if own:  # of S: e of the pixel itself, and a rest as above
+                light[:, some] = variance[:, some] + _square(T, noise, c, x, x - e)
+        variances.append(_ratio(light, scale[:, None] ** 2))
+    if T.mixing is not None and not systems:
+        variances = list(np.einsum("cd,dnk->cnk", np.linalg.inv(T.mixing) ** 2, np.stack(variances)))
+    variances = variances if len(scales) == len(q) else np.split(variances[0], 3)
+    deviations = [np.sqrt(variance * f) for variance, f in zip(variances, free, strict=True)]
+    pictures = shape.pack(deviations, T.grid), appearance
+    return CompensationStd(*(picture.astype(np.float32) for picture in pictures))
 
 
 def covariance(T: Transport, noise: Noise, c: int, a: np.ndarray, diagonal: bool = False) -> np.ndarray:
     """Covariances (M, k, n, n) of E a, for a (N, k, n) and channel c; and of diag(E) as one more."""
     n, known = a.shape[-1], np.isfinite(noise.white[c])
-    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1) if known.any() else a
+    own = noise.diagonal(T.first_bounce)[c, :, None, None] ** 2 if T.is_square else np.zeros((1, 1, 1))
+    w = np.concatenate([a, np.ones((*a.shape[:2], 1))], axis=-1)[..., : n + known.any()]
     i, j = np.triu_indices(w.shape[-1])
-    pairs = w[..., i] * w[..., j]
+    seen = noise.filtered(w, T.grid, c)
+    pairs = seen[..., i] * seen[..., j]
     sums = variance(T, noise, c, pairs.reshape(len(pairs), -1)).reshape(-1, *pairs.shape[1:])
+    if noise.neighbours[c]:
+        sums += own * (w[..., i] * w[..., j] - pairs)  # the first bounce has no part in its neighbours
     q = np.zeros((*sums.shape[:2], *2 * (w.shape[-1] + diagonal,)))
     q[..., i, j] = q[..., j, i] = sums
     if diagonal:
-        v = noise.diagonal(T.first_bounce)[c, :, None, None] ** 2
-        q[..., -1, :-1] = q[..., :-1, -1] = v * w
-        q[..., -1, -1] = v[..., 0]
+        q[..., -1, :-1] = q[..., :-1, -1] = own * w
+        q[..., -1, -1] = own[..., 0]
     if not known.any():
         return q
     V = np.where(known[:, None], np.maximum(q[..., n, n], 1e-300), 1.0)

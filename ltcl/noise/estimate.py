@@ -9,7 +9,7 @@ the wall has no texture. The smaller one counts. Blocks of different mean light 
 on anything else: of v ~ floor^2 (1 + q L) the dimmest blocks tell the floor, and those q are likely with
 which most blocks agree. Light off the diagonal is dim and leaves a range of q, in which the detail of the
 diagonal decides. Factors of rows are from the detail within a row, as far as its two halves agree; those of
-columns likewise.
+columns likewise. Errors of a row that cancel show as row sums whose detail is below the noise of entries.
 
 Known limits: smooth errors are not seen; where less than a third of the blocks is smooth the result is an
 upper bound; entries that are exactly 0 were cut off by somebody and do not count; photon noise that only a
@@ -27,7 +27,7 @@ import numpy as np
 import scipy.sparse
 
 from ltcl.errors import InputError
-from ltcl.noise.model import Noise
+from ltcl.noise.model import Noise, cancellation
 from ltcl.operators.interreflection import made_with
 
 _SQUARE = 0.4549  # median of the squares of standard normal values
@@ -40,7 +40,7 @@ _TRUSTED = 0.7  # share of blocks that agree: from there on, the detail of singl
 _CHANCE = 2.0  # standard deviations of a count, or of a correlation, that mean nothing
 _TEXTURE = 0.5  # of the variance: where texture leaves less than this, it is divided by
 _ROWS, _AT_ONCE = 512, 4096  # rows: of pairs of neighbours at most; in memory
-_LEAST = 1e-60
+_LEAST, _ARRAYS = 1e-60, (np.ndarray, scipy.sparse.csr_array)
 
 
 class Windows(NamedTuple):
@@ -78,16 +78,16 @@ def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[
     InputError for compressed ones, whose noise has no detail of its own, and what shows no entries.
     """
     for T in matrices:
-        if made_with(T) is not None or not (_is_array(T) or hasattr(T, "between")):
+        if made_with(T) is not None or not (isinstance(T, _ARRAYS) or hasattr(T, "between")):
             text = f"T is made of {type(T).__name__}, whose noise does not show in its entries"
             raise InputError(f"noise is None, but {text}; give noise=, as that of what it was made from")
     channels = [_channel(T, grid, camera_grid) for T in matrices]
-    photons, floor, rows, columns, direct = (np.stack(values) for values in zip(*channels, strict=True))
-    return Noise(photons, floor, rows, columns, np.full(rows.shape, np.inf), "estimated", direct)
+    photons, floor, rows, columns, *others = (np.stack(values) for values in zip(*channels, strict=True))
+    return Noise(photons, floor, rows, columns, np.full(rows.shape, np.inf), "estimated", *others)
 
 
 def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tuple[Any, ...]:
-    """Photons, floor, rows (M,), columns (N,), and direct."""
+    """Photons, floor, rows (M,), columns (N,), direct and neighbours."""
     (M, N), own = T.shape, camera_grid == grid and hasattr(T, "diagonal")
     F, texture = np.asarray(T.diagonal() if own else [], np.float64), np.ones(max(M, N))
     rows, columns = np.ones(M), np.ones(N)
@@ -96,15 +96,15 @@ def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tup
         if np.isfinite(v).sum() >= _ENOUGH:
             break
     else:
-        return 0.0, _of_neighbours(T), rows, columns, 1.0
-    first = _first_bounce(F, grid) if own else None
+        return 0.0, _of_neighbours(T), rows, columns, 1.0, 0.0
+    first = _picture(F, grid, np.ones(N)) if own else None
     if first and first[0] > 0.0:
         other = _blocks(T, grid, camera_grid, size, np.maximum(F / first[0], 0.1))
         if np.nanmedian(other[2]) < _TEXTURE * np.nanmedian(v):
             (camera, projector, v, light), first = other, None
     width = _AGREE / (len(camera.detail) * len(projector.detail)) ** 0.5
     floor2, q, _ = _agreement(v, light, first, width)
-    if _is_array(T) or hasattr(T, "row_blocks"):  # of an operator, N products
+    if isinstance(T, _ARRAYS) or hasattr(T, "row_blocks"):  # of an operator, N products
         r = _factors(lambda i: _entries(T, i, projector.pixels.ravel()), M, projector, q)
         c = _factors(lambda j: _entries(T, camera.pixels.ravel(), j).T, N, camera, q)
         mean = r[camera.pixels].mean(axis=1)[:, None] * c[projector.pixels].mean(axis=1)
@@ -112,7 +112,12 @@ def _channel(T: Any, grid: tuple[int, int], camera_grid: tuple[int, int]) -> tup
         if share >= _TRUSTED:
             (floor2, q), rows, columns = other, r, c
     direct = 1.0 if first is None else min(first[1] / (floor2 * (1.0 + q * first[0])), 1.0)
-    return q * floor2, floor2**0.5, rows, columns, direct
+    white, weighted = (T @ np.stack([np.ones(N), columns], axis=1).astype(np.float32)).T
+    V = columns.sum() + q * weighted
+    if own:
+        white, V = white - F, V - columns * (1.0 + q * F)
+    sums = _picture(white, camera_grid, np.maximum(floor2 * rows * V, _LEAST))[1]
+    return q * floor2, floor2**0.5, rows, columns, direct, cancellation(sums, M // 8)
 
 
 def _blocks(
@@ -139,7 +144,6 @@ def _agreement(
     dim = np.argsort(light[np.isfinite(v)])
     v, light = (x[np.isfinite(v)][dim] for x in (np.maximum(v, _LEAST), light))
     ratios = _RATIOS / max(float(np.median(light)), _LEAST)
-
     dimmest = slice(0, max(len(v) // 4, _ENOUGH))
 
     def floor2(q: float) -> float:
@@ -160,12 +164,13 @@ def _agreement(
     return floor2(q), q, counts.max() / len(v)
 
 
-def _first_bounce(F: np.ndarray, grid: tuple[int, int]) -> tuple[float, float]:
-    """Median of F (N,), and an upper bound on its variance."""
+def _picture(F: np.ndarray, grid: tuple[int, int], variance: np.ndarray) -> tuple[float, float]:
+    """Median of a first bounce or other picture F (N,), and an upper bound on its noise over `variance`."""
     bounds = []
     for side, order in _DIAGONAL:
         window = Windows.of(grid, side, order, np.ones(len(F)), overlap=True)
-        bounds.append(np.median((F[window.pixels] @ window.detail.T) ** 2) / _SQUARE)
+        d2 = (F[window.pixels] @ window.detail.T) ** 2 / variance[window.pixels].mean(axis=1)[:, None]
+        bounds.append(np.median(d2) / _SQUARE)
     return max(float(np.median(F)), 0.0), float(min(bounds))
 
 
@@ -195,21 +200,16 @@ def _factors(entries: Callable[[np.ndarray], np.ndarray], n: int, window: Window
 
 def _entries(T: Any, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """T[rows][:, columns], float64."""
-    if not _is_array(T):
+    if not isinstance(T, _ARRAYS):
         order, back = np.unique(rows, return_inverse=True)  # a store reads rows in ascending order
         return np.asarray(T.between(order, columns), np.float64)[back]
-    some = T[rows][:, columns] if len(rows) < len(columns) else T[:, columns][rows]
+    some: Any = T[rows][:, columns] if len(rows) < len(columns) else T[:, columns][rows]
     return np.asarray(some.toarray() if scipy.sparse.issparse(some) else some, np.float64)
-
-
-def _is_array(T: Any) -> bool:
-    return isinstance(T, (np.ndarray, scipy.sparse.csr_array))
 
 
 def _of_neighbours(T: Any) -> float:
     """Of neighbours in a row that are both not 0."""
     rows = np.unique(np.linspace(0, T.shape[0] - 1, _ROWS).astype(int))
     X = _entries(T, rows, np.arange(T.shape[1]))
-    pairs = (X[:, 1:] != 0) & (X[:, :-1] != 0)
-    d = np.diff(X)[pairs]
+    d = np.diff(X)[(X[:, 1:] != 0) & (X[:, :-1] != 0)]
     return float(np.median(np.abs(d)) / _SQUARE**0.5 / 2**0.5) if len(d) >= _ENOUGH else 0.0

@@ -4,23 +4,25 @@
     variance of T_c[i, j] = rows_c[i] columns_c[j] (photons_c max(T_c[i, j], 0) + floor_c^2)
 
 for channel c, times `direct_c` on the diagonal of a square T, whose light came straight from the projector.
-Entries are independent of each other; but where the rows of T were made to add up to a measured
-white, whose variance is `white`, errors of a row are those that add up to it (`covariance` in
-`ltcl.uncertainty`).
+Entries are independent of each other; but where the rows of T were made to add up to a measured white, whose
+variance is `white`, errors of a row are those that add up to it (`covariance` in `ltcl.uncertainty`). Paths
+of a path tracer that miss a column meet its neighbours: errors of a row are e (1 - c G) / ||1 - c G||, e
+independent, G the binomial mean of 3 x 3 columns, c = `neighbours`, by row sums.
 
 Known limits: pictures of a scan by S-matrices share their noise, so that all entries of a batch are as noisy
 as its brightest; the model spreads that over the row. First bounce and sums are right, errors of smooth
-pictures up to 2.4 times smaller. Cells of an adaptive scan count as one pixel with the noise of all; errors
-of pictures are 0.9 to 1.2 times those of the model, as of a scan by pixels.
+pictures up to 2.4 times smaller. Cells of an adaptive scan count as one pixel. Errors of a path-traced T are
+0.5 of those of the model where one wall is lit alone, and 1.3 times those where a patch is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import numpy as np
+import scipy.ndimage
 import scipy.optimize
 import scipy.sparse
 
@@ -31,8 +33,8 @@ SOURCES = ("given", "acquired", "measured twice", "estimated")
 Samples = Iterable[Sequence[np.ndarray]]
 _PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; samples of a row, about
 _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
-_AT_ONCE = 1 << 22  # samples
-_FIRST = 64  # first bounces at least, whose variance may have a factor of its own
+_AT_ONCE, _FIRST = 1 << 22, 64  # samples; first bounces at least, whose variance has a factor of its own
+_G, _CHANCE = 0.375, 3.0  # ||G||; standard deviations of row sums that mean nothing
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -51,6 +53,8 @@ class Noise:
         "acquired", "measured twice", "given", or "estimated" from T alone.
     direct : (channels,) float64
         Factor of the variance of the first bounce: far below 1 of a path-traced T.
+    neighbours : (channels,) float64
+        Share c of its neighbours that an entry's error lacks, 0 to 1; 0 where errors are independent.
 
     InputError for other shapes, NaN, and negative numbers.
 
@@ -68,14 +72,16 @@ class Noise:
     white: np.ndarray
     source: str = "given"
     direct: Any = 1.0
+    neighbours: Any = 0.0
 
     def __post_init__(self) -> None:
         n = np.size(self.photons)
         checks.one_of("noise.source", self.source, SOURCES)
-        object.__setattr__(self, "direct", np.broadcast_to(self.direct, n))
-        ndims = {"photons": 1, "floor": 1, "rows": 2, "columns": 2, "white": 2, "direct": 1}
-        for name, ndim in ndims.items():
+        for name in ("direct", "neighbours"):
+            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), n))
+        for name in (f.name for f in fields(self) if f.name != "source"):
             value = checks.real(f"noise.{name}", getattr(self, name)).astype(np.float64)
+            ndim = 2 if name in ("rows", "columns", "white") else 1
             largest = np.inf if name == "white" else np.finfo(float).max
             if value.ndim != ndim or len(value) != n or not np.all((value >= 0) & (value <= largest)):
                 text = f"noise.{name} has shape {value.shape}; it must be {ndim}-dimensional, channels first"
@@ -87,9 +93,8 @@ class Noise:
     def uniform(cls, shape: tuple[int, int], floor: Any, photons: Any = 0.0, source: str = "given") -> Self:
         """The same for all entries of a T (M, N); `floor` and `photons` are floats, or one a channel."""
         f, p = np.broadcast_arrays(np.atleast_1d(floor), np.atleast_1d(photons))
-        M, N = shape
-        n = len(f)
-        return cls(p, f, np.ones((n, M)), np.ones((n, N)), np.full((n, M), np.inf), source)
+        rows, columns = (np.ones((len(f), n)) for n in shape)
+        return cls(p, f, rows, columns, np.full(rows.shape, np.inf), source)
 
     def __repr__(self) -> str:
         floor = ", ".join(f"{value:.2g}" for value in self.floor)
@@ -112,6 +117,15 @@ class Noise:
         """By how much the variance of F is below that of bounced light as bright, (channels, N)."""
         light = self.photons[:, None] * np.maximum(np.atleast_2d(F), 0.0) + self.floor[:, None] ** 2
         return (1.0 - self.direct[:, None]) * self.rows * self.columns * light
+
+    def filtered(self, pictures: np.ndarray, grid: tuple[int, int], channel: int = 0) -> np.ndarray:
+        """`pictures` (N, ...) or (3 N, ...) as independent errors see them: (1 - c G) a / ||1 - c G||."""
+        if not self.neighbours[channel]:
+            return pictures
+        c, mean = self.neighbours[channel], pictures.reshape(-1, *grid, *pictures.shape[1:])
+        for axis in (1, 2):
+            mean = scipy.ndimage.correlate1d(mean, [0.25, 0.5, 0.25], axis=axis, mode="nearest")
+        return (pictures - c * mean.reshape(pictures.shape)) / (1.0 - 0.5 * c + (_G * c) ** 2) ** 0.5
 
     @classmethod
     def fit(
@@ -141,13 +155,13 @@ class Noise:
         noise = cls.fit(matrices[0].shape, [_differences(*pair) for pair in pairs], "measured twice")
         if not np.any(noise.floor + noise.photons):
             raise InputError("noise has the same entries as matrix; it must be a second measurement")
-        return noise
+        return replace(noise, neighbours=[_cancellation(*pair) for pair in pairs])
 
     def require(self, channels: int, shape: tuple[int, int]) -> None:
         """InputError where this is the noise of a T of other channels or another shape (M, N)."""
-        own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
-        if own != (channels, shape):
-            raise InputError(f"noise is of {own[0]} channel(s) {own[1]}; T has {channels} {shape}")
+        n, own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
+        if (n, own) != (channels, shape):
+            raise InputError(f"noise is of {n} channel(s) {own}; T has {channels} {shape}")
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Numbers for files, by names that begin with ``noise_``."""
@@ -160,7 +174,7 @@ class Noise:
         if "noise_floor" not in arrays:
             return None
         if missing := [f.name for f in fields(cls) if f"noise_{f.name}" not in arrays]:
-            raise InputError(f"noise_{missing[0]} is missing; noise has seven arrays")
+            raise InputError(f"noise_{missing[0]} is missing; noise has {len(fields(cls))} arrays")
         values = {f.name: arrays[f"noise_{f.name}"] for f in fields(cls)}
         return cls(**{**values, "source": SOURCES[int(values["source"]) % len(SOURCES)]})
 
@@ -168,14 +182,11 @@ class Noise:
 def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ...]:
     """Photons, floor, rows (M,), columns (N,) and direct: means in octaves of light, and factors."""
     stride = max(1, min(shape) // _ENTRIES)
-    parts = [
-        [x[(rows - columns) % stride == 0] for x in (rows, columns, *rest)]
-        for rows, columns, *rest in samples
-    ]
+    parts = [[x[(i - j) % stride == 0] for x in (i, j, *rest)] for i, j, *rest in samples]
     i, j, light, square = map(np.concatenate, zip(*parts, strict=True))
-    own = (i == j) & (shape[0] == shape[1]) & (not exact)
+    own = (i == j) & (shape[0] == shape[1])
     first = [x[own] for x in (i, light, square)]
-    i, j, light, square = (x[~own] for x in (i, j, light, square))
+    i, j, light, square = (x if exact else x[~own] for x in (i, j, light, square))
     factors, photons = [np.ones(n) for n in shape], 0.0
     top, floor2, scale = light.max(initial=0.0) or 1.0, float(square.mean()) if len(square) else 0.0, 1.0
     octave = np.clip(_LIGHTS - 2 + np.frexp(light / top)[1], 1, _LIGHTS - 2)
@@ -204,25 +215,47 @@ def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ..
             x = scipy.optimize.nnls(A * weight[:, None], mean * weight)[0]
         photons, floor2 = x[0] / top, max(x[1], 1e-6 * mean.max())
     photons, floor2, direct = scale * photons, scale * floor2, 1.0
-    if len(first[0]) >= _FIRST:
+    if len(first[0]) >= (1 if exact else _FIRST):
         model = factors[0][first[0]] * factors[1][first[0]] * (photons * np.maximum(first[1], 0.0) + floor2)
         z = first[2] / np.maximum(model, 1e-300)
-        direct = float(np.minimum(z, _CLIPPED * z.mean()).mean())
+        direct = float(np.average(np.minimum(z, _CLIPPED * z.mean()), weights=model if exact else None))
     return photons, floor2**0.5, *factors, direct
 
 
 def _differences(first: Any, second: Any) -> Iterator[tuple[np.ndarray, ...]]:
     """Rows, columns, light and half of the squared difference of the entries of two T (M, N)."""
-    M, N = first.shape
-    for start in range(0, M, step := max(1, _AT_ONCE // N)):
-        stop = min(start + step, M)
-        A, B = (_rows(T, start, stop) for T in (first, second))
+    for start, A, B in _rows(first, second):
         i, j = np.nonzero((A != 0) | (B != 0))
-        a, b = A[i, j].astype(np.float64), B[i, j].astype(np.float64)
+        a, b = A[i, j], B[i, j]
         yield i + start, j, (a + b) / 2, (a - b) ** 2 / 2
 
 
-def _rows(T: Any, start: int, stop: int) -> np.ndarray:
-    if hasattr(T, "rows"):
-        return T.rows(start, stop)
-    return T[start:stop].toarray() if scipy.sparse.issparse(T) else T[start:stop]
+def _cancellation(first: Any, second: Any) -> float:
+    """c by the differences of two T (M, N), but for their diagonal."""
+    sums: list[float] = []
+    for start, A, B in _rows(first, second):
+        E = A - B
+        if first.shape[0] == first.shape[1]:
+            np.fill_diagonal(E[:, start:], 0.0)
+        noisy = E[E.any(axis=1)]
+        sums.extend(np.sum(noisy, axis=1) ** 2 / np.sum(noisy**2, axis=1))
+    return cancellation(float(np.mean(sums or [1.0])), len(sums))
+
+
+def cancellation(ratio: float, rows: int) -> float:
+    """c, so that (1 - c)^2 / ||1 - c G||^2 is the variance of row sums over that of independent errors.
+
+    0 where it may be below 1 by chance, of so many rows.
+    """
+    certain = ratio * (1.0 + _CHANCE * (2.0 / max(rows, 1)) ** 0.5) < 1.0
+    a, b = 1.0 - _G**2 * ratio, 1.0 - 0.25 * ratio  # of a c^2 - 2 b c + 1 - ratio = 0
+    return (b - (b * b - a * (1.0 - ratio)) ** 0.5) / a if certain else 0.0
+
+
+def _rows(*matrices: Any) -> Iterator[tuple[Any, ...]]:
+    """First row and rows of T (M, N), some at a time, float64."""
+    M, N = matrices[0].shape
+    for start in range(0, M, step := max(1, _AT_ONCE // N)):
+        stop = min(start + step, M)
+        some = (T.rows(start, stop) if hasattr(T, "rows") else T[start:stop] for T in matrices)
+        yield start, *(np.asarray(A.toarray() if scipy.sparse.issparse(A) else A, np.float64) for A in some)

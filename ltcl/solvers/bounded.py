@@ -23,6 +23,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -125,6 +126,34 @@ def minimise(
     least = np.maximum(least - hidden, 0.0) * unit * unit_w
     certificate = {"errors": errors * unit * unit_w, "least": least, "gap": float(np.max(excess / scale))}
     return Bounded(x, status, *history, "bounded", saturated=saturated, **certificate)
+
+
+def least_squares(
+    A: Operator, b: np.ndarray, free: np.ndarray, weights: np.ndarray, *, rtol: float, maxiter: int = 100
+) -> np.ndarray:
+    """The x (N, ...), 0 but where `free`, for which w A x is nearest to w b (M, ...), by conjugate gradients.
+
+    Each column has free entries and weights of its own, which broadcast to x and b. Done when the gradient
+    of every column is at most rtol times the first one, or after `maxiter` steps of two products.
+    """
+
+    def product(matrix: Any, a: np.ndarray) -> np.ndarray:
+        return (matrix @ a.reshape(len(a), -1).astype(np.float32)).reshape(-1, *b.shape[1:])
+
+    r, size, first = b, np.ones(b.shape[1:]), np.ones(b.shape[1:])
+    x = p = np.zeros((A.shape[1], *b.shape[1:]))
+    for step in range(maxiter):
+        s, before = free * product(A.T, weights**2 * r), size
+        size = np.sum(s**2, axis=0)
+        first = first if step else size
+        if (size <= rtol**2 * first).all():
+            break
+        p = s + ratio(size, before, before > 0.0) * p
+        Ap = product(A, p)
+        curvature = np.sum((weights * Ap) ** 2, axis=0)
+        alpha = ratio(size, curvature, curvature > 0.0)
+        x, r = x + alpha * p, r - alpha * Ap
+    return x
 
 
 def inwards(lower: ArrayLike, upper: ArrayLike) -> Box:

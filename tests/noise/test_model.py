@@ -27,7 +27,7 @@ random = np.random.default_rng()
 LEVELS = (1e-5, 1e-4, 1e-3, 1e-2)
 CLOSE = 1.3
 LINE = Response(np.array([[-0.004 / 0.996, 1.0]]))
-ATTRIBUTES = ("photons", "floor", "rows", "columns", "white")
+ATTRIBUTES = ("photons", "floor", "rows", "columns", "white", "direct", "neighbours")
 
 
 def seed() -> int:
@@ -170,7 +170,14 @@ def test_other_noise_is_refused(noise: Any, error: type[Exception], match: str) 
         ltcl.Transport(T.to_numpy(), T.grid, noise=noise)
 
 
-BAD = {"floor": [-1.0], "photons": [np.nan], "rows": np.ones(4), "columns": [[np.inf] * 4], "white": [[1.0]]}
+BAD = {
+    "floor": [-1.0],
+    "photons": [np.nan],
+    "neighbours": [-0.1],
+    "rows": np.ones(4),
+    "columns": [[np.inf] * 4],
+    "white": [[1.0]],
+}
 
 
 @pytest.mark.parametrize(("name", "value"), [*BAD.items(), ("floor", [1.0, 1.0]), ("source", "guessed")])
@@ -278,3 +285,25 @@ def test_the_first_bounce_may_have_a_noise_of_its_own() -> None:
     shown = ltcl.compensate(ltcl.Transport(first.to_numpy(), T.grid, noise=twice), T @ np.full(T.grid, 0.5))
     errors = (first @ shown.pattern - T @ shown.pattern) / shown.std.appearance
     assert 0.8 < np.sqrt(np.mean(np.square(errors))) < 1.2
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("twice", [False, True])
+def test_errors_of_neighbouring_columns_may_cancel(share: float, twice: bool) -> None:
+    """As of a path tracer: by row sums, in deviations of what smooth, single and random pictures show."""
+    T = truth("corner", 16)
+    independent = noise_of(T, 1e-3)
+    noise = replace(independent, neighbours=share)
+    first, second = (
+        T.to_numpy() + noise.filtered((measure(T, independent, k).to_numpy() - T.to_numpy()).T, T.grid).T
+        for k in (1, 2)
+    )
+    other = ltcl.Transport(second, T.grid) if twice else None
+    measured = ltcl.Transport(first, T.grid, noise=other)
+    assert measured.noise.neighbours == pytest.approx(share, abs=0.15)
+    patch = np.zeros(T.grid)
+    patch[2:14, 2:14] = 0.8
+    for p in (np.full(T.grid, 0.5), patch, random.random(T.grid)):
+        c = ltcl.compensate(measured, T @ p, bounds=(-9.0, 9.0))
+        errors = (measured @ c.pattern - T @ c.pattern) / c.std.appearance
+        assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.3
