@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from ltcl import checks
-from ltcl.compression.bases import INVERSE_NAMES, Bases, energies, quantize, validate_names
+from ltcl.compression.bases import INVERSE_NAMES, Bases, quantize, validate_names
 from ltcl.compression.coefficients import Coefficients
 from ltcl.compression.norms import MISS, Starts, fresh_starts, inverse_norm
 from ltcl.compression.pictures import CONFIDENCE, PictureError, draw, losses, picture_error
@@ -41,13 +41,13 @@ Note = Callable[[str, float], object]
 _GATHER = 0.7  # of what is allowed: Frobenius norm of what need not even be looked at
 _MORE = 4  # times the numbers kept on the window, which the whole may need
 _TRIES = 8
-_AIM, _GROWTH = 0.94, 8.0  # of the tolerance, what is tried next; no step grows by more
-_CLOSE = 0.85  # of the tolerance is good enough
+_AIM, _GROWTH = 0.96, 8.0  # of the tolerance, what is tried next; no step grows by more
+_CLOSE = 0.92  # of the tolerance is good enough
 _UNIT = 2.0**-24  # rounding of float32
 _ROUNDING = {"worst": 0.05, "pictures": 0.3}  # of what is allowed, for rounding the core
 _GUESS = 64  # pictures by which bases are compared
 _COARSE = 1.5  # between the bounds of a norm on which no choice depends
-_NOISE = 3.0  # deviations by which coefficients stand out: 3 of 1000 that are noise do
+_NOISE = 1.5, 3.0  # deviations by which coefficients stand out: that cost most, and as much as a pixel's
 _LEAST = 0.5  # of T.noise: more of it is never taken back
 _QUIET = 0.1  # of the noise of pictures, for the rounding of the core
 _TRANSFORMS = 1e-6  # of coefficients that went through transforms in float32, rounded there
@@ -406,30 +406,43 @@ def _certain(numbers: Coefficients, packed: Packed) -> float:
     return numbers.dropped + transforms + packed.difference[0]
 
 
+def _light(problem: Problem) -> np.ndarray:
+    """Light F p (N, k) of typical pictures, of norm 1."""
+    x = draw(problem.grid, _GUESS, np.random.default_rng(0)) * problem.F[:, None]
+    return x / np.maximum(np.linalg.norm(x, axis=0), 1e-30)
+
+
+def _bases(problem: Problem, name: str, goal: Goal) -> Bases:
+    """Those of a name, with weights where the goal is of pictures."""
+    light = _light(problem) if goal.norm == "pictures" else None
+    return Bases.named(problem.operator.device, problem.grid, name, light)
+
+
 def _significant(problem: Problem, bases: Bases, note: Callable[[str], object]) -> _Fit:
     """R~ of the numbers that stand out of the noise."""
     note(f"{bases.name}, noise")
     rows, columns = bases.noise(problem.noise)
-    least = [float(np.min(side, where=side > 0.0, initial=np.inf)) for side in (rows, columns)]
-    least = _LEAST * _NOISE * math.prod(least) if max(least) < math.inf else 0.0
+    weights, (low, middle) = bases.weights**2, _NOISE
+    limits = np.sqrt(low**2 + 2.0 * (middle**2 - low**2) / weights)
+    least = [float(np.min(side, where=side > 0.0, initial=np.inf)) for side in (rows, limits * columns)]
+    least = _LEAST * math.prod(least) if max(least) < math.inf else 0.0
     coefficients = bases.gather(problem.R, threshold=least)
     core, total = coefficients.core.copy(), float(np.sum(rows**2) * np.sum(columns**2))
     sizes = np.repeat(rows, np.diff(core.indptr)) * columns[core.indices]
-    small = np.abs(core.data) < _NOISE * sizes
+    small = np.abs(core.data) < limits[core.indices] * sizes
     # What is dropped has all of its noise: where it is less than T.noise says, that is too much.
     left, noise = coefficients.dropped**2 + np.sum(core.data[small] ** 2), total - np.sum(sizes[~small] ** 2)
     sizes *= np.clip(math.sqrt(left / noise), _LEAST, 1.0) if noise > 0.0 else 1.0
-    small = np.abs(core.data) < _NOISE * sizes
+    small = np.abs(core.data) < limits[core.indices] * sizes
     second, core.data[small] = math.hypot(coefficients.second, np.linalg.norm(core.data[small])), 0.0
     core.eliminate_zeros()
     numbers, indices = replace(coefficients, core=core, second=second), coefficients.core.indices[~small]
     core, support = bases.restricted(core)
-    of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2))  # what noise makes of light of norm 1
+    of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2 / weights))  # noise in light of norm 1
     packed = quantize(core, _QUIET * of_pictures)
-    x = draw(problem.grid, _GUESS, np.random.default_rng(0)) * problem.F[:, None]
-    x /= np.maximum(np.linalg.norm(x, axis=0), 1e-30)
-    lost = losses(problem, support.operator(problem.operator.device, packed), x)[0]
-    risk = np.sum(lost**2) / _GUESS + 2.0 * np.sum(sizes[~small] ** 2 * energies(bases.into, x)[indices])
+    lost = losses(problem, support.operator(problem.operator.device, packed), _light(problem))[0]
+    energies = ((1.0 - 1.0 / weights) / len(weights))[indices]  # over the weights, which `sizes` have
+    risk = np.sum(lost**2) / _GUESS + 2.0 * np.sum(sizes[~small] ** 2 * energies)
     return _Fit(bases, coefficients, numbers, support, packed, None, _DIFFUSE, None, float(risk))
 
 
@@ -444,7 +457,7 @@ def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> 
             note(f"trying {text}", at)
 
         tried(name)
-        bases = Bases.named(device, window.grid, name)
+        bases = _bases(window, name, goal)
         if math.isnan(goal.rtol):
             fits.append(_significant(window, bases, tried))
             trials.append(fits[-1].trial())
@@ -485,11 +498,11 @@ def _whole(problem: Problem, best: _Fit, goal: Goal, starts: Starts, draws: Star
     bases, candidates, drop = best.bases, best.candidates, best.numbers.dropped
     if math.isnan(goal.rtol):
         if pixels < N:
-            bases = Bases.named(problem.operator.device, problem.grid, bases.name)
+            bases = _bases(problem, bases.name, goal)
             best = _significant(problem, bases, lambda text: note(text, 0.5))
         return _bounded(problem, best, goal, starts, draws)
     if pixels < N:  # begun where the window ended: the same is dropped of each row
-        bases = Bases.named(problem.operator.device, problem.grid, bases.name)
+        bases = _bases(problem, bases.name, goal)
         drop *= math.sqrt(N / pixels)
         allowed = max(drop, goal.frobenius(best.inverse, N))
         most = _MORE * math.ceil(best.numbers.core.nnz / pixels) * N
