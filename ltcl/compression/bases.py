@@ -16,24 +16,14 @@ from ltcl.compression.norms import estimate_norm
 from ltcl.compression.sources import Rows
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import (
-    Basis,
-    Compressed,
-    SubsetBasis,
-    Tiles,
-    Wavelet,
-    basis,
-    multiresolution_order,
-    restrict_to_support,
-    smallest,
-)
+from ltcl.operators import Basis, Compressed, SubsetBasis, Tiles, Wavelet, basis, smallest
+from ltcl.operators.bases import multiresolution_order, restrict_to_support
 from ltcl.operators.tiles import Packed
 from ltcl.operators.wavelets import filters
 
 PIXELS, ROWS = "pixels", " rows"
 INVERSE_NAMES = ("db2", "haar", "db4", PIXELS)  # compared where none is named, in this order
 _SIGNS = 32  # pictures of random signs
-_TRANSFORM = 4  # launches of a wavelet transform, all levels
 
 
 def validate_names(names: Any, *, for_inverse: bool = False) -> list[str]:
@@ -69,9 +59,7 @@ class Bases:
     weights: np.ndarray
 
     @classmethod
-    def named(
-        cls, device: Device, grid: tuple[int, int], name: str, light: np.ndarray | None = None
-    ) -> Bases:
+    def named(cls, device: Device, grid: tuple[int, int], name: str, light: Any = None) -> Bases:
         """Those of a name, on a grid, with weights by `light` (N, k) of norm 1."""
         W = basis(device, grid, name.removesuffix(ROWS))
         if isinstance(W, Wavelet):  # large coefficients then lie side by side, in fewer tiles
@@ -79,11 +67,6 @@ class Bases:
             W = SubsetBasis(device, grid, order, of=W)
         weights = np.sqrt(1.0 + (0.0 if light is None else len(light) * energies(W, light)))
         return cls(name, None if name.endswith(ROWS) else W, W, np.broadcast_to(weights, grid[0] * grid[1]))
-
-    @property
-    def launches(self) -> int:
-        """Of a product in a solve, which runs on the core alone where both sides have one basis."""
-        return 1 if self.out is self.into else _TRANSFORM + 1
 
     def restricted(self, core: Any) -> tuple[Any, Bases]:
         """Core without weights; without coefficients it does not touch, where both sides have one basis."""
@@ -110,12 +93,11 @@ class Bases:
         out = None if self.out is None else partial(_on_host, self.out)
         return coefficients(R, out, into, progress=progress, **limits)
 
-    def noise(self, variances: Any) -> tuple[np.ndarray, np.ndarray]:
+    def noise(self, variances: Any) -> list[np.ndarray]:
         """Standard deviations of rows and columns of weighted numbers, of random signs: each within 13 %."""
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (variances.shape[1], _SIGNS))
-        sides = zip((self.out, self.into), variances, strict=True)
-        rows, columns = (np.sqrt(energies(W, np.sqrt(each)[:, None] * signs)) for W, each in sides)
-        return rows, self.weights * columns
+        sides = zip((self.out, self.into), variances, (1.0, self.weights), strict=True)
+        return [weights * np.sqrt(energies(W, np.sqrt(each)[:, None] * signs)) for W, each, weights in sides]
 
 
 def energies(W: Basis | None, x: np.ndarray) -> np.ndarray:

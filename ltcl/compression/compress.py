@@ -9,8 +9,10 @@ What is dropped has a known Frobenius norm f. What it makes of pictures (`pictur
 measured, rounding and all: how far below f it lies changes slowly, so that a few measurements find the f
 that is needed. Bases are compared on a window.
 
-Noise gives coefficients variances (W^2 u)_k (W^2 v)_l of rows and columns; those of _NOISE standard
-deviations remain, in the basis of least error of pictures: squares lost, and twice the variance of the rest.
+A dropped number c of column l costs light of energies e about c^2 e_l: it is weighted by sqrt(1 + N e_l), for
+single pixels and for pictures. Noise gives coefficients variances (W^2 u)_k (W^2 v)_l. By SURE (squares lost,
+and twice the variance of the rest) c^2 above 2 variances is worth its bytes where e_l is large; where it is
+average, N e_l = 1, above 9: 2 + 14 / (1 + N e_l) variances. Of bases the one of least SURE is taken.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from ltcl import checks
 from ltcl.compression.bases import INVERSE_NAMES, Bases, quantize, validate_names
 from ltcl.compression.coefficients import Coefficients
 from ltcl.compression.norms import MISS, Starts, fresh_starts, inverse_norm
-from ltcl.compression.pictures import CONFIDENCE, PictureError, draw, losses, picture_error
+from ltcl.compression.pictures import CONFIDENCE, PictureError, losses, picture_error, typical_light
 from ltcl.compression.sources import Inputs, Problem, memory_errors, validate_inputs, window_of
 from ltcl.device import Device
 from ltcl.errors import ConvergenceError, InputError, InputTypeError, ToleranceError
@@ -47,7 +49,7 @@ _UNIT = 2.0**-24  # rounding of float32
 _ROUNDING = {"worst": 0.05, "pictures": 0.3}  # of what is allowed, for rounding the core
 _GUESS = 64  # pictures by which bases are compared
 _COARSE = 1.5  # between the bounds of a norm on which no choice depends
-_NOISE = 1.5, 3.0  # deviations by which coefficients stand out: that cost most, and as much as a pixel's
+_NOISE = math.sqrt(2.0), 3.0  # deviations that stand out, where light is most, and where it is average
 _LEAST = 0.5  # of T.noise: more of it is never taken back
 _QUIET = 0.1  # of the noise of pictures, for the rounding of the core
 _TRANSFORMS = 1e-6  # of coefficients that went through transforms in float32, rounded there
@@ -63,8 +65,8 @@ class Trial:
     """R in one basis, tried on a window of pixels or on the whole.
 
     `format` ("tiles"; "csr" where none were made), `width` and `precision` are of the core. `kept` numbers in
-    a row take `nbytes`, and a product of a solve so many `launches`. `error` is an upper bound on the 2-norm
-    of R~ - R, rounding included; None where pictures chose, or the basis was `left` before, and why.
+    a row take `nbytes`. `error` is an upper bound on the 2-norm of R~ - R, rounding included; None where
+    pictures chose, or the basis was `left` before, and why.
     """
 
     basis: str
@@ -73,7 +75,6 @@ class Trial:
     precision: str
     kept: float
     nbytes: int
-    launches: int
     error: float | None
     left: str = ""
 
@@ -82,11 +83,12 @@ class Trial:
 class ChannelCompression(Trial):
     """One colour channel: what was taken, of the whole R.
 
-    Numbers below `threshold` were dropped; `dropped` is their Frobenius norm, where memory was short a bound
-    on it, and `quantisation` that of what rounding of the core changed. `inverse_norm` bounds the 2-norm of
-    S~^-1; its product with `error` is `error_bound`, which bounds ``||x~ - x|| / ||x||``. `confidence` is
-    that the bounds of all channels hold, over the random starts of the norms. `solution_error` is what the
-    norm states: this bound, or that of `pictures`, which has a share and confidence of its own.
+    Numbers below `threshold` were dropped, times the weights of columns, at least 1, unless the norm is
+    "worst"; `dropped` is the Frobenius norm of these products, so a bound on that of what was dropped, and
+    `quantisation` of what rounding of the core changed. `inverse_norm` bounds the 2-norm of S~^-1; its
+    product with `error` is `error_bound`, which bounds ``||x~ - x|| / ||x||``. `confidence` is that the
+    bounds of all channels hold, over the random starts of the norms. `solution_error` is what the norm
+    states: this bound, or that of `pictures`, which has a share and confidence of its own.
     """
 
     threshold: float
@@ -100,7 +102,7 @@ class ChannelCompression(Trial):
     trials: tuple[Trial, ...]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Compression:
     """How a compressed transport was made; its ``.compression``.
 
@@ -115,10 +117,6 @@ class Compression:
     window: tuple[int, int]
     seconds: float
     channels: tuple[ChannelCompression, ...]
-
-    def __repr__(self) -> str:
-        bases = ", ".join(channel.basis for channel in self.channels)
-        return f"<ltcl Compression of {checks.size(self.uncompressed)} to rtol {self.rtol} in {bases}>"
 
 
 def compress(
@@ -144,7 +142,8 @@ def compress(
         operator, whose rows are products of its transpose; a sequence of 3 of these for RGB.
     rtol : float or "noise"
         The relative error that pictures may have, in the 2-norm, or that is allowed of every light; see
-        `norm`. "noise" keeps what stands out of `T.noise`, a Transport's, by 3 standard deviations.
+        `norm`. "noise" keeps what stands out of `T.noise`, a Transport's, by 3 standard deviations; by
+        1.4 where pictures have most of their light, by 4 where they have none.
     budget : int, optional
         Bytes that the cores of all channels may take together on the device.
     norm : "pictures" or "worst"
@@ -314,7 +313,7 @@ class _Fit:
         packed, per_row = self.packed, self.numbers.core.nnz / (len(self.numbers.core.indptr) - 1)
         form = (self.bases.name, "tiles", packed.width, packed.precision)
         error = self.norm.upper if self.norm else None
-        return Trial(*form, per_row, packed.nbytes, self.bases.launches, error)
+        return Trial(*form, per_row, packed.nbytes, error)
 
     def report(self, trials: Sequence[Trial]) -> ChannelCompression:
         """What is reported of a channel."""
@@ -406,15 +405,10 @@ def _certain(numbers: Coefficients, packed: Packed) -> float:
     return numbers.dropped + transforms + packed.difference[0]
 
 
-def _light(problem: Problem) -> np.ndarray:
-    """Light F p (N, k) of typical pictures, of norm 1."""
-    x = draw(problem.grid, _GUESS, np.random.default_rng(0)) * problem.F[:, None]
-    return x / np.maximum(np.linalg.norm(x, axis=0), 1e-30)
-
-
 def _bases(problem: Problem, name: str, goal: Goal) -> Bases:
-    """Those of a name, with weights where the goal is of pictures."""
-    light = _light(problem) if goal.norm == "pictures" else None
+    """Those of a name, with weights where pictures or noise decide."""
+    worst = goal.norm == "worst" and not math.isnan(goal.rtol)
+    light = None if worst else typical_light(problem, _GUESS)
     return Bases.named(problem.operator.device, problem.grid, name, light)
 
 
@@ -440,9 +434,9 @@ def _significant(problem: Problem, bases: Bases, note: Callable[[str], object]) 
     core, support = bases.restricted(core)
     of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2 / weights))  # noise in light of norm 1
     packed = quantize(core, _QUIET * of_pictures)
-    lost = losses(problem, support.operator(problem.operator.device, packed), _light(problem))[0]
+    R, light = support.operator(problem.operator.device, packed), typical_light(problem, _GUESS)
     energies = ((1.0 - 1.0 / weights) / len(weights))[indices]  # over the weights, which `sizes` have
-    risk = np.sum(lost**2) / _GUESS + 2.0 * np.sum(sizes[~small] ** 2 * energies)
+    risk = np.sum(losses(problem, R, light)[0] ** 2) / _GUESS + 2.0 * np.sum(sizes[~small] ** 2 * energies)
     return _Fit(bases, coefficients, numbers, support, packed, None, _DIFFUSE, None, float(risk))
 
 
@@ -485,7 +479,7 @@ def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> 
             except ToleranceError as error:
                 refusals.append(error)
                 left = str(error)
-        form = (name, "csr", 1, "float32", count / pixels, 8 * count, bases.launches)
+        form = (name, "csr", 1, "float32", count / pixels, 8 * count)
         trials.append(Trial(*form, error=None, left=left))
     if not fits:
         raise refusals[0]
@@ -496,13 +490,13 @@ def _whole(problem: Problem, best: _Fit, goal: Goal, starts: Starts, draws: Star
     """All of R in the bases that are best on the window, confirmed by norms or pictures from fresh starts."""
     pixels, N = len(best.numbers.core.indptr) - 1, problem.R.shape[0]
     bases, candidates, drop = best.bases, best.candidates, best.numbers.dropped
+    if pixels < N:
+        bases = _bases(problem, bases.name, goal)
     if math.isnan(goal.rtol):
         if pixels < N:
-            bases = _bases(problem, bases.name, goal)
             best = _significant(problem, bases, lambda text: note(text, 0.5))
         return _bounded(problem, best, goal, starts, draws)
     if pixels < N:  # begun where the window ended: the same is dropped of each row
-        bases = _bases(problem, bases.name, goal)
         drop *= math.sqrt(N / pixels)
         allowed = max(drop, goal.frobenius(best.inverse, N))
         most = _MORE * math.ceil(best.numbers.core.nnz / pixels) * N
