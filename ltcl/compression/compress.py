@@ -21,7 +21,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -493,15 +492,13 @@ def _whole(problem: Problem, best: _Fit, goal: Goal, starts: Starts, draws: Star
     if pixels < N:
         bases = _bases(problem, bases.name, goal)
     if math.isnan(goal.rtol):
-        if pixels < N:
-            best = _significant(problem, bases, lambda text: note(text, 0.5))
+        best = best if pixels == N else _significant(problem, bases, lambda text: note(text, 0.5))
         return _bounded(problem, best, goal, starts, draws)
     if pixels < N:  # begun where the window ended: the same is dropped of each row
         drop *= math.sqrt(N / pixels)
         allowed = max(drop, goal.frobenius(best.inverse, N))
         most = _MORE * math.ceil(best.numbers.core.nnz / pixels) * N
-        read = partial(note, "coefficients of all pixels")
-        share = lambda share: read(0.5 + 0.4 * share)  # noqa: E731
+        share = lambda share: note("coefficients of all pixels", 0.5 + 0.4 * share)  # noqa: E731
         candidates = bases.gather(problem.R, share, drop=_GATHER * allowed, most=most)
     fresh = draws if goal.norm == "pictures" else starts
     fit = _fit(problem, bases, candidates, goal, best.inverse, drop, fresh, lambda text: note(text, 0.9))
