@@ -83,7 +83,7 @@ def losses(T: ltcl.Transport, C: ltcl.Transport, p: np.ndarray) -> np.ndarray:
 
 
 def case(name: str, pair: Measured, count: int, smoke: bool) -> tuple[dict[str, Any], list[Claim]]:
-    """What `compress` makes of the first of two measurements, and the second says of it; and the ratios."""
+    """What `compress` makes of the first of two measurements, judged by the second."""
     (T, other), claims = pair, []
     p = np.random.default_rng(3).random((len(T.first_bounce), 8)).astype(np.float32)
     truth, R = np.asarray(other.operators[0] @ p), [each.to_numpy() / each.first_bounce for each in pair]
@@ -129,8 +129,8 @@ def main() -> None:
     if why := "--smoke" if given.smoke else _traced.unavailable():
         facts["path-traced"] = f"not measured: {why}"
     else:
-        grid, (first, second) = (64, 64), (_traced.trace("blocks", (64, 64), PATHS, seed) for seed in (1, 2))
-        pairs["path-traced"] = tuple(ltcl.Transport(T.sum(axis=(0, 1)), grid) for T in (first, second))
+        first, second = (_traced.trace("blocks", (64, 64), PATHS, seed).sum(axis=(0, 1)) for seed in (1, 2))
+        pairs["path-traced"] = ltcl.Transport(first, (64, 64)), ltcl.Transport(second, (64, 64))
     for name, pair in pairs.items():
         more, further = case(name, pair, count, given.smoke)
         facts, claims = facts | more, claims + further
