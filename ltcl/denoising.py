@@ -2,17 +2,17 @@
 """Denoising of a measured T: reciprocal pairs averaged, wavelet coefficients and singular values shrunk.
 
 1. The diagonal of a square T, the first bounce, stays as measured; it is left out of all that follows.
-2. Reciprocity: T_ij d_j = T_ji d_i of a Lambertian scene. The fit of d (`ltcl.diagnostics`) has errors of its
-   own; d holds areas and irradiance, no albedo, so its wavelet coefficients below 3 standard deviations go. In
-   Z = D^-1/2 T D^1/2 both entries of a pair are the same light; they are averaged with weights 1 / variance,
+2. Reciprocity: T_ij d_j = T_ji d_i of a Lambertian scene. The fit of d (`ltcl.diagnostics`) has errors,
+   the largest ones of bright smooth pictures; d holds areas and irradiance, no albedo, so that its wavelet
+   coefficients are shrunk, too. In Z = D^-1/2 T D^1/2 both entries of a pair are the same light; they are averaged with weights 1 / variance,
    unless sums of Z - Z^T between blocks of pixels exceed what the noise explains: a glossy scene.
 3. C = K Z K^T, K orthonormal multiwavelets of 1 to 3 vanishing moments (Alpert 1993) at a few random shifts,
    whose results are averaged (cycle spinning, Coifman and Donoho 1995). What is below 3 standard deviations
    goes; with this first estimate P of C the Wiener factor P^2 / (P^2 + variance) is applied to the measured C
    (Ghael, Sayeed and Baraniuk 1997), in bases that do not cross the folds between walls.
-4. Between two walls, light depends on rows and on columns of the picture nearly as a sum of few products
-   (Van Loan and Pitsianis 1993). Singular values of entries in that order, (rows, rows') x (columns, columns'),
-   are shrunk (Gavish and Donoho 2017) below those of the noise that step 3 leaves, simulated.
+4. Between two walls, light depends on rows and on columns of the picture nearly as few products
+   (Van Loan and Pitsianis 1993): singular values of entries in that order, (rows, rows') x (columns,
+   columns'), are shrunk (Gavish and Donoho 2017) below those of the noise that step 3 leaves, simulated.
 5. Negative entries become 0; between the same two blocks of pixels what is dim loses as much light.
 
 Known limit: at low noise or few pixels most coefficients stand out; `bench/denoise.py` prints the bound.
@@ -109,8 +109,10 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
         Y = (matrix if isinstance(matrix, np.ndarray) else matrix.tocsr().toarray()).astype(np.float32)
         problem = Problem.of(Y, partial(noise.variance, channel=c), T.camera_grid, T.grid)
         pilot = shrink(problem, multiwavelets(problem.grids), None, note)[0]
-        estimate, left[c] = refine(problem, pilot, pilot, lambda done: note(SHIFTS + done))
+        estimate, error = refine(problem, pilot, pilot, lambda done: note(SHIFTS + done))
+        white = (error / problem.gauge).sum(axis=1, dtype=float)
         matrices.append(problem.restore(estimate, Y))
+        left[c] = white @ white / (noise.variance(matrices[-1], c).sum() or 1.0)
     noise = dataclasses.replace(noise, photons=noise.photons * left, floor=noise.floor * np.sqrt(left))
     settings = {"device": T._requested_device, "mixing": T.mixing, "noise": noise}
     first = T.first_bounce if T.is_square else "diagonal"
@@ -164,7 +166,7 @@ class Problem:
         bright = np.maximum(Z, 0.0)
         dim = np.minimum(bright, 3.0 * np.sqrt(self.variance))  # what may well be 0
         surplus, room = _sums(bright - Z, rows, columns), _sums(dim, rows, columns)
-        share = np.minimum(np.divide(surplus, room, out=np.zeros_like(room), where=room > 0.0), 1.0)
+        share = np.minimum(surplus / np.maximum(room, np.finfo(np.float32).tiny), 1.0)
         T = (bright - dim * (rows @ share @ columns.T)) / self.gauge
         if self.grids[0] == self.grids[1]:
             np.fill_diagonal(T, np.diag(Y))
@@ -176,69 +178,64 @@ def shrink(
     bases: Bases,
     pilot: np.ndarray | None,
     step: Callable[[int], object] = lambda done: None,
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Z of less noise, (M, N), by thresholds without a `pilot`; share of its variance left; noise so left.
-
-    Of a picture under white: by Stein's unbiased estimate, or that of a Wiener filter where this is more.
-    """
+) -> tuple[np.ndarray, np.ndarray]:
+    """Z of less noise, (M, N), by thresholds without a `pilot`, and simulated noise after the last basis."""
     Z, noise = problem.Z, np.random.default_rng(0).standard_normal(problem.Z.shape, np.float32)
     if problem.symmetric:
         noise = (noise + noise.T) * np.float32(0.5**0.5)
     if pilot is not None and problem.grids[0] == problem.grids[1]:
         Z = Z + np.diag(np.diag(pilot))  # smooth where the first bounce was
-    result, sums = np.zeros(Z.shape, np.float32), np.zeros(3)
+    result = np.zeros(Z.shape, np.float32)
     for done, basis in enumerate(bases, 1):
-        inverse, C = [A.T for A in basis], _transform(Z, basis)
-        V = _transform(problem.variance, [A * A for A in basis])
+        C, V = _transform(Z, basis), _transform(problem.variance, [A * A for A in basis])
         if problem.symmetric:  # Z_ij is Z_ji: twice the variance on the diagonal
             np.einsum("ii->i", V)[:] *= 2.0
         if pilot is None:
-            factor = (C * C > THRESHOLD**2 * V).astype(np.float32)
+            C *= C * C > THRESHOLD**2 * V
         else:
-            P = _transform(np.maximum(pilot, 0.0), basis) ** 2
-            factor = P / np.maximum(P + V, np.finfo(np.float32).tiny)
-            white = np.kron(basis[2].sum(axis=1), basis[3].sum(axis=1)) ** 2
-            risks = (1.0 - factor) ** 2 * C * C + (2.0 * factor - 1.0) * V, factor * V, V
-            sums += [float((risk @ white).sum()) for risk in risks]
+            factor = _transform(np.maximum(pilot, 0.0), basis) ** 2
+            factor /= np.maximum(factor + V, np.finfo(np.float32).tiny)
+            C *= factor
             if done == len(bases):
-                noise = _transform(noise * factor * np.sqrt(V), inverse)
-        result += _transform(C * factor, inverse)
+                noise = _transform(noise * np.sqrt(factor * V), [A.T for A in basis])
+        result += _transform(C, [A.T for A in basis])
         step(done)
-    result /= len(bases)
-    return result, max(sums[:2]) / sums[2] if sums[2] else 1.0, noise
+    return result / len(bases), noise
 
 
 def refine(
     problem: Problem, pilot: np.ndarray, light: np.ndarray, step: Callable[[int], object] = lambda done: None
-) -> tuple[np.ndarray, float]:
-    """Z by Wiener factors of a `pilot` and products between walls, whose folds `light` shows; share left."""
-    grids = problem.grids
-    ends = [_folds(light, grids[0]), _folds(light.T, grids[1])]
-    Z, share, noise = shrink(problem, multiwavelets(grids, ends, moments=2), pilot, step)
-    walls = [list(product(*([slice(*e) for e in pairwise(axis)] for axis in picture))) for picture in ends]
-    result, left = np.empty((2, *grids[0], *grids[1]), np.float32)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Z and noise by Wiener factors of a `pilot` and products between walls, whose folds `light` shows."""
+    ends = [_folds(light, problem.grids[0]), _folds(light.T, problem.grids[1])]
+    pair = shrink(problem, multiwavelets(problem.grids, ends, moments=2), pilot, step)
+    shape, walls = (*problem.grids[0], *problem.grids[1]), [list(product(*map(_slices, p))) for p in ends]
+    before, after = [X.reshape(shape) for X in pair], [np.empty(shape, np.float32) for _ in pair]
     for (p, to), (q, source) in product(*map(enumerate, walls)):
-        block, mirror = (*to, *source), (*source, *to)
-        for target, values in zip(
-            (result, left),
-            [X[mirror].transpose(2, 3, 0, 1) for X in (result, left)]
-            if problem.symmetric and q < p
-            else _few_products(*(X.reshape(result.shape)[block] for X in (Z, noise))),
-            strict=True,
-        ):
-            target[block] = values
-    before, after = ((X.reshape(Z.shape).sum(axis=1) ** 2).sum(dtype=float) for X in (noise, left))
-    return result.reshape(Z.shape), float(share * after / before) if before else share
+        if problem.symmetric and q < p:
+            values = [X[(*source, *to)].transpose(2, 3, 0, 1) for X in after]
+        else:
+            values = _few_products(*(X[(*to, *source)] for X in before))
+        for X, value in zip(after, values, strict=True):
+            X[(*to, *source)] = value
+    return after[0].reshape(problem.Z.shape), after[1].reshape(problem.Z.shape)
+
+
+def _slices(ends: list[int]) -> list[slice]:
+    return [slice(*pair) for pair in pairwise(ends)]
 
 
 def _few_products(X: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """X and its noise, (h, w, h', w'), in the order of least estimated error; as they are where none helps."""
+    """X and its noise, (h, w, h', w'), by products in the best order, or as they are."""
     least, best = 1.0, (X, noise)
     for order in _ORDERS:
         shape = tuple(X.shape[axis] for axis in order)
         A, E = (Y.transpose(order).reshape(shape[0] * shape[1], -1) for Y in (X, noise))
-        (U, S, V), edge, beta = _svd(A), _EDGE * _svd(E)[1][0], min(A.shape) / max(A.shape)
-        k, (m, n), power = int(np.sum(edge < S)), A.shape, float(np.vdot(E, E)) or 1.0
+        (U, S, V), of_noise, beta = _svd(A), _svd(E)[1], min(A.shape) / max(A.shape)
+        most = 2.0 * of_noise > of_noise[0]
+        level = min(1.0, float((S[most] / of_noise[most]).min(initial=1.0)))  # the model may state too much
+        edge, power = _EDGE * level * of_noise[0], level**2 * float(np.vdot(E, E)) or 1.0
+        k, (m, n) = int(np.sum(edge < S)), A.shape
         U, S, V = U[:, :k], S[:k], V[:k]
         dropped = float(np.vdot(A, A) - S @ S) / power - (m - k) * (n - k) / (m * n)  # light, not noise
         error = dropped + k * (m + n - k) / (m * n)
@@ -271,7 +268,7 @@ def _folds(Z: np.ndarray, grid: Grid) -> Ends:
         A = np.moveaxis(Z.reshape(*grid, -1), axis, 0)
         power = np.einsum("ijk,ijk->i", A, A)
         common, norm = np.einsum("ijk,ijk->i", A[1:], A[:-1]), np.sqrt(power[1:] * power[:-1])
-        alike = np.divide(common, norm, out=np.ones_like(norm), where=norm > 0.0)
+        alike = (common + (norm == 0.0)) / (norm + (norm == 0.0))  # where it is dark
         ends.append([0, *sorted(1 + int(i) for i in np.argsort(alike)[:_FOLDS] if alike[i] < _ALIKE), size])
     return ends
 
@@ -291,7 +288,7 @@ def _smooth(log_d: np.ndarray, X: np.ndarray, V: np.ndarray, grid: Grid) -> np.n
 
 
 def multiwavelets(grids: tuple[Grid, Grid], ends: list[Ends] | None = None, moments: int = 1) -> Bases:
-    """Bases of rows and columns of pictures of camera and projector, at random shifts; of each wall its own."""
+    """Bases of rows and columns of pictures of camera and projector, at random shifts, each wall by itself."""
     random, bases = np.random.default_rng(0), []
     pictures = ends or [[[0, size] for size in grid] for grid in grids]
     for number in range(SHIFTS):
@@ -304,7 +301,7 @@ def multiwavelets(grids: tuple[Grid, Grid], ends: list[Ends] | None = None, mome
 
 
 def _multiwavelet(n: int, moments: int, shift: float) -> np.ndarray:
-    """Orthonormal rows (n, n) on intervals that halve, of lengths 2^k; the first begins outside by shift n."""
+    """Orthonormal rows (n, n) on intervals that halve, of lengths 2^k; the first begins `shift` n outside."""
     details, outside = [], int(shift * n)
 
     def scaling(start: int, length: int) -> np.ndarray:
