@@ -2,10 +2,10 @@
 """Denoising of a measured T: reciprocal pairs averaged, wavelet coefficients and singular values shrunk.
 
 1. The diagonal of a square T, the first bounce, stays as measured; it is left out of all that follows.
-2. Reciprocity: T_ij d_j = T_ji d_i of a Lambertian scene. The fit of d (`ltcl.diagnostics`) has errors,
-   the largest ones of bright smooth pictures; d holds areas and irradiance, no albedo, so that its wavelet
-   coefficients are shrunk, too. In Z = D^-1/2 T D^1/2 both entries of a pair are the same light; they are averaged with weights 1 / variance,
-   unless sums of Z - Z^T between blocks of pixels exceed what the noise explains: a glossy scene.
+2. Reciprocity: T_ij d_j = T_ji d_i of a Lambertian scene. Errors of the fitted d (`ltcl.diagnostics`) are the
+   largest ones of smooth pictures; d holds areas and irradiance, no albedo: what of its wavelet coefficients
+   its errors explain goes. In Z = D^-1/2 T D^1/2 both entries of a pair are the same light; they are averaged
+   with weights 1 / variance, unless sums of Z - Z^T between blocks exceed what noise explains: gloss.
 3. C = K Z K^T, K orthonormal multiwavelets of 1 to 3 vanishing moments (Alpert 1993) at a few random shifts,
    whose results are averaged (cycle spinning, Coifman and Donoho 1995). What is below 3 standard deviations
    goes; with this first estimate P of C the Wiener factor P^2 / (P^2 + variance) is applied to the measured C
@@ -43,8 +43,9 @@ _EXCESS = 1.5  # of the variance of Z - Z^T between blocks over that of noise: t
 _SCALE = 3.0  # largest |log d|; beyond, d is fitted to noise
 _FOLDS, _ALIKE = 3, 0.3  # along an axis at most; cosine of the light of neighbours across one
 _ORDERS = (0, 2, 1, 3), (0, 3, 1, 2)  # axes: rows with rows, columns with columns; rows with columns
-_EDGE, _RANK = 0.8, 96  # of the largest singular value of noise; singular values of a large matrix
-_ARRAYS = 16  # of the size of T, float32, at once
+_EDGE, _GLOSS = 0.8, 0.5  # of the largest singular value of noise, and where T is not reciprocal
+_RANK = 96  # singular values of a large matrix
+_ARRAYS = 15  # of the size of T, float32, at once
 
 Grid = tuple[int, int]
 Bases = list[tuple[np.ndarray, ...]]
@@ -74,7 +75,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     InputError
         3 x 3 blocks between colours.
     MemoryLimitError
-        The host lacks memory for 16 arrays of float32 of the size of T.
+        The host lacks memory for 15 arrays of float32 of the size of T.
 
     Examples
     --------
@@ -91,15 +92,12 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
         raise InputError("T has blocks between colours; denoise takes a T of 1 or 3 channels")
     for A in T.matrices:
         if isinstance(A, Operator) or not (isinstance(A, np.ndarray) or hasattr(A, "tocsr")):
-            kind = type(A).__name__
-            raise InputTypeError(
-                f"T is made of {kind}; it must be of arrays or sparse: denoise, then compress"
-            )
+            text = "it must be of arrays or sparse: denoise, then compress"
+            raise InputTypeError(f"T is made of {type(A).__name__}; {text}")
     if progress is not None and not callable(progress):
         raise InputTypeError(f"progress is {progress!r}; it must be callable(text, share), or None")
     checks.fits_host("denoising", 4 * _ARRAYS * T.shape[0] * T.shape[1])
-    noise = T.noise
-    matrices, left = [], np.ones(T.channels)
+    noise, matrices, left = T.noise, [], np.ones(T.channels)
 
     def note(done: int) -> None:
         if progress is not None:
@@ -215,7 +213,8 @@ def refine(
         if problem.symmetric and q < p:
             values = [X[(*source, *to)].transpose(2, 3, 0, 1) for X in after]
         else:
-            values = _few_products(*(X[(*to, *source)] for X in before))
+            edge = _EDGE if problem.symmetric else _GLOSS
+            values = _few_products(*(X[(*to, *source)] for X in before), edge)
         for X, value in zip(after, values, strict=True):
             X[(*to, *source)] = value
     return after[0].reshape(problem.Z.shape), after[1].reshape(problem.Z.shape)
@@ -225,7 +224,7 @@ def _slices(ends: list[int]) -> list[slice]:
     return [slice(*pair) for pair in pairwise(ends)]
 
 
-def _few_products(X: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _few_products(X: np.ndarray, noise: np.ndarray, lowest: float) -> tuple[np.ndarray, np.ndarray]:
     """X and its noise, (h, w, h', w'), by products in the best order, or as they are."""
     least, best = 1.0, (X, noise)
     for order in _ORDERS:
@@ -234,7 +233,7 @@ def _few_products(X: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndar
         (U, S, V), of_noise, beta = _svd(A), _svd(E)[1], min(A.shape) / max(A.shape)
         most = 2.0 * of_noise > of_noise[0]
         level = min(1.0, float((S[most] / of_noise[most]).min(initial=1.0)))  # the model may state too much
-        edge, power = _EDGE * level * of_noise[0], level**2 * float(np.vdot(E, E)) or 1.0
+        edge, power = lowest * level * of_noise[0], level**2 * float(np.vdot(E, E)) or 1.0
         k, (m, n) = int(np.sum(edge < S)), A.shape
         U, S, V = U[:, :k], S[:k], V[:k]
         dropped = float(np.vdot(A, A) - S @ S) / power - (m - k) * (n - k) / (m * n)  # light, not noise
@@ -246,7 +245,7 @@ def _few_products(X: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndar
         EV = E @ V.T
         values = (U * S) @ V, U @ (U.T @ E) + (EV - U @ (U.T @ EV)) @ V
         least, best = error, tuple(Y.reshape(shape).transpose(np.argsort(order)) for Y in values)
-    return best
+    return best[0], best[1]
 
 
 def _svd(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -288,7 +287,7 @@ def _smooth(log_d: np.ndarray, X: np.ndarray, V: np.ndarray, grid: Grid) -> np.n
 
 
 def multiwavelets(grids: tuple[Grid, Grid], ends: list[Ends] | None = None, moments: int = 1) -> Bases:
-    """Bases of rows and columns of pictures of camera and projector, at random shifts, each wall by itself."""
+    """Bases of rows and columns of pictures, camera and projector, at random shifts, each wall by itself."""
     random, bases = np.random.default_rng(0), []
     pictures = ends or [[[0, size] for size in grid] for grid in grids]
     for number in range(SHIFTS):
