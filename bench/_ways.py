@@ -18,13 +18,13 @@ import scipy.sparse
 
 import ltcl
 from _coefficients import analysis, bisect, note, relative
-from _corner import interreflection
+from _corner import Bounce, interreflection
 from _harness import Options
 from ltcl.compression import invert_coefficients
 from ltcl.compression.coefficients import coefficients, drop_below
 from ltcl.compression.sources import source
 from ltcl.operators import CSR, Compressed, Dense, IdentityPlus, Tiles, Wavelet, restrict_to_support
-from ltcl.scenes import CornerRows, landscape
+from ltcl.scenes import landscape
 from ltcl.solvers import matrix_series
 
 ALBEDO, ERROR = 0.8, 1e-2
@@ -39,7 +39,7 @@ MEMORY = 1 << 28  # bytes of a block
 class Problem:
     """A corner, a picture of it, (N,) float32, and the direct light that makes it, (N,) float64."""
 
-    rows: CornerRows
+    rows: Bounce
     l_out: np.ndarray
     l_d: np.ndarray
 
@@ -58,7 +58,7 @@ class Way:
 
 def problem(n: int) -> Problem:
     """The corner under a landscape."""
-    rows = CornerRows(n, ALBEDO)
+    rows = Bounce(n, ALBEDO)
     l_out = 0.05 + 0.4 * landscape(*rows.grid).mean(axis=2).reshape(-1)
     return Problem(rows, l_out, l_out - rows.matmat(l_out))
 

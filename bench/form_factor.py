@@ -14,8 +14,9 @@ from collections.abc import Callable
 import numpy as np
 
 from _harness import Options, Row, options, report, seconds
+from ltcl.device import Device
 from ltcl.scenes import FormFactor, Patches, box, cut
-from ltcl.scenes.patches import Frame, squared_size
+from ltcl.scenes.patches import scaled, squared_size
 
 TARGETS = {"numpy": 20.0, "side": 2.0}
 ACCURACY = 1e-4
@@ -25,8 +26,8 @@ FAR = 64.0  # sizes of a pair, as `kernels/form_factor.cl` takes it
 class Peer:
     """The same sums in NumPy, for some rows."""
 
-    def __init__(self, patches: Patches, rows: np.ndarray) -> None:
-        placed = Frame.of(patches).patches(patches)
+    def __init__(self, device: Device, patches: Patches, rows: np.ndarray) -> None:
+        placed, _ = scaled(device, patches, np.zeros((0, 2, 3)))
         parts = (placed.centre, placed.normal, placed.right, placed.down)
         self.centre, self.normal, self.right, self.down = (part.astype(np.float32) for part in parts)
         self.area, self.reach = placed.area.astype(np.float32), FAR**2 * squared_size(placed)
@@ -61,7 +62,7 @@ def actions(
     given: Options, A: FormFactor, patches: Patches, rows: np.ndarray
 ) -> dict[str, Callable[[], object]]:
     """Ours with 1 and 3 right-hand sides, and NumPy on a sample of the rows, checked against each other."""
-    peer, rng = Peer(patches, rows), np.random.default_rng(1)
+    peer, rng = Peer(given.device, patches, rows), np.random.default_rng(1)
     x = rng.random((len(patches), 3), dtype=np.float32)
     one, three = (given.device.upload(np.ascontiguousarray(part)) for part in (x[:, 0], x))
     outs = [A.apply(one), A.apply(three)]

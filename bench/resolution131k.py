@@ -27,6 +27,7 @@ import numpy as np
 import _figures as figures
 import ltcl
 from _coefficients import analysis, bisect, note, relative, transport
+from _corner import Bounce
 from _figures import Claim
 from _harness import Options, options, product, seconds
 from ltcl.compression import SparseInverse, invert_coefficients
@@ -34,7 +35,7 @@ from ltcl.compression.coefficients import Coefficients, coefficients, drop_below
 from ltcl.compression.sources import source
 from ltcl.images import to_srgb
 from ltcl.operators import CSR, Compressed, IdentityPlus, Wavelet, restrict_to_support
-from ltcl.scenes import CornerRows, dihedral, landscape
+from ltcl.scenes import dihedral, landscape
 from ltcl.scenes.viewer import draw as draw_view
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ TARGETS = {"solve in colour": 5.0, "compensate in colour": 10.0}  # ms
 class Corner:
     """Rows of A of a reference albedo; A of a channel is a multiple of it."""
 
-    rows: CornerRows
+    rows: Bounce
 
     @property
     def picture(self) -> np.ndarray:
@@ -212,7 +213,7 @@ def draw(found: Pictures) -> Figure:
 def main() -> None:
     """Run it."""
     given = options(__doc__ or "")
-    corner = Corner(CornerRows(8 if given.smoke else 256, REFERENCE))
+    corner = Corner(Bounce(8 if given.smoke else 256, REFERENCE))
     built = build(given, corner)
     found = pictures(corner, built)
     ms = times(built, found.wanted)

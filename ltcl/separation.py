@@ -142,6 +142,8 @@ def separate(
     require(T)
     checks.count("bounces", bounces, least=0)
     monte_carlo.check_whole(options)
+    checks.one_of("method", method, METHODS)
+    seed = checks.count("seed", options.get("seed", 0), least=0, most=(1 << 64) - 1)
     columns, shape = layout.unpack("image", image, T.grid, T.channels)
     pictures = sum(column.size for column in columns)
     checks.fits_host(f"separating {bounces} bounces", 3 * 8 * pictures * (bounces + 1))
@@ -163,7 +165,9 @@ def separate(
         if inverse is not None:
             solutions.append(tuple(inverse.solve(l, channel) for channel, l in enumerate(rest)))
         else:
-            solutions.append(solve_each(T.systems, rest, method, **_with_seed(method, options, k)))
+            if method in SAMPLED:  # random numbers of its own, or its noise would go with that of others
+                options["seed"] = (seed + k) % 2**64
+            solutions.append(solve_each(T.systems, rest, method, **options))
         b_k = [solution.x.astype(np.float64) for solution in solutions[-1]]
         rest = [l - b for l, b in zip(rest, b_k, strict=True)]
         if k == 0:
@@ -230,12 +234,3 @@ def _warning(defect: float, negative: float, error: float) -> str:
     why = "surfaces reflect differently to different sides, or T is noisy; with one camera"
     such = "the bounces of such a scene are approximate (section 8.4, eq. 28 and 29)"
     return f"{' and '.join(reasons)}: {why} {such}" if reasons else ""
-
-
-def _with_seed(method: str, options: dict[str, Any], k: int) -> dict[str, Any]:
-    """The options of bounce k: random numbers of its own, or its noise would go with that of others."""
-    if checks.one_of("method", method, METHODS) not in SAMPLED:
-        return options
-    seed = options.get("seed", 0)
-    checks.count("seed", seed, least=0, most=(1 << 64) - 1)
-    return {**options, "seed": (seed + k) % 2**64}

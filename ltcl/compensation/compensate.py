@@ -301,15 +301,12 @@ def _start(
         nearest = [gain * slope - shift for slope, shift in zip(u, v, strict=True)]
     else:
         gain, nearest = gains.within_loss(problem, loss)
-    return _Start(gain, nearest, tuple(_combined(s, gain, k) for s in both), meets)
-
-
-def _combined(both: Solution, gain: float, k: int) -> Solution:
-    """gain * the first k columns - the others; both share their samples, so that errors add at worst."""
-    error = both.standard_error
-    if error is not None:
-        error = gain * error[:, :k] + error[:, k:]
-    return dataclasses.replace(both, x=gain * both.x[:, :k] - both.x[:, k:], standard_error=error, rest=None)
+    solutions = []
+    for s in both:  # both sides share their samples, so that errors add at worst
+        x, error = gain * s.x[:, :k] - s.x[:, k:], s.standard_error
+        error = None if error is None else gain * error[:, :k] + error[:, k:]
+        solutions.append(dataclasses.replace(s, x=x, standard_error=error, rest=None))
+    return _Start(gain, nearest, tuple(solutions), meets)
 
 
 def _within(
@@ -364,7 +361,9 @@ def _result(
         if not problem.is_dark:
             seen = [T_p + dark for T_p, dark in zip(seen, problem.dark, strict=True)]
         missing = [d - c for d, c in zip(target, seen, strict=True)]
-    sizes, errors = (_of_frames(columns, frames) for columns in (norms, problem.norms(missing)))
+    # Columns of a frame lie side by side.
+    sides = [[n.reshape(frames, -1) for n in columns] for columns in (norms, problem.norms(missing))]
+    sizes, errors = (np.linalg.norm(np.concatenate(side, axis=1), axis=1) for side in sides)
     size, error = float(np.linalg.norm(sizes)) or 1.0, float(np.linalg.norm(errors))
     least = np.linalg.norm([np.linalg.norm(solution.least / problem.unit) for solution in limited])
     rtol, atol = problem.rules["rtol"], problem.rules["atol"]
@@ -394,8 +393,3 @@ def _result(
         _inverse=inverse,
         _bounds=(problem.limits.low, problem.limits.high),
     )
-
-
-def _of_frames(norms: list[np.ndarray], frames: int) -> np.ndarray:
-    """(frames,), of the norms of their columns, which lie side by side."""
-    return np.linalg.norm(np.concatenate([n.reshape(frames, -1) for n in norms], axis=1), axis=1)

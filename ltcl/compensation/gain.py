@@ -153,7 +153,13 @@ class Search:
             light = trials[-1].light
             lines.append((trials[-1].slope, (trials[-1].least - trials[-1].slope) / t))
             farthest = max(farthest, t)
-            t, bound = _lowest(lines, 2 * farthest)
+            # Where in (0, 2 farthest] the largest of the lines a + b t is lowest, and how low.
+            a, b = np.array(lines).T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                crossings = ((a[:, None] - a) / (b - b[:, None])).ravel()
+            ts = np.append(crossings[(crossings > 0.0) & (crossings < 2 * farthest)], 2 * farthest)
+            heights = np.max(a + b * ts[:, None], axis=1)
+            t, bound = float(ts[np.argmin(heights)]), float(np.min(heights))
         return min(trials, key=lambda trial: trial.sine)
 
     def _from_above(self, loss: float) -> tuple[float, Columns]:
@@ -179,7 +185,16 @@ class Search:
     def _nearest(self, gain: float, light: Columns, accuracy: float) -> Trial:
         """The trial at this gain, whose error is above the least by `accuracy` at most, if it has settled."""
         problem = self.problem
-        solves = [self._solve(which, gain, start, accuracy) for which, start in enumerate(light)]
+        columns = sum(d.shape[1] for d in problem.desired)
+        rules = {"rtol": 0.0, "atol": accuracy * gain * self.size / np.sqrt(columns), "maxiter": _MAXITER}
+        solves = []  # of each system light, error and its lower bound of each column, and whether it settled
+        for which, start in enumerate(light):
+            if self.on_host:
+                solves.append((*_active_sets(problem, which, gain, self.A[which]), True))
+                continue
+            p, solution = problem.nearest(which, gain, start, **rules)
+            settled = solution.status is not Status.CONVERGED or not np.any(solution.errors)
+            solves.append((p, solution.errors / problem.unit, solution.least / problem.unit, settled))
         light = [p for p, *_ in solves]
         parts = zip(problem.target(gain), self.A, problem.systems, light, strict=True)
         missing = problem.weighted([b - A @ (system.scale[:, None] * p) for b, A, system, p in parts])
@@ -202,19 +217,6 @@ class Search:
             settled=all(settled for *_, settled in solves),
         )
 
-    def _solve(
-        self, which: int, gain: float, start: np.ndarray, accuracy: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-        """Light of one system, the error and its lower bound of each column, and whether it has settled."""
-        problem = self.problem
-        if self.on_host:
-            return *_active_sets(problem, which, gain, self.A[which]), True
-        columns = sum(d.shape[1] for d in problem.desired)
-        rules = {"rtol": 0.0, "atol": accuracy * gain * self.size / np.sqrt(columns), "maxiter": _MAXITER}
-        light, solution = problem.nearest(which, gain, start, **rules)
-        settled = solution.status is not Status.CONVERGED or not np.any(solution.errors)
-        return light, solution.errors / problem.unit, solution.least / problem.unit, settled
-
 
 def _active_sets(
     problem: Problem, which: int, gain: float, A: np.ndarray
@@ -236,16 +238,6 @@ def _active_sets(
         errors[column] = np.linalg.norm(T @ light[lit, column] - b)
         least[column] = max(error - gap / error, 0.0) if error > 0.0 else 0.0
     return light, errors, np.minimum(least, errors)
-
-
-def _lowest(lines: list[tuple[float, float]], most: float) -> tuple[float, float]:
-    """Where in (0, most] the largest of the lines a + b t is lowest, and how low."""
-    a, b = np.array(lines).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossings = ((a[:, None] - a) / (b - b[:, None])).ravel()
-    t = np.append(crossings[(crossings > 0.0) & (crossings < most)], most)
-    heights = np.max(a + b * t[:, None], axis=1)
-    return float(t[np.argmin(heights)]), float(np.min(heights))
 
 
 def _inner(a: Columns, b: Columns) -> float:

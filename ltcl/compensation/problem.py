@@ -22,7 +22,7 @@ from ltcl import checks, layout
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator, ScaledColumns, as_operator
-from ltcl.solvers.bounded import Bounded, minimise
+from ltcl.solvers.bounded import Bounded, inwards, minimise
 from ltcl.solvers.solve import METHODS, OPTIONS
 from ltcl.transport import Transport
 
@@ -56,9 +56,7 @@ class Limits:
     @classmethod
     def in_float32(cls, bounds: tuple[float, float], masked: np.ndarray) -> Limits:
         """The numbers of float32 within the bounds, so that a rounded pattern does not exceed them."""
-        low, high = (np.float32(bound) for bound in bounds)
-        low = np.nextafter(low, np.float32(np.inf)) if float(low) < bounds[0] else low
-        high = np.nextafter(high, np.float32(-np.inf)) if float(high) > bounds[1] else high
+        low, high = inwards(*bounds)
         if not -np.inf < low < high < np.inf:
             raise InputError(f"bounds is {bounds}; there must be two numbers of float32 within")
         return cls(float(low), float(high), masked)

@@ -18,30 +18,10 @@ from ltcl.operators.stored import basis
 from ltcl.operators.tiles import Tiles, smallest
 from ltcl.operators.wavelets import Wavelet
 
-__all__ = [
-    "CSR",
-    "Basis",
-    "Compressed",
-    "Coupled",
-    "Dense",
-    "Epilogue",
-    "Host",
-    "IdentityPlus",
-    "Norms",
-    "Operator",
-    "Pyramid",
-    "RowBlocks",
-    "ScaledColumns",
-    "SubsetBasis",
-    "Tiles",
-    "Wavelet",
-    "as_operator",
-    "basis",
-    "interreflections",
-    "multiresolution_order",
-    "restrict_to_support",
-    "smallest",
-]
+__all__ = ["CSR", "Basis", "Compressed", "Coupled", "Dense", "Epilogue", "Host", "IdentityPlus", "Norms"]
+__all__ += ["Operator", "Pyramid", "RowBlocks", "ScaledColumns", "SubsetBasis", "Tiles", "Wavelet"]
+__all__ += ["as_operator", "basis", "interreflections", "multiresolution_order", "restrict_to_support"]
+__all__ += ["smallest"]
 
 
 def as_operator(matrix: Any, device: Device | None = None) -> Operator:

@@ -7,6 +7,7 @@ columns of C empty; with P, (M, N), that picks the others, its support, C = P^T 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,8 @@ class Basis(Operator):
 
     orthonormal = True
     isometric = True
+    # (x, out, a, b, y, transpose): queues out = a (W x) + b y, or with W^T; y is not read where b is 0.
+    _transform: Callable[[Array, Array, float, float, Array, bool], None]
 
     def __init__(
         self, device: Device, grid: Any, name: str, coefficients: int, *parts: Operator | Array | None
@@ -54,10 +57,6 @@ class Basis(Operator):
             self._transform(x, out, a, b, x if y is None else y, transpose)
         if c:
             vectors.axpy(c, x, out)
-
-    def _transform(self, x: Array, out: Array, a: float, b: float, y: Array, transpose: bool) -> None:
-        """Queue ``out = a (W x) + b y``, or with W^T; y is an array in any case, not read where b is 0."""
-        raise NotImplementedError
 
     def _kernel(self, file: str, name: str, k: int, **defines: Any) -> tuple[Kernel, int]:
         """A kernel for k right-hand sides, and in how many pieces it takes them."""
@@ -102,7 +101,14 @@ class SubsetBasis(Basis):
         h, w = checks.grid("grid", grid)
         if of is not None and (of.device is not device or of.grid != (h, w)):
             raise InputError(f"of is for {of.grid} on {of.device}; it must be for {(h, w)} on {device}")
-        self.places = _places(places, h * w if of is None else of.shape[0])
+        count, places = h * w if of is None else of.shape[0], checks.real("places", places)
+        if places.ndim != 1 or not len(places) or places.dtype.kind not in "iu":
+            kind = f"{places.shape} of {places.dtype}"
+            raise InputError(f"places has shape {kind}; it must be (M,) whole numbers")
+        least, most = places.min(), places.max()
+        if least < 0 or most >= count or len(np.unique(places)) < len(places):
+            raise InputError(f"places are {least} to {most}; they must be different, below {count}")
+        self.places = places.astype(np.int64)
         if isinstance(of, SubsetBasis):
             self.places, of = of.places[self.places], of.of
         self.of, count = of, h * w if of is None else of.shape[0]
@@ -210,14 +216,3 @@ def multiresolution_order(grid: Any, levels: int) -> np.ndarray:
         level[down | right] = levels - split
         h, w = rows, columns
     return np.lexsort((band, x, y, level))
-
-
-def _places(places: Any, count: int) -> np.ndarray:
-    places = checks.real("places", places)
-    if places.ndim != 1 or not len(places) or places.dtype.kind not in "iu":
-        raise InputError(f"places has shape {places.shape} of {places.dtype}; it must be (M,) whole numbers")
-    if places.min() < 0 or places.max() >= count or len(np.unique(places)) < len(places):
-        raise InputError(
-            f"places are {places.min()} to {places.max()}; they must be different, below {count}"
-        )
-    return places.astype(np.int64)

@@ -59,6 +59,9 @@ class RowOperator(Operator):
     defines: dict[str, Any]
     unit = 1.0  # of the numbers in the slabs
     slabs: list[Slab]
+    # (first row, rows on the host): float64 arrays or csr_arrays (rows, N) of what it stands for.
+    blocks: Callable[[], Iterator[tuple[int, Any]]]
+    _transposed_rows: Callable[[], RowOperator]
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
         super().__init__(device, shape)
@@ -72,10 +75,6 @@ class RowOperator(Operator):
         """Of all slabs, and of the transpose once it was asked for."""
         arrays = {x for slab in self.slabs for x in slab.arguments if isinstance(x, Array)}
         return arrays if self._transposed is None else arrays | self._transposed.arrays()
-
-    def blocks(self) -> Iterator[tuple[int, Any]]:
-        """(first row, rows on the host): float64 arrays or csr_arrays (rows, N) of what it stands for."""
-        raise NotImplementedError
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64."""
@@ -109,9 +108,6 @@ class RowOperator(Operator):
         if self._transposed is None:
             self._transposed = self._transposed_rows()
         return self._transposed
-
-    def _transposed_rows(self) -> RowOperator:
-        raise NotImplementedError
 
     def variants(self) -> dict[str, Variant]:
         """The kernels and work-groups that make a product here, the default first."""

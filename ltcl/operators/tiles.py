@@ -137,17 +137,15 @@ class Tiles(RowOperator):
         tile_bytes = max(packed.width * size, packed.columns.itemsize)
         row_bytes = np.maximum(tile_bytes * np.diff(packed.pointers), 4)
         cuts = cut(device, row_bytes, "the matrix of tiles", size)
-        self.slabs = [self._slab(start, stop) for start, stop in cuts]
-
-    def _slab(self, start: int, stop: int) -> Slab:
-        packed, upload = self.packed, self.device.upload
-        pointers = packed.pointers[start : stop + 1]
-        tiles = slice(pointers[0], pointers[-1])
-        columns, codes = (upload(array[tiles], array.dtype) for array in (packed.columns, packed.codes))
-        # Not read where there are none, but a kernel needs a buffer.
-        scales = upload(packed.scales[tiles], np.uint8) if packed.scales.size else columns
-        counts = upload(pointers - pointers[0], np.int32)
-        return Slab(start, stop - start, (counts, columns, codes, scales))
+        self.slabs, upload = [], device.upload
+        for start, stop in cuts:
+            pointers = packed.pointers[start : stop + 1]
+            tiles = slice(pointers[0], pointers[-1])
+            columns, codes = (upload(array[tiles], array.dtype) for array in (packed.columns, packed.codes))
+            # Not read where there are none, but a kernel needs a buffer.
+            scales = upload(packed.scales[tiles], np.uint8) if packed.scales.size else columns
+            counts = upload(pointers - pointers[0], np.int32)
+            self.slabs.append(Slab(start, stop - start, (counts, columns, codes, scales)))
 
     def matrix(self) -> scipy.sparse.csr_array:
         """What it stands for: (M, N) float64, exact."""

@@ -8,7 +8,7 @@ past blocks by `visibility` (`rays`), computed in each product in `form_factor`.
 from __future__ import annotations
 
 from ltcl.scenes.builders import box, dihedral, trihedral
-from ltcl.scenes.form_factor import CornerRows, FormFactor
+from ltcl.scenes.form_factor import FormFactor
 from ltcl.scenes.gloss.glossy import GlossyScene, glossy
 from ltcl.scenes.landscape import landscape
 from ltcl.scenes.patches import Patches, cut
@@ -16,18 +16,5 @@ from ltcl.scenes.scene import Scene
 from ltcl.scenes.visibility import visibility
 from ltcl.scenes.walls import Block
 
-__all__ = [
-    "Block",
-    "CornerRows",
-    "FormFactor",
-    "GlossyScene",
-    "Patches",
-    "Scene",
-    "box",
-    "cut",
-    "dihedral",
-    "glossy",
-    "landscape",
-    "trihedral",
-    "visibility",
-]
+__all__ = ["Block", "FormFactor", "GlossyScene", "Patches", "Scene"]
+__all__ += ["box", "cut", "dihedral", "glossy", "landscape", "trihedral", "visibility"]

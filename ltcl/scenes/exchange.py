@@ -50,8 +50,6 @@ def form_factors(walls: Sequence[Wall], n: int) -> np.ndarray:
 
     None of the walls may cut through another. MemoryLimitError: the host has no room for the matrix.
 
-    Examples
-    --------
     >>> from ltcl.scenes.builders import WALLS
     >>> bool(np.allclose(form_factors(WALLS, 2).sum(axis=1), 1))  # a closed room loses no light
     True
@@ -129,8 +127,6 @@ def of_pairs(patches: Patches, i: np.ndarray, j: np.ndarray) -> np.ndarray:
 
     For pairs a few sizes apart at most: to 1e-6 of an entry up to 10 sizes.
 
-    Examples
-    --------
     >>> from ltcl.scenes import box, cut
     >>> patches = cut(box(1, sides=2).walls, 1)
     >>> round(float(of_pairs(patches, np.array([0]), np.array([1]))[0]), 5)
@@ -194,6 +190,7 @@ def _quadrature(first: np.ndarray, second: np.ndarray, offset: np.ndarray, point
     here, there = place @ first, place @ second  # (Q, 3)
     between = (there[None, :] - here[:, None]).reshape(-1, 3)
     normal, other = _normal(first), _normal(second)
+    areas = [np.linalg.norm(np.cross(*edges)) for edges in (first, second)]
     # The height of a point over the first plane is that of its patch's centre and its own from there.
     moments = np.stack([weights, weights * (there @ normal)], axis=1)
     result = np.empty(len(offset))
@@ -209,7 +206,7 @@ def _quadrature(first: np.ndarray, second: np.ndarray, offset: np.ndarray, point
         meet = (apart @ normal)[:, None] * inner[..., 0] + inner[..., 1]
         leave = weights * ((apart @ other)[:, None] - here @ other)
         result[start : start + step] = -np.einsum("pk,pk->p", leave, meet)
-    return result * (_area(first) * _area(second) / np.pi)
+    return result * (np.prod(areas) / np.pi)
 
 
 def _stokes(first: np.ndarray, second: np.ndarray, points: int) -> np.ndarray:
@@ -294,18 +291,9 @@ def _clip(outlines: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 def _heights(plane: np.ndarray, patch: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Signed distances of a patch's corners, around, from another's plane, (P, 4)."""
-    normal = _normal(plane)
-    return _dot(offset, normal)[:, None] + _dot(_AROUND @ patch, normal[..., None, :])
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return (a * b).sum(axis=-1)
+    return ((offset[:, None] + _AROUND @ patch) * _normal(plane)[..., None, :]).sum(axis=-1)
 
 
 def _normal(edges: np.ndarray) -> np.ndarray:
     normal = np.cross(edges[..., 0, :], edges[..., 1, :])
     return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-
-
-def _area(edges: np.ndarray) -> float:
-    return float(np.linalg.norm(np.cross(edges[0], edges[1])))

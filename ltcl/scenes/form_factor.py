@@ -18,7 +18,6 @@ theirs, the most where a block covers half of a patch.
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,9 +30,9 @@ from ltcl.errors import InputError
 from ltcl.operators import CSR, Operator
 from ltcl.operators.base import Epilogue, widths
 from ltcl.scenes import exchange
-from ltcl.scenes.patches import Frame, Patches, check_blocks, check_patches, cut, lanes, padded, squared_size
+from ltcl.scenes.patches import Patches, check_blocks, check_patches, cut, lanes, padded, scaled, squared_size
 from ltcl.scenes.visibility import Rays
-from ltcl.scenes.walls import check_albedo, spread_albedo
+from ltcl.scenes.walls import check_albedo
 
 if TYPE_CHECKING:
     from ltcl.scenes.scene import Scene
@@ -100,11 +99,10 @@ class FormFactor(Operator):
         super().__init__(device if isinstance(device, Device) else open_device(device), (count, count))
         self.device.require(60 * count, f"the geometry of {count} patches")
         self.error = _ERROR * float(shares.max())
-        frame = Frame.of(patches)
-        placed = frame.patches(patches)
+        placed, self._blocks = scaled(self.device, patches, blocks)
         vectors = (placed.centre, placed.right, placed.down, placed.normal)
         rows = np.concatenate([*(vector.T for vector in vectors), squared_size(placed)[None]])  # (13, N)
-        self._geometry, self._blocks = padded(self.device, rows), frame.upload_blocks(self.device, blocks)
+        self._geometry = padded(self.device, rows)
         self._defines = {"LANES": lanes(self.device), "BLOCKS": len(blocks)}
         self._albedo, self._area = self.device.upload(shares), self.device.upload(placed.area)
         self._near = CSR(self.device, self._correction(patches, blocks, shares, placed.area))
@@ -203,97 +201,3 @@ def _near_pairs(patches: Patches, sizes: float) -> tuple[np.ndarray, np.ndarray]
         close &= height > 1e-6 * np.sqrt(squared[other])
     order = np.lexsort((j[close], i[close]))
     return i[close][order], j[close][order]
-
-
-class CornerRows:
-    """A = diag(albedo) F of `ltcl.scenes.dihedral`, row by row, never stored.
-
-    Form factors depend on three offsets only: n^3 numbers for the N^2 = 4 n^4 entries of A. So A of 131072
-    pixels, 69 GB, comes from two tables of 67 MB.
-
-    Parameters
-    ----------
-    n : int
-        Patches along each side of the two walls; N = 2 n^2 pixels on a grid (n, 2n).
-    albedo : float or (2,) in [0, 1)
-        Of both walls, or of the left and the right one: one colour channel.
-
-    Examples
-    --------
-    >>> import ltcl, numpy
-    >>> rows = CornerRows(4, albedo=0.5)
-    >>> numpy.allclose(rows.rows(3, 9), ltcl.scenes.dihedral(4, albedo=0.5).A[3:9])
-    True
-    """
-
-    def __init__(self, n: int, albedo: Any = 0.7) -> None:
-        n = checks.count("n", n)
-        checks.fits_host(f"form factors of a corner of {n} x {2 * n} pixels", 4 * 8 * n**3)
-        patches = spread_albedo(albedo, 2, n)
-        if len(patches) != 1:
-            raise InputError("albedo has 3 colours; rows are those of one channel: make three")
-        self.n, self.grid, self.shape = n, (n, 2 * n), (2 * n * n, 2 * n * n)
-        self.first_bounce = patches[0]
-        # [d, p, q]: d apart along the seam, p and q the columns of the wall that sees and of the one that is
-        # seen, both counted from the left.
-        self._of_left = self._table(n)
-        self._of_right = np.ascontiguousarray(self._of_left.transpose(0, 2, 1))
-
-    @staticmethod
-    def _table(n: int) -> np.ndarray:
-        """Form factors from the left wall to the right one, (n, n, n) float32."""
-        left, right = np.array([((0, 0, -1), (-1, 0, 0)), ((0, 0, -1), (0, 1, 0))], np.float64)  # down, right
-        offset = np.zeros((n, n, 3))
-        offset[..., 0], offset[..., 1] = np.arange(n)[::-1, None] + 0.5, np.arange(n) + 0.5
-        offset[..., 0] *= -1
-        table = np.empty((n, n, n), np.float32)
-        for d in range(n):
-            offset[..., 2] = d
-            table[d] = exchange.exchange(left, right, offset.reshape(-1, 3)).reshape(n, n)
-        return table
-
-    def rows(self, start: int, stop: int) -> np.ndarray:
-        """Rows start .. stop - 1 of A, (stop - start, N) float32."""
-        if not 0 <= start <= stop <= self.shape[0]:
-            raise InputError(f"rows {start} to {stop} are not among {self.shape[0]}")
-        width = 2 * self.n
-        parts = [np.zeros((0, self.shape[1]), np.float32)]
-        for r in range(start // width, -(-stop // width)):
-            first, last = max(start - r * width, 0), min(stop - r * width, width)
-            parts.append(self._of_picture_row(r, first, last))
-        return np.concatenate(parts) * self.first_bounce[start:stop, None].astype(np.float32)
-
-    def matmat(self, x: np.ndarray) -> np.ndarray:
-        """A x, (N, k) float64, of the same float32 form factors as the rows.
-
-        They depend on how far apart two pixels are along the seam, so that this is a convolution there and a
-        matrix in the other direction: O(n^3) for each column, by a Fourier transform in float64.
-        """
-        n = self.n
-        x = checks.shape("x", np.asarray(x, np.float64), (self.shape[0], *np.shape(x)[1:2]))
-        waves = np.fft.rfft(x.reshape(n, 2 * n, -1), 2 * n, axis=0)
-        of_left, of_right = self._spectra
-        parts = waves.view(np.float64)  # real and imaginary side by side: the spectra are real
-        seen = np.concatenate([of_left @ parts[:, n:], of_right @ parts[:, :n]], axis=1)
-        light = np.fft.irfft(seen.view(np.complex128), 2 * n, axis=0)[:n].reshape(x.shape)
-        return light * self.first_bounce.reshape(-1, *[1] * (x.ndim - 1))
-
-    @cached_property
-    def _spectra(self) -> tuple[np.ndarray, np.ndarray]:
-        """Cosine transforms of both tables over the distance, (n + 1, n, n): they are even in it."""
-        around = np.abs(np.arange(2 * self.n) - self.n)  # n, n - 1, ..., 0, ..., n - 1, of which n is none
-        spectra = []
-        for table in (self._of_left, self._of_right):
-            even = np.concatenate([table, np.zeros_like(table[:1])])[np.roll(around, self.n)]
-            spectra.append(np.ascontiguousarray(np.fft.rfft(even.astype(np.float64), axis=0).real))
-        return spectra[0], spectra[1]
-
-    def _of_picture_row(self, r: int, first: int, last: int) -> np.ndarray:
-        """Form factors of pixels first .. last - 1 of row r of the picture, (last - first, N)."""
-        n = self.n
-        out = np.zeros((last - first, n, 2 * n), np.float32)
-        apart = np.abs(np.arange(n) - r)
-        split = max(min(last, n) - first, 0)
-        out[:split, :, n:] = self._of_left[apart, first : first + split].transpose(1, 0, 2)
-        out[split:, :, :n] = self._of_right[apart, max(first - n, 0) : max(last - n, 0)].transpose(1, 0, 2)
-        return out.reshape(last - first, self.shape[1])

@@ -124,31 +124,19 @@ def check_blocks(blocks: Any) -> np.ndarray:
     return value
 
 
-@dataclass(frozen=True)
-class Frame:
-    """Where the scene is, and the largest of its three extents."""
+def scaled(device: Device, patches: Patches, blocks: np.ndarray) -> tuple[Patches, Array]:
+    """The same patches in the units of kernels; boxes (B, 2, 3) as centre and half sides, shrunk by a hair.
 
-    middle: np.ndarray
-    size: float
-
-    @classmethod
-    def of(cls, patches: Patches) -> Frame:
-        """The frame of the box, along the axes, that holds all patches."""
-        half = (np.abs(patches.right) + np.abs(patches.down)) / 2
-        low, high = (patches.centre - half).min(axis=0), (patches.centre + half).max(axis=0)
-        return cls((low + high) / 2, float((high - low).max()))
-
-    def patches(self, patches: Patches) -> Patches:
-        """The same patches, counted in this frame."""
-        centre = (patches.centre - self.middle) / self.size
-        return Patches(centre, patches.right / self.size, patches.down / self.size)
-
-    def upload_blocks(self, device: Device, blocks: np.ndarray) -> Array:
-        """Centre and half sides of boxes (B, 2, 3), shrunk by a hair; one unused row where there are none."""
-        low, high = ((blocks[:, end] - self.middle) / self.size for end in (0, 1))
-        half = (high - low) / 2
-        rows = np.concatenate([(low + high) / 2, half - np.minimum(_HAIR, half / 2)], axis=1)
-        return device.upload(rows if len(rows) else np.zeros((1, 6)))
+    Where there are no boxes, one row that is not used.
+    """
+    half = (np.abs(patches.right) + np.abs(patches.down)) / 2
+    low, high = (patches.centre - half).min(axis=0), (patches.centre + half).max(axis=0)
+    middle, size = (low + high) / 2, float((high - low).max())
+    placed = Patches((patches.centre - middle) / size, patches.right / size, patches.down / size)
+    low, high = ((blocks[:, end] - middle) / size for end in (0, 1))
+    half = (high - low) / 2
+    rows = np.concatenate([(low + high) / 2, half - np.minimum(_HAIR, half / 2)], axis=1)
+    return placed, device.upload(rows if len(rows) else np.zeros((1, 6)))
 
 
 def lanes(device: Device) -> int:

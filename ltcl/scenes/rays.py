@@ -47,8 +47,6 @@ def cast(walls: Sequence[Wall], origins: np.ndarray, directions: np.ndarray, blo
 
     Blocks (B, 2, 3) are opaque boxes along the axes, lowest and highest corner; walls on their faces reflect.
 
-    Examples
-    --------
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
     >>> start, down = np.array([[0.25, 0.5, 2.0]]), np.array([[0.0, 0.0, -1.0]])
     >>> hits = cast([floor], start, down)
@@ -71,8 +69,6 @@ def clear(walls: Sequence[Wall], origins: np.ndarray, place: np.ndarray, blocks:
 
     Walls, from either side, and blocks are as in `cast`. The points and the place may lie on them.
 
-    Examples
-    --------
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
     >>> clear([floor], np.array([[0.5, 0.5, 0], [0.5, 0.5, -1]]), np.array([0.5, 0.5, 1])).tolist()
     [True, False]
@@ -124,8 +120,6 @@ def sight(name: str, stand: Any, walls: Sequence[Wall], patches: Patches, blocks
 
     InputError: it is no place, lies on a wall or in a block, or sees no patch from its front.
 
-    Examples
-    --------
     >>> from ltcl.scenes import cut
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
     >>> seen = sight("camera", (0.5, 0.5, 1), [floor], cut([floor], 1))

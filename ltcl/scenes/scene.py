@@ -156,7 +156,8 @@ class Scene:
         device : Device or str, optional
             The device that `Transport` computes on; the best one if omitted.
         on_dark : "mask" or "raise"
-            What `Transport` does about patches of albedo 0: never light them, or refuse.
+            What `Transport` does about patches of albedo 0, or hidden from the camera or projector of a
+            glossy scene: never light them, or refuse.
 
         Examples
         --------
@@ -299,8 +300,6 @@ def transport(form_factors: np.ndarray, albedo: np.ndarray, area: np.ndarray) ->
 
     InputError: the gain of one bounce is 1 or more.
 
-    Examples
-    --------
     >>> mirrors = np.array([[0.0, 1.0], [1.0, 0.0]])
     >>> transport(mirrors, albedo=np.array([0.5, 0.5]), area=np.ones(2)).round(4)
     array([[0.6667, 0.3333],

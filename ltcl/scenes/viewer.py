@@ -36,8 +36,6 @@ class Viewer:
 
     InputError: it looks straight up or down, where upright means nothing.
 
-    Examples
-    --------
     >>> floor = Wall("floor", corner=(0, 0, 0), right=(0, 1, 0), down=(1, 0, 0))
     >>> Viewer(eye=(2, 2, 1), target=(0, 0, 0)).sees(floor)
     True

@@ -21,7 +21,7 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.device import Device, open_device
-from ltcl.scenes.patches import Frame, Patches, check_blocks, check_patches, lanes, padded
+from ltcl.scenes.patches import Patches, check_blocks, check_patches, lanes, padded, scaled
 
 _LAUNCH = 1 << 30  # tests of a ray and a box in one launch: a fraction of a second, also for slow devices
 
@@ -31,15 +31,19 @@ class Rays:
 
     def __init__(self, patches: Patches, blocks: np.ndarray, device: Device, samples: int) -> None:
         self.device, self.count, self.rays, self.boxes = device, len(patches), samples**2, len(blocks)
-        frame = Frame.of(patches)
-        placed = frame.patches(patches)
-        points = _points(placed, samples)
+        placed, self._blocks = scaled(device, patches, blocks)
+        cell = np.stack(np.meshgrid(*[np.arange(samples)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+        place = (cell + np.random.default_rng(1).random(cell.shape)) / samples - 0.5  # (s^2, 2) in edges
+        edges = np.stack([placed.right, placed.down])  # (2, N, 3)
+        points = (placed.centre + np.tensordot(place, edges, 1)).transpose(0, 2, 1)  # (s^2, 3, N)
+        partner, order = np.arange(self.rays), np.random.default_rng(2).permutation(self.rays)
+        here, there = np.split(order[: self.rays // 2 * 2], 2)
+        partner[here], partner[there] = there, here  # an exchange: partner[partner] is the identity
         nbytes = (2 * points.size + 3 * self.count) * 4
         device.require(nbytes, f"{samples}^2 points on each of {self.count} patches")
         self._starts = padded(device, points.reshape(-1, self.count))
-        self._ends = padded(device, points[_partner(self.rays)].reshape(-1, self.count))
+        self._ends = padded(device, points[partner].reshape(-1, self.count))
         self._normals = padded(device, placed.normal.T)
-        self._blocks = frame.upload_blocks(device, blocks)
 
     def all(self) -> np.ndarray:
         """V of all patches, (N, N) float32, some rows in a launch: as many as one buffer holds."""
@@ -117,20 +121,3 @@ def visibility(
     if not len(blocks):
         return np.ones((count, count), np.float32)
     return Rays(patches, blocks, device if isinstance(device, Device) else open_device(device), samples).all()
-
-
-def _points(patches: Patches, samples: int) -> np.ndarray:
-    """The points of every ray on every patch, (s^2, 3, N)."""
-    cell = np.stack(np.meshgrid(*[np.arange(samples)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    place = (cell + np.random.default_rng(1).random(cell.shape)) / samples - 0.5  # (s^2, 2) in edges
-    edges = np.stack([patches.right, patches.down])  # (2, N, 3)
-    return (patches.centre + np.tensordot(place, edges, 1)).transpose(0, 2, 1)
-
-
-def _partner(rays: int) -> np.ndarray:
-    """A random exchange of `rays` points: partner[partner] is the identity."""
-    order = np.random.default_rng(2).permutation(rays)
-    half = rays // 2
-    partner = np.arange(rays)
-    partner[order[:half]], partner[order[half : 2 * half]] = order[half : 2 * half], order[:half]
-    return partner

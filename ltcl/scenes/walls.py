@@ -127,15 +127,15 @@ class Block:
 
     def faces(self) -> tuple[Wall, ...]:
         """Its six faces as walls that look outwards; side faces stand upright."""
-        return tuple(self._face(name, *direction) for name, direction in _FACES.items())
-
-    def _face(self, name: str, axis: int, sign: int) -> Wall:
-        normal = sign * np.eye(3)[axis]
-        # Side faces hang from their upper edge; top and bottom lie as floor and ceiling do.
-        down = -np.eye(3)[2] if axis < 2 else np.eye(3)[0 if sign > 0 else 1]
-        right, down = np.cross(normal, down) * self.size, down * self.size
-        middle = (self.low + self.high + normal * self.size) / 2
-        return Wall(f"block {name}", *(vector(v) for v in (middle - right / 2 - down / 2, right, down)))
+        faces = []
+        for name, (axis, sign) in _FACES.items():
+            normal = sign * np.eye(3)[axis]
+            # Side faces hang from their upper edge; top and bottom lie as floor and ceiling do.
+            down = -np.eye(3)[2] if axis < 2 else np.eye(3)[0 if sign > 0 else 1]
+            right, down = np.cross(normal, down) * self.size, down * self.size
+            corner = (self.low + self.high + normal * self.size - right - down) / 2
+            faces.append(Wall(f"block {name}", vector(corner), vector(right), vector(down)))
+        return tuple(faces)
 
 
 def vector(array: np.ndarray) -> Vector:
@@ -147,8 +147,6 @@ def vector(array: np.ndarray) -> Vector:
 def point(name: str, value: Any) -> Vector:
     """Return `value` as three finite floats.
 
-    Examples
-    --------
     >>> point("light", [1, 2, 3])
     (1.0, 2.0, 3.0)
     """
@@ -167,8 +165,6 @@ def spread_albedo(albedo: Any, walls: int, n: int) -> np.ndarray:
     A scalar; (walls,), one per wall; (3,), one colour for all walls; (walls, 3) or (walls, 1) or (1, 3) to
     say it in full. Three numbers for three walls could be either, and are refused.
 
-    Examples
-    --------
     >>> spread_albedo([0.5, 0.2], walls=2, n=1)
     array([[0.5, 0.2]])
     """

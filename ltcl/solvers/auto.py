@@ -13,9 +13,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import os
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -37,9 +36,6 @@ STEPS = 3  # of a survey
 _AT_ONCE = 8  # right-hand sides in one product
 _SELF_ADJOINT = 0.02  # defect of R up to which inner products are nearly those of a self-adjoint one
 _SLENDER = 0.25  # of the smallest real part: imaginary parts that an interval may leave out
-# Bytes a second: less than of any memory, more than of a core of a CPU or of another device; operations a
-# second: more than of a core, 64 a cycle at 6 GHz. They decide only whether the true speed is measured.
-_SLOWEST, _FASTEST, _FLOPS = 1e8, {True: 1e11, False: 1e14}, 4e11
 _LAUNCHES = 16  # timed together
 # Vectors read or written, launches and waits for each product.
 _STEPS = {"chebyshev": (4, 1, 0.5), "cg": (9, 3, 0.5), "gmres": (12, 5, 1.0)}
@@ -176,7 +172,9 @@ def plan(S: Operator, rtol: float, columns: int, refines: bool = False) -> Itera
         candidates.append(_candidate(S, columns, Chebyshev(surveyed.spectrum), products))
     if n <= LARGEST_DIRECT and isinstance(S.R if isinstance(S, IdentityPlus) else S, RowOperator):
         candidates.append(_candidate(S, columns, Direct()))
-    first, ranking = _rank(S.device, candidates)
+    bandwidth, flops = _bandwidth(S.device), _flops()
+    candidates.sort(key=lambda candidate: candidate.seconds(bandwidth, flops))
+    first, ranking = candidates[0].method, f"fastest first: {', '.join(map(str, candidates))}"
     reasons = f"{ranking}; {surveyed}{' made before' if made_before else ''}"
     yield first, reasons, 0 if made_before else len(surveyed.residuals) - 1
     if not isinstance(first, GMRES):
@@ -196,23 +194,6 @@ def _overheads(device: Device) -> tuple[float, float]:
     fills = lambda: [vectors.fill(x, 0.0) for _ in range(_LAUNCHES)]  # noqa: E731
     wait = tuning.seconds(device, "a wait", lambda: vectors.dot(x, x))
     return tuning.seconds(device, f"{_LAUNCHES} launches", fills) / _LAUNCHES, wait
-
-
-def _rank(device: Device, candidates: Sequence[_Candidate]) -> tuple[Any, str]:
-    """The method that takes the least time, and all by time; a speed is measured where it could change which.
-
-    Differences of times are linear in 1 / bandwidth: what is first at both ends of a range is so in between.
-    """
-    cores = os.cpu_count() or 1
-    flops, most = cores * _FLOPS, (cores if device.is_cpu else 1) * _FASTEST[device.is_cpu]
-    rank = lambda speed: sorted(candidates, key=lambda c: c.seconds(speed, flops))  # noqa: E731
-    ranked = rank(_SLOWEST)
-    if ranked[0] is not rank(most)[0]:
-        ranked = rank(_bandwidth(device))
-    if isinstance(ranked[0].method, Direct):
-        flops = _flops()
-        ranked = rank(_bandwidth(device))
-    return ranked[0].method, f"fastest first: {', '.join(map(str, ranked))}"
 
 
 def _candidate(S: Operator, columns: int, method: Any, products: float = 0) -> _Candidate:

@@ -202,7 +202,13 @@ class MonteCarlo(Sampler):
         score = lengths.scores()[0][0]  # what weights are multiplied by after the first step
         square = step.mean_square.T * score**2  # (N, channels)
         if self.adjoint:
-            x, error, spent = self._from_light(walker, light, square[:, 0])
+            samples = n * (self.samples or self.usual)  # one column of the light after the other
+            x, error, spent = np.zeros(light.shape), np.zeros(light.shape), np.full(n, samples // n)
+            for c, column in enumerate(light.T):
+                walker.tables.append(walker.tables.device.upload(column))
+                sums, share = walker.columns(samples, stream=c), np.abs(column, dtype=np.float64)
+                unmet = np.sqrt(3.0 * share.sum() * (share @ square[:, 0]))  # a walk weighs all of the light
+                x[:, c], error[:, c] = sums.mean, np.hypot(sums.standard_error, unmet / samples)
         else:
             scores = np.sqrt(square[pixels][:, np.arange(light.shape[1]) % count])
             unmet = 3.0**0.5 * scores * np.abs(light).max(axis=0)
@@ -242,17 +248,6 @@ class MonteCarlo(Sampler):
             needed = np.clip(needed, last[active] * (2 if stage else 1), most)
             last[active] = np.minimum(2.0 ** np.ceil(np.log2(needed)), most)
         raise AssertionError
-
-    def _from_light(self, walker: Walker, light: np.ndarray, square: np.ndarray) -> Estimate:
-        """The same of walks from b, one column after the other."""
-        n, samples = len(light), len(light) * (self.samples or self.usual)
-        x, error = np.zeros(light.shape), np.zeros(light.shape)
-        for c, column in enumerate(light.T):
-            walker.tables.append(walker.tables.device.upload(column))
-            sums, share = walker.columns(samples, stream=c), np.abs(column, dtype=np.float64)
-            unmet = np.sqrt(3.0 * share.sum() * (share @ square))  # a walk weighs all of the light
-            x[:, c], error[:, c] = sums.mean, np.hypot(sums.standard_error, unmet / samples)
-        return x, error, np.full(n, samples // n)
 
     def _result(
         self, channel: Channel, rest: np.ndarray, error: np.ndarray, pixels: np.ndarray, reason: str

@@ -273,7 +273,11 @@ def _validate(
     if isinstance(chosen, MonteCarlo):
         chosen.check(n)
     rule = Rule(rtol, atol / unit if atol else 0.0, maxiter, callback)
-    required = _required(b, rule)
+    required = rtol if np.any(b) else np.inf  # where all columns are dark
+    if np.any(b) and atol:
+        norms = np.atleast_1d(np.linalg.norm(b.astype(np.float64), axis=0))
+        lit = norms > 0.0
+        required = float(np.min(rule.target(norms)[lit] / norms[lit], initial=np.inf))
     A = S if isinstance(S, Operator) else _operator(S)
     if exact is not None:
         exact = _exact_operator(exact, A)
@@ -285,15 +289,6 @@ def _validate(
         )
     x0 = None if x0 is None else np.where(np.any(b, axis=0), x0 / unit, 0.0)  # no light: x = 0 is exact
     return _Problem(A, b, x0, rule, unit, required, chosen, exact, with_residual)
-
-
-def _required(b: np.ndarray, rule: Rule) -> float:
-    """The relative residual that all columns have to reach; infinite where all are dark."""
-    if not np.any(rule.atol):
-        return rule.rtol if np.any(b) else np.inf
-    norms = np.atleast_1d(np.linalg.norm(b.astype(np.float64), axis=0))
-    lit = norms > 0.0
-    return float(np.min(rule.target(norms)[lit] / norms[lit], initial=np.inf))
 
 
 def _operator(S: Any, device: Device | None = None) -> Operator:

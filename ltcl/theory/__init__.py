@@ -21,27 +21,10 @@ from ltcl.theory.series import (
     bounce_coefficients,
     forward_error_bound,
     inverse_error_bound,
-    norm_bound,
 )
 from ltcl.theory.spectrum import SpectralRadius, free_bounds, row_sum_range, spectral_radius
 
-__all__ = [
-    "Forecast",
-    "SpectralRadius",
-    "Terms",
-    "TwoNorm",
-    "after_terms",
-    "bounce_coefficients",
-    "chebyshev_products",
-    "forecasts",
-    "forward_error_bound",
-    "free_bounds",
-    "gauss_seidel_forecast",
-    "inverse_error_bound",
-    "norm_bound",
-    "richardson_products",
-    "row_sum_range",
-    "series_products",
-    "spectral_radius",
-    "two_norm",
-]
+__all__ = ["Forecast", "SpectralRadius", "Terms", "TwoNorm"]
+__all__ += ["after_terms", "bounce_coefficients", "chebyshev_products", "forecasts", "forward_error_bound"]
+__all__ += ["free_bounds", "gauss_seidel_forecast", "inverse_error_bound", "richardson_products"]
+__all__ += ["row_sum_range", "series_products", "spectral_radius", "two_norm"]

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import math
-import numbers
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -118,13 +118,11 @@ def gauss_seidel_forecast(S: Operator, rtol: float) -> Forecast:
     sweeps, last = len(residuals) - 1, residuals[-1]
     if last <= rtol:
         return Forecast(sweeps, SWEEPS)
+    if not math.isfinite(last) or not sweeps:
+        return Forecast(math.nan, NOTHING)
     late = residuals[-_LATE // 2 :]
-    rate = (last / late[0]) ** (1.0 / max(1, len(late) - 1)) if math.isfinite(last) and sweeps else math.nan
-    return (
-        Forecast(math.nan, NOTHING)
-        if math.isnan(rate)
-        else Forecast(sweeps + series_products(rate, rtol / last), SWEEPS)
-    )
+    rate = (last / late[0]) ** (1.0 / max(1, len(late) - 1))
+    return Forecast(sweeps + series_products(rate, rtol / last), SWEEPS)
 
 
 def _trial_sweeps(S: np.ndarray, rtol: float) -> list[float]:
@@ -148,7 +146,7 @@ def series_products(rho: float, rtol: float) -> float:
     >>> series_products(0.5, 1e-2), series_products(1.0, 1e-2)
     (7, inf)
     """
-    _numbers(rho=rho, rtol=rtol)
+    rho, rtol = checks.number("rho", rho), checks.number("rtol", rtol)
     if rho >= 1.0:
         return math.inf
     return 1 if rho <= rtol else math.ceil(math.log(rtol) / math.log(rho))
@@ -163,7 +161,7 @@ def chebyshev_products(lower: float, upper: float, rtol: float) -> int:
     >>> chebyshev_products(0.5, 5.0, 1e-2)
     9
     """
-    _numbers(lower=lower, upper=upper, rtol=rtol)
+    lower, upper, rtol = _numbers(lower, upper, rtol)
     if upper <= lower:
         return 1
     angle = 2.0 * math.asinh(math.sqrt(lower / (upper - lower)))  # acosh of the centre, which may round to 1
@@ -179,13 +177,10 @@ def richardson_products(lower: float, upper: float, rtol: float) -> int:
     >>> richardson_products(0.5, 5.0, 1e-2)
     23
     """
-    _numbers(lower=lower, upper=upper, rtol=rtol)
+    lower, upper, rtol = _numbers(lower, upper, rtol)
     factor = (upper - lower) / (upper + lower)
     return 1 if factor <= rtol else math.ceil(math.log(rtol) / math.log1p(-2.0 * lower / (upper + lower)))
 
 
-def _numbers(**values: object) -> None:
-    """Refuse what is no real number."""
-    for name, value in values.items():
-        if not isinstance(value, numbers.Real) or isinstance(value, bool):
-            raise InputTypeError(f"{name} is {value!r}; it must be a real number")
+def _numbers(lower: Any, upper: Any, rtol: Any) -> tuple[float, float, float]:
+    return checks.number("lower", lower), checks.number("upper", upper), checks.number("rtol", rtol)

@@ -76,16 +76,6 @@ def after_terms(m: float, orders: Sequence[int] = (1, 2, 4, 8, 16)) -> tuple[Ter
     )
 
 
-def norm_bound(m: float) -> float:
-    """||R|| <= m / (1 - m) (eq. 14); an InputError where m is not in [0, 1).
-
-    >>> norm_bound(0.5)
-    1.0
-    """
-    m = _albedo(m)
-    return m / (1.0 - m)
-
-
 def forward_error_bound(m: float, n: int) -> float:
     """||S - S_n|| <= m^(n+1) / (1 - m) of n bounces (eq. 15); m in [0, 1), n at least 0.
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import checks
 from ltcl.device import Array, vectors
 from ltcl.errors import InputTypeError
 from ltcl.operators import Norms, Operator
 
 _ranges: weakref.WeakKeyDictionary[Operator, tuple[float, float, float]] = weakref.WeakKeyDictionary()
+_STEPS = 200  # at most
 _FLOOR = 1e-12  # of the largest value of a vector: far above what underflows
 
 COLLATZ_WIELANDT, POWER_ITERATION = "collatz-wielandt", "power iteration"
@@ -66,9 +66,7 @@ def require_operator(name: str, value: Any) -> Operator:
     return value
 
 
-def spectral_radius(
-    R: Operator, *, rtol: float = 1e-3, maxiter: int = 200, seed: int = 0, norms: Norms | None = None
-) -> SpectralRadius:
+def spectral_radius(R: Operator, *, rtol: float = 1e-3, norms: Norms | None = None) -> SpectralRadius:
     """Largest modulus of the eigenvalues of R, (N, N), by power iteration from a positive random start.
 
     R of a real scene is nonnegative up to noise, so that its dominant eigenvalue is real and positive
@@ -88,11 +86,11 @@ def spectral_radius(
     """
     require_operator("R", R)
     certificate = POWER_ITERATION if norms is None or norms.lowest < 0.0 else COLLATZ_WIELANDT
-    start = np.random.default_rng(checks.count("seed", seed, least=0)).uniform(0.5, 1.5, R.shape[0])
+    start = np.random.default_rng(0).uniform(0.5, 1.5, R.shape[0])
     v = R.device.upload(start / np.linalg.norm(start))
     w = v.like()
     growth, values, change = [], [], math.inf
-    for _ in range(maxiter):
+    for _ in range(_STEPS):
         R.apply(v, w)
         growth.append(float(vectors.norm(w)[0]))
         if growth[-1] == 0.0:  # nilpotent up to rounding: no light comes back for ever
@@ -106,7 +104,13 @@ def spectral_radius(
                 break
     rho = SpectralRadius(values[-1] if values else growth[-1], change, len(growth))
     if norms is None or certificate is POWER_ITERATION:
-        return _estimated(rho, values)
+        changes = np.abs(np.diff(values[-3:]))
+        if len(changes) < 2:
+            return rho
+        # A geometric approach leaves the last change times q / (1 - q).
+        q = min(float(changes[1] / changes[0]), 0.99) if changes[0] > 0.0 else 0.0
+        error = float(changes[1]) * max(1.0, q / (1.0 - q))
+        return dataclasses.replace(rho, lower=max(rho.value - error, 0.0), upper=rho.value + error)
     # In the sum of two steps a part that belongs to -rho, which would keep ratios apart, cancels.
     return _certified(rho, R, vectors.axpby(1.0, w, growth[-1] / rho.value, v, w), norms)
 
@@ -124,16 +128,6 @@ def _certified(rho: SpectralRadius, R: Operator, v: Array, norms: Norms) -> Spec
     upper = min(float(np.max(y / x)) * (1.0 + rounding), norms.one, norms.inf, norms.frobenius)
     value = min(max(rho.value, lower), upper)
     return SpectralRadius(value, rho.change, rho.products + 1, max(lower, 0.0), upper, COLLATZ_WIELANDT)
-
-
-def _estimated(rho: SpectralRadius, values: list[float]) -> SpectralRadius:
-    """`rho` with the error that a geometric approach leaves: the last change times q / (1 - q)."""
-    changes = np.abs(np.diff(values[-3:]))
-    if len(changes) < 2:
-        return rho
-    q = min(float(changes[1] / changes[0]), 0.99) if changes[0] > 0.0 else 0.0
-    error = float(changes[1]) * max(1.0, q / (1.0 - q))
-    return dataclasses.replace(rho, lower=max(rho.value - error, 0.0), upper=rho.value + error)
 
 
 def free_bounds(S: Operator) -> tuple[float, float]:

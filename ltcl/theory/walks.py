@@ -90,10 +90,8 @@ def enough_samples(Rs: Sequence[CSR | Dense], tables: Tables) -> float:
     1.0
     """
     if "enough" not in tables.moments:
-        pairs = zip(Rs, tables.second_moments(Rs[0]), strict=True)
-        tables.moments["enough"] = max(_enough(two_norm(R).upper ** 2, Q.norms().one) for R, Q in pairs)
+        squares = np.array([two_norm(R).upper ** 2 for R in Rs])
+        most = np.array([Q.norms().one for Q in tables.second_moments(Rs[0])])
+        enough = np.floor(np.maximum(most - squares, 0.0) / np.maximum(1.0 - squares, 1e-300)) + 1.0
+        tables.moments["enough"] = float(np.max(np.where(squares < 1.0, enough, np.inf)))
     return tables.moments["enough"]
-
-
-def _enough(square: float, most: float) -> float:
-    return math.floor(max(most - square, 0.0) / (1.0 - square)) + 1.0 if square < 1.0 else math.inf

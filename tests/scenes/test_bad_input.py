@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ltcl.errors import InputError, InputTypeError
-from ltcl.scenes import Block, CornerRows, FormFactor, box, cut, dihedral, glossy, trihedral, visibility
+from ltcl.scenes import Block, FormFactor, box, cut, dihedral, glossy, trihedral, visibility
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.scene import transport
 from ltcl.scenes.viewer import Viewer, frame
@@ -60,8 +60,6 @@ CASES: list[tuple[Callable[[], Any], str]] = [
     (lambda: FormFactor([1], 0.5), "patches is a list"),  # pyright: ignore[reportArgumentType]
     (lambda: FormFactor(PATCHES, [0.5, 0.5]), r"albedo has shape \(2,\)"),
     (lambda: FormFactor.of(replace(dihedral(2), grid=(1, 8))), r"scene .* 1 x 4 .*n x n"),
-    (lambda: CornerRows(2).matmat(np.ones((3, 2))), r"x has shape \(3, 2\)"),
-    (lambda: CornerRows(2, (0.5, 0.4, 0.3)), "albedo has 3 colours"),
     (lambda: visibility(PATCHES, [[(0, 0, 0), (1, 1, -1)]]), "the first must be below"),
 ]
 

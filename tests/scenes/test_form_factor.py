@@ -11,7 +11,7 @@ import pytest
 import ltcl
 from ltcl.device import Device
 from ltcl.operators import IdentityPlus
-from ltcl.scenes import Block, CornerRows, FormFactor, Patches, box, cut, dihedral, visibility
+from ltcl.scenes import Block, FormFactor, Patches, box, cut, visibility
 from ltcl.scenes.builders import WALLS
 from ltcl.scenes.exchange import form_factors
 from ltcl.scenes.visibility import Rays
@@ -143,14 +143,3 @@ def test_rays_meet_their_twin(launched, count, boxes, samples):
     # A ray that grazes a box or a plane to rounding counts either way: one in a hundred entries at most.
     assert np.count_nonzero(np.abs(seen - expected) > 1e-6) <= 0.01 * count**2
     np.testing.assert_array_equal(seen, seen.T)
-
-
-@pytest.mark.parametrize("n", [1, 2, 5])
-def test_rows_of_a_corner_are_those_of_the_dihedral(n):
-    rows, scene = CornerRows(n, albedo=(0.5, 0.25)), dihedral(n, albedo=(0.5, 0.25))
-    assert (rows.grid, rows.shape) == (scene.grid, (2 * n * n, 2 * n * n))
-    np.testing.assert_array_equal(rows.first_bounce, scene.first_bounce)
-    for start, stop in ((0, 2 * n * n), (n, n + 1), (1, 2 * n), (0, 0)):
-        np.testing.assert_allclose(rows.rows(start, stop), scene.A[start:stop], rtol=1e-6, atol=1e-9)
-    for x in (gallery.vectors(2 * n * n, None), gallery.vectors(2 * n * n, 3)):
-        np.testing.assert_allclose(rows.matmat(x), scene.A @ x, rtol=1e-6, atol=1e-6)

@@ -87,13 +87,6 @@ def test_a_first_solve_needs_no_survey_and_the_second_makes_one_for_good(device)
     assert gone() is None
 
 
-def test_speeds_that_cannot_change_the_choice_are_not_measured(device, monkeypatch):
-    monkeypatch.setattr(auto, "LARGEST_DIRECT", N - 1)
-    for name in ("_bandwidth", "_flops"):
-        monkeypatch.setattr(auto, name, pytest.fail)
-    assert ltcl.solve(system(device, ring(0.7, 1.0)), pictures()).method == "gmres"
-
-
 def test_many_right_hand_sides_are_worth_a_factorization_and_one_is_not(device, monkeypatch):
     monkeypatch.setenv("LTCL_TUNE", "0")
     for name in ("_overheads", "_bandwidth", "_flops"):

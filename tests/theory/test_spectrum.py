@@ -29,7 +29,7 @@ def test_the_radius_is_that_of_the_eigenvalues(device, rho, density):
     assert found.change < 1e-3
 
 
-@pytest.mark.parametrize("call", [theory.spectral_radius, theory.two_norm, reciprocity_defect])
+@pytest.mark.parametrize("call", [theory.two_norm, reciprocity_defect])
 def test_a_seed_is_checked(device, call):
     F = {"F": np.ones(4), "entries": 4} if call is reciprocity_defect else {}
     with pytest.raises(InputError, match="seed is -1"):

@@ -105,7 +105,16 @@ class GrayCode:
         pictures = [p.mean(axis=2, dtype=np.float32) if p.ndim == 3 else p for p in pictures]
         dark = DARK if levels is None else max(DARK, STEPS / (checks.count("levels", levels, least=2) - 1))
         step = 1.0 if pictures[0].dtype.kind == "u" else 0.0  # of whole numbers
-        least = max(dark * _brightest(pictures), step)
+        # What white shows more than black, at the brightest pixels but a thousandth.
+        lit = pictures[-2].astype(np.float32) - pictures[-1].astype(np.float32)
+        brightest = float(np.quantile(lit[:: max(lit.shape[0] // 512, 1)], 0.999))
+        if brightest <= 0.0:
+            bright, black = (f"photographs[{len(pictures) - k}]" for k in (2, 1))
+            raise InputError(
+                f"{bright} is of the white pattern and must be brighter than {black}, of the black one; "
+                f"the difference is at most {brightest:.3g}"
+            )
+        least = max(dark * brightest, step)
         H, W = pictures[0].shape
         axes = [Axis(*np.full((5, H, W), np.nan, np.float32)) for _ in self.grid]
         fine = [k < FINE for bits in self.bits for k in reversed(range(bits))]
@@ -185,15 +194,3 @@ def _mark_edges(axis: Axis, rows: slice, difference: np.ndarray) -> None:
         total = before + after
         total[total <= 0] = np.nan
         fractions.ravel()[site] = before / total
-
-
-def _brightest(pictures: list[np.ndarray]) -> float:
-    """What white shows more than black, at the brightest pixels but a thousandth."""
-    lit = pictures[-2].astype(np.float32) - pictures[-1].astype(np.float32)
-    brightest = float(np.quantile(lit[:: max(lit.shape[0] // 512, 1)], 0.999))
-    if brightest <= 0.0:
-        raise InputError(
-            f"photographs[{len(pictures) - 2}] is of the white pattern and must be brighter than "
-            f"photographs[{len(pictures) - 1}], of the black one; the difference is at most {brightest:.3g}"
-        )
-    return brightest

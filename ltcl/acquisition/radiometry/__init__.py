@@ -16,14 +16,5 @@ from ltcl.acquisition.radiometry.merge import Radiance, merge
 from ltcl.acquisition.radiometry.projector import mixing, projector_response
 from ltcl.acquisition.radiometry.response import Response, calibrate
 
-__all__ = [
-    "NoiseModel",
-    "Radiance",
-    "Response",
-    "black_level",
-    "calibrate",
-    "estimate",
-    "merge",
-    "mixing",
-    "projector_response",
-]
+__all__ = ["NoiseModel", "Radiance", "Response"]
+__all__ += ["black_level", "calibrate", "estimate", "merge", "mixing", "projector_response"]

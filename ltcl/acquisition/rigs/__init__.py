@@ -10,14 +10,5 @@ from ltcl.acquisition.rigs.live import LiveRig
 from ltcl.acquisition.rigs.mitsuba import MitsubaRig
 from ltcl.acquisition.rigs.virtual import VirtualRig, camera_map
 
-__all__ = [
-    "Display",
-    "FolderRig",
-    "GPhoto2Camera",
-    "LiveRig",
-    "MitsubaRig",
-    "OpenCVCamera",
-    "VirtualRig",
-    "camera_map",
-    "show",
-]
+__all__ = ["Display", "FolderRig", "GPhoto2Camera", "LiveRig", "MitsubaRig", "OpenCVCamera", "VirtualRig"]
+__all__ += ["camera_map", "show"]

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -93,8 +92,14 @@ class LiveRig(Closing):
             _log.warning("the display has no known period: exposures are not checked for whole periods")
         self._period = None if period is None else checks.number("period", period, above=0.0, most=1.0)
         if self._period is not None:
-            limits = getattr(camera, "limits", (rig.SHORTEST, rig.LONGEST))
-            self.exposures = _whole_periods(self.exposures, self._period, limits)
+            least, most = getattr(camera, "limits", (rig.SHORTEST, rig.LONGEST))
+            times = [n * self._period for n in _PERIODS]
+            offered = self.exposures or [t for t in times if least <= t <= most * (1 + 1e-9)]
+            nearest = [max(round(t / self._period), 1) * self._period for t in offered]
+            pairs = zip(offered, nearest, strict=True)
+            self.exposures = tuple(t for t, whole in pairs if abs(t - whole) <= _FRACTION * t)
+            if not self.exposures:
+                raise InputError(f"period is {self._period:.4g} s; it must divide an exposure of the camera")
         self._drift = checks.number("drift", drift, above=0.0, below=1.0)
         self._patience = checks.number("patience", patience, above=0.0, most=60.0)
         self._camera, self._display = camera, display
@@ -302,15 +307,3 @@ def _change(a: Frame, b: Frame) -> float:
 def _drift(now: np.ndarray, before: np.ndarray, least: float) -> float:
     """Difference of two means, (channels,), relative to at least `least`, of the worst one."""
     return float(np.max(np.abs(now - before) / np.maximum(before, least)))
-
-
-def _whole_periods(
-    offered: Sequence[float] | None, period: float, limits: tuple[float, float]
-) -> tuple[float, ...]:
-    """The camera's exposures that see whole periods; where it has any in `limits`, multiples of it."""
-    if offered is None:
-        offered = [n * period for n in _PERIODS if limits[0] <= n * period <= limits[1] * (1 + 1e-9)]
-    whole = tuple(t for t in offered if abs(t - max(round(t / period), 1) * period) <= _FRACTION * t)
-    if not whole:
-        raise InputError(f"period is {period:.4g} s; it must divide an exposure of the camera")
-    return whole

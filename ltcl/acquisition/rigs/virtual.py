@@ -81,6 +81,7 @@ class SimulatedRig:
     """
 
     sensitivity = 1.0
+    _radiance: Callable[[np.ndarray], np.ndarray]
 
     def __init__(self, projector_grid: tuple[int, int], channels: int, sensor: dict[str, Any]) -> None:
         self.sensor = Sensor(**sensor)
@@ -124,9 +125,6 @@ class SimulatedRig:
         sensor = {name: value for name, value in asdict(self.sensor).items() if name != "exposures"}
         shape = {"projector_grid": self.projector_grid, "channels": self.channels}
         return self._facts | shape | sensor | {"sensitivity": self.sensitivity}
-
-    def _radiance(self, codes: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
 
     def _light(self, codes: np.ndarray) -> np.ndarray:
         """p: float64, (h, w) or (h, w, 3), of the projector's channels."""

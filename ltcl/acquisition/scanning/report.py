@@ -68,7 +68,12 @@ class Report:
     @classmethod
     def of(cls, store: str | os.PathLike[str] | BlockStore) -> Report:
         """The report of a store; FileError where the scan is not finished, or not by `ltcl.acquire`."""
-        scan = finished_scan(store)
+        scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
+        scan.verify()
+        if "strategy" not in scan.attributes or not scan.final:
+            started = "strategy" in scan.attributes
+            state = "is still being scanned" if started else "was not made by ltcl.acquire"
+            raise FileError(f"{scan.path}: {state}; it must be a finished scan")
         facts, seen, measured = scan.attributes, Seen.of(scan), scan.layout.kind != "compressed"
         calibration, F, white = seen.calibration, np.asarray(scan.extra("first_bounce")), seen.white
         entries, unknown, variance, cells = 0, 0, np.zeros(F.shape), membership(scan)
@@ -128,16 +133,6 @@ class Report:
 
 def _noise(variance: np.ndarray, value: np.ndarray, known: np.ndarray) -> float:
     return float(np.median(np.sqrt(variance[known]) / value[known])) if known.any() else math.nan
-
-
-def finished_scan(store: str | os.PathLike[str] | BlockStore) -> BlockStore:
-    """A store that `ltcl.acquire` finished, its checksums compared; else FileError."""
-    scan = store if isinstance(store, BlockStore) else BlockStore.open(store)
-    scan.verify()
-    if "strategy" not in scan.attributes or not scan.final:
-        state = "is still being scanned" if "strategy" in scan.attributes else "was not made by ltcl.acquire"
-        raise FileError(f"{scan.path}: {state}; it must be a finished scan")
-    return scan
 
 
 def membership(store: BlockStore) -> scipy.sparse.csr_array:

@@ -48,8 +48,6 @@ def exchange(
     axes, from places that `seed` decides. InputError: a number is out of range. MemoryLimitError: so many
     rays do not fit in the memory of the host.
 
-    Examples
-    --------
     >>> from ltcl.scenes.builders import WALLS
     >>> G = exchange(WALLS, 2, directions=16, rays=16)
     >>> G.shape, bool(np.allclose(G.sum(axis=1), 1))  # a closed room

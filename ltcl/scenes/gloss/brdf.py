@@ -38,8 +38,6 @@ _ROUNDS, _CLOSE = 1000, 1e-14  # of the scaling
 def side(directions: Any) -> int:
     """k of k x k bins, of a square number of at least 4.
 
-    Examples
-    --------
     >>> side(64)
     8
     """
@@ -52,8 +50,6 @@ def side(directions: Any) -> int:
 def from_square(square: np.ndarray) -> np.ndarray:
     """Unit vectors (..., 3), z >= 0, of points (..., 2) of the unit square.
 
-    Examples
-    --------
     >>> from_square(np.array([0.5, 0.5]))  # the middle looks along the normal
     array([0., 0., 1.])
     """
@@ -119,8 +115,6 @@ class Lobe:
 def lobe(exponent: float, k: int) -> Lobe:
     """The lobe of an exponent over k x k bins; InputError: not above 0, or too sharp for the bins to show.
 
-    Examples
-    --------
     >>> shine = lobe(20, k=4)
     >>> bool(np.allclose(shine.between.mean(axis=0), 1)), bool((shine.between == shine.between.T).all())
     (True, True)

@@ -18,8 +18,8 @@ so with m the largest albedo all bounces after A^k F Q are at most max(A^k F Q) 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -33,17 +33,13 @@ from ltcl.scenes.rays import Sight, sight
 from ltcl.scenes.scene import Scene
 from ltcl.scenes.viewer import Viewer
 from ltcl.scenes.walls import Block, Wall, point, spread_albedo, vector
-from ltcl.transport import Transport
-
-if TYPE_CHECKING:
-    from ltcl.device import Device
 
 _COLUMNS = 64  # of T computed together
 _TAIL = 1e-8  # of a white patch: all bounces left out together
 
 
-@dataclass(frozen=True, eq=False)
-class GlossyScene:
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class GlossyScene(Scene):
     """Patches that reflect into each other as their material, camera and projector say; made by `glossy`.
 
     Attributes
@@ -69,31 +65,15 @@ class GlossyScene:
     True
     """
 
-    matte: Scene
-    G: scipy.sparse.csr_array = field(repr=False)
-    white: scipy.sparse.bsr_array = field(repr=False)
-    P: scipy.sparse.csr_array = field(repr=False)
-    Q: scipy.sparse.csr_array = field(repr=False)
+    G: scipy.sparse.csr_array
+    white: scipy.sparse.bsr_array
+    P: scipy.sparse.csr_array
+    Q: scipy.sparse.csr_array
 
     @property
-    def grid(self) -> tuple[int, int]:
-        """The patches as a picture, (h, w); N = h * w."""
-        return self.matte.grid
-
-    @property
-    def walls(self) -> tuple[Wall, ...]:
-        """Where the parts of the picture stand."""
-        return self.matte.walls
-
-    @property
-    def viewer(self) -> Viewer:
-        """Who looks in `view` and `sample`."""
-        return self.matte.viewer
-
-    @property
-    def channels(self) -> int:
-        """1 for grey, 3 for colour."""
-        return self.matte.channels
+    def matte(self) -> Scene:
+        """The same room without gloss."""
+        return Scene(*(getattr(self, own.name) for own in fields(Scene)))
 
     @property
     def directions(self) -> int:
@@ -105,8 +85,7 @@ class GlossyScene:
         """Reflection: what leaves for what arrives, bsr_array; a tuple of three in colour. F is the same."""
         structure = self.white.indices, self.white.indptr
         parts = tuple(
-            scipy.sparse.bsr_array((self.white.data * r[:, None, None], *structure))
-            for r in self.matte.albedo
+            scipy.sparse.bsr_array((self.white.data * r[:, None, None], *structure)) for r in self.albedo
         )
         return parts[0] if self.channels == 1 else parts
 
@@ -123,7 +102,7 @@ class GlossyScene:
     def first_bounce(self) -> np.ndarray:
         """P F Q, which is diagonal: (N,), or (3, N) in colour. 0 where camera or projector see nothing."""
         direct = self.P.sum(axis=1) * self.white.data[:, -1, -1] * self.Q.sum(axis=0)
-        F = self.matte.albedo * direct
+        F = self.albedo * direct
         return F[0] if self.channels == 1 else F
 
     def matrices(self) -> tuple[np.ndarray, ...]:
@@ -134,44 +113,18 @@ class GlossyScene:
         MemoryLimitError
             If they do not fit in the memory of the host.
         """
-        patches = len(self.matte.area)
+        patches = len(self.area)
         block = 8 * patches * (self.directions + 1) * min(_COLUMNS, patches)
         checks.fits_host(
-            f"the transport of {self.matte.name}, {self.channels} of {patches} x {patches},",
+            f"the transport of {self.name}, {self.channels} of {patches} x {patches},",
             self.channels * 8 * patches**2 + 4 * block,
         )
         light = np.eye(patches)
         slices = [slice(start, start + _COLUMNS) for start in range(0, patches, _COLUMNS)]
         return tuple(
             np.concatenate([sum(self._pictures(albedo, light[:, columns])) for columns in slices], axis=1)
-            for albedo in self.matte.albedo
+            for albedo in self.albedo
         )
-
-    def transport(
-        self,
-        first_bounce: Any = "diagonal",
-        device: Device | str | None = None,
-        *,
-        on_dark: str = "mask",
-    ) -> Transport:
-        """The scene's `ltcl.Transport`, as one camera and one projector measure it.
-
-        Parameters
-        ----------
-        first_bounce, device, on_dark
-            As `ltcl.Transport` takes them; `scene.first_bounce` is the truth. Patches hidden from camera or
-            projector are dark.
-
-        Examples
-        --------
-        >>> from ltcl.scenes import dihedral, glossy
-        >>> scene = glossy(dihedral(2), 2, projector=(2, 1.5, 0.6), directions=16)
-        >>> scene.transport(scene.first_bounce).grid
-        (2, 4)
-        """
-        matrices = self.matrices()
-        matrix = matrices[0] if self.channels == 1 else matrices
-        return Transport(matrix, grid=self.grid, first_bounce=first_bounce, device=device, on_dark=on_dark)
 
     def bounces(self, pattern: Any, count: int) -> np.ndarray:
         """True pictures of single bounces, P A^k F Q pattern for k = 0 (direct) to count (eq. 29).
@@ -202,43 +155,26 @@ class GlossyScene:
         count = checks.count("count", count, least=0)
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
         series = [
-            self._pictures(albedo, light, count)
-            for albedo, light in zip(self.matte.albedo, columns, strict=True)
+            self._pictures(albedo, light, count) for albedo, light in zip(self.albedo, columns, strict=True)
         ]
         return np.stack([shape.pack(list(parts), self.grid) for parts in zip(*series, strict=True)])
-
-    def picture(self, patches: Any) -> np.ndarray:
-        """Values per patch as a picture on the grid; see `Scene.picture`."""
-        return self.matte.picture(patches)
-
-    def view(self, picture: Any, size: int = 480, supersample: int = 3) -> np.ndarray:
-        """What the viewer sees of a picture on the walls; see `Scene.view`."""
-        return self.matte.view(picture, size, supersample)
-
-    def sample(self, image: Any) -> np.ndarray:
-        """The picture on the walls that looks like a flat image to the viewer; see `Scene.sample`."""
-        return self.matte.sample(image)
 
     def _pictures(
         self, albedo: np.ndarray, light: np.ndarray, count: int | None = None
     ) -> Iterator[np.ndarray]:
         """P A^k F Q light (N, k) one after another: `count` indirect ones, or until little is left."""
-        most = albedo.max()
+        most, blocks = albedo.max(), self.white.data
         arriving, bounce = self.Q @ light.astype(np.float64), 0
         while True:
-            leaving = self._reflect(albedo, arriving)
+            # K arriving, as products of dense blocks, which are much faster than those of `bsr_array`.
+            leaving = blocks @ arriving.reshape(len(blocks), blocks.shape[1], -1)
+            leaving *= albedo[:, None, None]
+            leaving = leaving.reshape(arriving.shape)
             yield self.P @ leaving
             left = np.abs(leaving).max(initial=0.0) * most / (1 - most)
             if bounce == count or (count is None and left <= _TAIL):
                 return
             arriving, bounce = self.G @ leaving, bounce + 1
-
-    def _reflect(self, albedo: np.ndarray, arriving: np.ndarray) -> np.ndarray:
-        """K arriving, as products of dense blocks, which are much faster than those of `bsr_array`."""
-        blocks = self.white.data
-        leaving = blocks @ arriving.reshape(len(blocks), blocks.shape[1], -1)
-        leaving *= albedo[:, None, None]
-        return leaving.reshape(arriving.shape)
 
 
 def glossy(
@@ -317,11 +253,14 @@ def glossy(
     lights = sight("projector", projector, walls, patches, boxes)
     sees = sight("camera", viewer.eye if camera is None else camera, walls, patches, boxes)
     exchange = beams.exchange(walls, n, directions, rays, boxes, seed)
-    form_factors = _form_factors(exchange, patches.area)
+    entries = exchange.tocoo()  # with an empty last slot: no patch gets what others send to the camera
+    places = tuple(index + index // (slots - 1) for index in (entries.row, entries.col))
+    form_factors, grid = _form_factors(exchange, patches.area), (n, n * len(walls))
+    matte = name, grid, form_factors, albedos, patches.area, walls, viewer, blocks
     return GlossyScene(
-        Scene(name, (n, n * len(walls)), form_factors, albedos, patches.area, walls, viewer, blocks),
-        _with_slots(exchange, slots),
-        _reflectance(n, materials, lights, sees),
+        *matte,
+        G=scipy.sparse.csr_array((entries.data, places), (size * slots, size * slots)),
+        white=_reflectance(n, materials, lights, sees),
         P=_last_slots((sees.share > 0).astype(np.float64), slots),
         Q=scipy.sparse.csr_array(_last_slots(lights.share, slots).T),
     )
@@ -373,14 +312,6 @@ def _form_factors(exchange: Any, area: np.ndarray) -> np.ndarray:
     both = area[:, None] * (sums @ exchange @ sums.T).toarray() / bins
     form_factors = (both + both.T) / (2 * area[:, None])
     return form_factors / max(1.0, form_factors.sum(axis=1).max())
-
-
-def _with_slots(exchange: Any, slots: int) -> scipy.sparse.csr_array:
-    """The exchange with an empty last slot for each patch: no patch gets what others send to the camera."""
-    entries = exchange.tocoo()
-    row, column = (index + index // (slots - 1) for index in (entries.row, entries.col))
-    size = exchange.shape[0] // (slots - 1) * slots
-    return scipy.sparse.csr_array((entries.data, (row, column)), (size, size))
 
 
 def _last_slots(values: np.ndarray, slots: int) -> scipy.sparse.csr_array:
