@@ -207,24 +207,21 @@ def refine(
     """Z and noise by Wiener factors of a `pilot` and products between walls, whose folds `light` shows."""
     ends = [_folds(light, problem.grids[0]), _folds(light.T, problem.grids[1])]
     pair = shrink(problem, multiwavelets(problem.grids, ends, moments=2), pilot, step)
-    shape, walls = (*problem.grids[0], *problem.grids[1]), [list(product(*map(_slices, p))) for p in ends]
+    walls, shape = [list(product(*map(pairwise, p))) for p in ends], sum(problem.grids, ())
     before, after = [X.reshape(shape) for X in pair], [np.empty(shape, np.float32) for _ in pair]
     for (p, to), (q, source) in product(*map(enumerate, walls)):
+        block, mirror = (tuple(slice(*ends) for ends in pair) for pair in ((*to, *source), (*source, *to)))
         if problem.symmetric and q < p:
-            values = [X[(*source, *to)].transpose(2, 3, 0, 1) for X in after]
+            values = [X[mirror].transpose(2, 3, 0, 1) for X in after]
         else:
             edge = _EDGE if problem.symmetric else _GLOSS
-            values = _few_products(*(X[(*to, *source)] for X in before), edge)
+            values = _few_products(edge, *(X[block] for X in before))
         for X, value in zip(after, values, strict=True):
-            X[(*to, *source)] = value
+            X[block] = value
     return after[0].reshape(problem.Z.shape), after[1].reshape(problem.Z.shape)
 
 
-def _slices(ends: list[int]) -> list[slice]:
-    return [slice(*pair) for pair in pairwise(ends)]
-
-
-def _few_products(X: np.ndarray, noise: np.ndarray, lowest: float) -> tuple[np.ndarray, np.ndarray]:
+def _few_products(lowest: float, X: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """X and its noise, (h, w, h', w'), by products in the best order, or as they are."""
     least, best = 1.0, (X, noise)
     for order in _ORDERS:
