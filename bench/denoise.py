@@ -91,19 +91,13 @@ def claims(cases: Sequence[Case]) -> list[Claim]:
     reached = f"{(left[half] <= GOAL).sum()} of {half.sum()}"
     found = [
         Claim("none is worse than before", f"{left.max():.2f} of it", "at most 1", left.max() <= 1.0),
-        Claim(
-            "at most half where the bound is at most 0.4",
-            reached,
-            "all",
-            left[half].max() <= GOAL,
-            differs="bounces 2 and 3 of gloss",
-        ),
+        Claim("at most half where the bound is at most 0.4", reached, "all", left[half].max() <= GOAL),
         Claim(
             "others than at most half are near the bound",
             f"{far:.2f} of it",
             "at most 1.3",
             far <= 1.3,
-            differs="bounces 2 and 3 of gloss",
+            differs="bounce 3 of gloss",
         ),
         Claim("the first bounce is no limit", f"{first.max():.2f}", "at most 0.1", first.max() <= 0.1),
     ]
