@@ -112,8 +112,9 @@ def analyze(T: Transport, *, rtol: float = 1e-2) -> Analysis:
     rtol = checks.number("rtol", rtol, least=LEAST_RTOL, below=1.0)
     systems = zip(T.matrices, np.atleast_2d(T.first_bounce), T.systems, T.negative_bounces, strict=True)
     channels = tuple(_channel(*system, rtol) for system in systems)
-    highest = max(channel.energy.bounce_highest for channel in channels)
-    judged = verdict(T, negative_bounce=max(T.negative_bounces), bounce_highest=highest)
+    negative, highest = T.negative_bounces, [channel.energy.bounce_highest for channel in channels]
+    known = {"negative_bounce": np.fmax.reduce(negative), "bounce_highest": np.fmax.reduce(highest)}
+    judged = verdict(T, **known)
     return Analysis(T.shape, T.grid, rtol, T.nbytes, int(T.masked.sum()), channels, judged)
 
 

@@ -24,7 +24,7 @@ from ltcl.first_bounce import ENTRIES
 from ltcl.transport import Transport, require
 
 _STEPS, _AT_ONCE = 8, 8  # of a solve; right-hand sides
-_ENTRIES, _LEAST = 1 << 24, 64  # to read of a channel; pixels: fewer have no parts
+_ENTRIES, _LEAST = 1 << 24, 64  # to read of a channel; pixels: fewer tell neither parts nor noise
 _PARTS = 6  # of a row of the grid, over which noise averages out
 _NORMAL, _MARGIN = 0.6745, 1.5  # median of |normal values| in standard deviations; of an estimated noise
 
@@ -71,11 +71,12 @@ class Verdict:
     numbers: dict[str, float] = field(default_factory=dict)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused
 def verdict(T: Transport, **known: float) -> Verdict:
     """What T is good for; opens no device where T is an array or sparse.
 
     `known` are further numbers: `negative_bounce` and `bounce_highest` of `ltcl.analyze`; `sum_deviation` and
-    `saturation`, a share of the camera's pixels, of a scan.
+    `saturation`, a share of the camera's pixels, of a scan; NaN does not count.
 
     Examples
     --------
@@ -83,14 +84,18 @@ def verdict(T: Transport, **known: float) -> Verdict:
     >>> verdict(ltcl.scenes.dihedral(8, albedo=0.6).transport()).text.split(".")[0]
     'Good for compensation and for bounces'
     """
-    numbers, places = dict(known), dict[str, str]()
+    numbers, places = {name: x for name, x in known.items() if not math.isnan(x)}, dict[str, str]()
     try:
-        require(T, square=False).noise  # noqa: B018 - which is not known where entries are not
-    except InputError as error:
+        noise = require(T, square=False).noise  # of compressed entries it is not known
+        if noise.source == "estimated" and min(T.shape) < _LEAST:
+            raise InputError(f"fewer than {_LEAST} pixels do not tell their noise: run ltcl analyze --noise")
+        for name, value, where in _numbers(_on_host(T)):
+            if not math.isfinite(value):
+                raise InputError(f"{name} is {value:g}: check T and its noise for numbers that are too large")
+            if name not in numbers or (value < numbers[name]) == (name == "gain"):
+                numbers[name], places[name] = float(value), where
+    except (InputError, np.linalg.LinAlgError) as error:
         return Verdict(f"Unknown: {error}.", numbers=numbers)
-    for name, value, where in _numbers(_on_host(T)):
-        if name not in numbers or (value < numbers[name]) == (name == "gain"):
-            numbers[name], places[name] = float(value), where
     bad = [k for k in (1, 2, 3) if numbers.get(f"bounce_{k}", 0.0) > _DAMAGES["bounces"][0]]
     which = f"bounce{'s' * (len(bad) > 1)} {' and '.join(map(str, bad)).replace('1 and 2 and 3', '1 to 3')}"
     causes, spoilt = dict[str, tuple[bool, bool, str]](), set[str]()
@@ -219,12 +224,12 @@ def _flicker(T: Any, c: int) -> Number:
     """What differs from column to column in light that is smooth on surfaces, beyond noise."""
     S, ones = T.systems[c], np.ones(T.shape[1])
     deviation, own = _deviation(T, c, ones), T.noise.diagonal(T.first_bounce)[c]
-    indirect = np.maximum(S.T @ ones - S.T.diagonal(), 1e-300)
-    logs = np.log(np.where(S.F > 0, indirect * S.inverse, np.nan)).reshape(T.grid)
+    indirect = np.maximum((S.T @ ones - S.T.diagonal()) * S.inverse, 1e-30)  # in units of F
+    logs = np.log(np.where(lit := S.F > 0, indirect, np.nan)).reshape(T.grid)
     detail = np.diff(np.diff(logs, axis=0), axis=1) / 2.0
-    detail = detail[np.isfinite(detail)] if np.isfinite(detail).any() else np.zeros(1)
-    doubt = _MARGIN * float(np.median(np.hypot(deviation / indirect, own * (S.inverse + 1.0 / indirect))))
-    change = float(np.median(np.abs(detail))) / _NORMAL
+    doubt = np.hypot(deviation / indirect, own * (1.0 + 1.0 / indirect))[lit] * S.inverse[lit]
+    doubt = _MARGIN * float(np.median(doubt))
+    change = float(np.median(np.abs(np.append(detail[np.isfinite(detail)], 0.0)))) / _NORMAL
     return "flicker", math.sqrt(max(change**2 - doubt**2, 0.0)) if doubt < 0.3 else 0.0, ""
 
 
@@ -239,7 +244,7 @@ def _entries(T: Any, c: int) -> Iterator[Number]:
     moves, counts = np.unique(np.append(away[away != 0], N), return_counts=True)
     y = round((step := int(moves[counts.argmax()])) / w)
     yield "shifted", np.mean(away == step), f"{y} rows and {step - y * w} columns"
-    lower, top = direct[direct < direct.max()], (rows >= direct.max()).sum(axis=1)
+    lower, top = direct[direct < direct.max()], (rows == direct.max()).sum(axis=1)
     rows[k, pick] = (rows.sum(axis=1) - direct) / max(N - 1, 1)
     columns = np.add.outer(np.arange(0, N, w), np.unique(np.arange(_PARTS) * w // _PARTS)).ravel()
     groups = np.unique(np.searchsorted(pick, columns).clip(max=len(pick) - 1))

@@ -44,7 +44,7 @@ def info(
                     BlockStore.open(file).verify()
                 facts, F = _describe(file, record)
             lights |= {} if F is None else {file.name: (F, record.grid or (1, record.shape[1]))}
-            verdicts[str(file)] = judged = _verdict(record, facts["nbytes"])
+            verdicts[str(file)] = judged = _verdict(record, facts)
             entries.append(facts | {"verdict": judged})
             rows.append(_row(facts))
         except LtclError as error:
@@ -137,9 +137,17 @@ def _describe_record(record: Record) -> tuple[np.ndarray | None, dict[str, Any]]
     }
 
 
-def _verdict(record: Record | Parts, nbytes: int) -> Verdict:
-    if isinstance(record, Parts) or record.grid is None or nbytes > _JUDGED:
-        return Verdict("Unknown without a grid, of compressed or large transports: ask ltcl analyze.")
+def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
+    """Its text says why it is unknown, and which command helps."""
+    if isinstance(record, Parts):
+        kind = {"inverse": "an inverse"}.get(facts["stored"], facts["stored"])
+        return Verdict(f"Unknown: this is {kind}: run 'ltcl analyze' on the transport it was made of.")
+    square, advice = record.shape[0] == record.shape[1], "" if record.grid else " --grid HxW"
+    advice += "" if square or record.camera_grid else " --camera-grid HxW"
+    if advice or (square and facts["nbytes"] > _JUDGED):
+        why = "the file does not contain the grid" if advice else "T takes more than 256 MiB"
+        tool = f"analyze {facts['file']}" if square else f"convert {facts['file']} OUT.npz"
+        return Verdict(f"Unknown: {why}: run 'ltcl {tool}{advice}'.")
     names = ("first_bounce", "camera_grid", "mixing", "noise")
     settings = {n: value for n in names if (value := getattr(record, n)) is not None}
     try:

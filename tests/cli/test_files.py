@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import scipy.sparse
@@ -30,6 +32,9 @@ def test_info(program, transport, colour_transport, compressed, inverse, tmp_pat
     assert (sparse["stored"], sparse["entries"], sparse["grid"]) == ("sparse", 3, None)
     assert (sparse["dark_pixels"], sparse["first_bounce"]) == (1, [0.0, 3.0])
     assert (rectangular["first_bounce"], rectangular["dark_pixels"]) == (None, None)
+    reasons = (corner, "fewer than 64"), (small, "compressed: .*analyze"), (inverted, "inverse: .*analyze")
+    reasons += (sparse, "grid: .*analyze .* --grid"), (rectangular, "grid: .*convert .* --camera-grid")
+    assert all(re.search(f"^Unknown: .*{words}", entry["verdict"]["text"]) for entry, words in reasons)
     printed, words = program("info", *files).out, ("50 x 50", "5 x 10", "the same", "unknown", "inverse")
     assert all(word in printed for word in words)
 

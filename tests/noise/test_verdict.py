@@ -86,7 +86,8 @@ DAMAGES: list[tuple[str, Callable[..., Any], str, str, str]] = [
     ("saturated", lambda A, grid: np.minimum(A, np.quantile(A.diagonal(), 0.7)), "saturate", "", "saturated"),
     # The next two do not show in T, as the module says.
     ("slow drift", lambda A, grid: A * np.linspace(1.0, 0.8, len(A)), GOOD, "cb", ""),
-    ("gain", lambda A, grid: 7.0 * A, GOOD, "cb", ""),
+    ("gain", lambda A, grid: 1e30 * A, GOOD, "cb", ""),
+    ("noise, gain", lambda A, grid: 1e30 * noisy(1e-3)(A, grid)[0], f"bounce.*{NOISE}", "c", "bounces"),
 ]
 
 
@@ -118,6 +119,11 @@ def colours(order: tuple[int, ...], **settings: Any) -> ltcl.Transport:
     )
 
 
+def scaled(largest: float) -> ltcl.Transport:
+    A = measure(truth("corner"), noise_of(truth("corner"), 1e-3), 0).to_numpy()
+    return ltcl.Transport((A / A.max() * largest).astype(np.float32), (12, 24))
+
+
 def blocks(order: tuple[int, ...]) -> ltcl.Transport:
     T = truth("corner").to_numpy()
     return ltcl.Transport([[T if d == c else 0.1 * T for d in range(3)] for c in order], (12, 24))
@@ -140,6 +146,9 @@ def blocks(order: tuple[int, ...]) -> ltcl.Transport:
         (lambda: truth("glossy"), "not reciprocal.*gloss", "c"),
         (lambda: measure(truth("glossy"), noise_of(truth("glossy"), 1e-3), 0), "not reciprocal.*gloss", "c"),
         (lambda: ltcl.compress(truth("corner"), 0.05, basis="haar"), "^Unknown", ""),
+        (lambda: ltcl.Transport(np.eye(8) + 0.1, (2, 4)), "^Unknown: fewer than 64 pixels", ""),
+        (lambda: scaled(3.3e38), "^Unknown: pictures is (nan|inf)", ""),  # their light exceeds float32
+        (lambda: ltcl.Transport(scaled(1.0).to_numpy()[::-1], (12, 24)), "^Not good((?!saturate).)*$", ""),
     ],
 )
 def test_colours_shapes_and_surfaces(T, words, expected):
@@ -189,7 +198,7 @@ def test_a_closed_bright_room_is_no_ambient_light(ambient, causes):
 
 @pytest.mark.parametrize("known", [{"sum_deviation": 0.07}, {"saturation": 0.07}, {"negative_bounce": 0.07}])
 def test_numbers_from_elsewhere_count(known):
-    judged = verdict(truth("corner"), **known)
+    judged = verdict(truth("corner"), bounce_highest=np.nan, **known)  # which is not known
     assert (judged.causes, judged.bounces) == (tuple(known), False)
     assert "7 %" in judged.text
 
