@@ -185,7 +185,8 @@ def _error(T: Any, c: int, name: str, light: np.ndarray, deviation: np.ndarray) 
     light, deviation = np.where(F > 0, [light, deviation], 0.0)
     doubt = deviation / np.maximum(np.abs(light), 1e-300)
     place = _place(T.camera_grid, np.flatnonzero(doubt > 2.0 * np.median(doubt)), F)
-    return name, float(np.linalg.norm(deviation) / (np.linalg.norm(light) or 1.0)), place
+    relative = float(np.linalg.norm(deviation) / (np.linalg.norm(light) or 1.0))
+    return name, relative if np.isfinite(light).all() else math.nan, place
 
 
 def _deviation(T: Any, c: int, pattern: np.ndarray) -> np.ndarray:

@@ -196,8 +196,7 @@ def _report(context: Context, project: Project, device: Any) -> Answer:
     data = {"folder": project.folder, "store": project.store, **json.loads(facts.to_json())}
     lines = [str(facts)]
     T = store.load(project.store, on_dark="mask", device=device)
-    judged = verdict(T, sum_deviation=facts.sum_deviation, saturation=facts.saturated)
-    data["verdict"] = judged
+    data["verdict"] = judged = verdict(T, sum_deviation=facts.sum_deviation, saturation=facts.saturated)
     if project.kind == "virtual":
         context.progress("relative error of T p")
         with project.rig(aligned=True) as rig:

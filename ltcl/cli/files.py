@@ -91,11 +91,10 @@ def convert(
 def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.ndarray | None]:
     """Facts about a transport in plain types, and F; refuses what could not be loaded again."""
     if isinstance(record, Parts):  # whose operators are not made: that takes a device
-        F, kinds = record.first_bounce, ", ".join(record.kinds)
-        facts: dict[str, Any] = {"channels": len(F), "entries": record.entries}
-        facts |= {"dtype": f"{kinds}; error {checks.upwards(record.error)}", "nbytes": record.nbytes}
+        F, kinds, error = record.first_bounce, ", ".join(record.kinds), record.error
+        facts: dict[str, Any] = {"channels": len(F), "entries": record.entries, "solution_error": error}
+        facts |= {"dtype": f"{kinds}; error {checks.upwards(error)}", "nbytes": record.nbytes}
         facts |= {"first_bounce_from": "file", "stored": record.format.split("-")[1]}
-        facts["solution_error"] = record.error
     else:
         F, facts = _describe_record(record)
     facts = {
@@ -138,20 +137,18 @@ def _describe_record(record: Record) -> tuple[np.ndarray | None, dict[str, Any]]
 
 
 def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
-    """Its text says why it is unknown, and which command helps."""
     if isinstance(record, Parts):
-        kind = {"inverse": "an inverse"}.get(facts["stored"], facts["stored"])
-        return Verdict(f"Unknown: this is {kind}: run 'ltcl analyze' on the transport it was made of.")
-    square, advice = record.shape[0] == record.shape[1], "" if record.grid else " --grid HxW"
-    advice += "" if square or record.camera_grid else " --camera-grid HxW"
-    if advice or (square and facts["nbytes"] > _JUDGED):
-        why = "the file does not contain the grid" if advice else "T takes more than 256 MiB"
+        return Verdict(f"Unknown: stored as {facts['stored']}: run 'ltcl analyze' on what it was made of.")
+    square, missing = record.shape[0] == record.shape[1], "" if record.grid else " --grid HxW"
+    missing += "" if square or record.camera_grid else " --camera-grid HxW"
+    if missing or (square and facts["nbytes"] > _JUDGED):
+        why = "the file does not contain the grid" if missing else "T takes more than 256 MiB"
         tool = f"analyze {facts['file']}" if square else f"convert {facts['file']} OUT.npz"
-        return Verdict(f"Unknown: {why}: run 'ltcl {tool}{advice}'.")
-    names = ("first_bounce", "camera_grid", "mixing", "noise")
+        return Verdict(f"Unknown: {why}: run 'ltcl {tool}{missing}'.")
+    names = ("grid", "first_bounce", "camera_grid", "mixing", "noise")
     settings = {n: value for n in names if (value := getattr(record, n)) is not None}
     try:
-        return verdict(Transport(record.matrices, record.grid, **settings))
+        return verdict(Transport(record.matrices, **settings))
     except InputError as error:  # dark all over
         return Verdict(f"Good for nothing: {error}.", False, False)
 
