@@ -86,15 +86,14 @@ def verdict(T: Transport, **known: float) -> Verdict:
     """
     numbers, places = {name: x for name, x in known.items() if not math.isnan(x)}, dict[str, str]()
     try:
-        noise = require(T, square=False).noise  # of compressed entries it is not known
-        if noise.source == "estimated" and min(T.shape) < _LEAST:
-            raise InputError(f"fewer than {_LEAST} pixels do not tell their noise: run ltcl analyze --noise")
+        if require(T, square=False).noise.source == "estimated" and min(T.shape) < _LEAST:
+            raise InputError(f"fewer than {_LEAST} pixels do not tell their noise: use ltcl analyze --noise")
         for name, value, where in _numbers(_on_host(T)):
             if not math.isfinite(value):
                 raise InputError(f"{name} is {value:g}: check T and its noise for numbers that are too large")
             if name not in numbers or (value < numbers[name]) == (name == "gain"):
                 numbers[name], places[name] = float(value), where
-    except (InputError, np.linalg.LinAlgError) as error:
+    except (InputError, np.linalg.LinAlgError) as error:  # as of compressed entries, without noise
         return Verdict(f"Unknown: {error}.", numbers=numbers)
     bad = [k for k in (1, 2, 3) if numbers.get(f"bounce_{k}", 0.0) > _DAMAGES["bounces"][0]]
     which = f"bounce{'s' * (len(bad) > 1)} {' and '.join(map(str, bad)).replace('1 and 2 and 3', '1 to 3')}"
@@ -228,8 +227,7 @@ def _flicker(T: Any, c: int) -> Number:
     indirect = np.maximum((S.T @ ones - S.T.diagonal()) * S.inverse, 1e-30)  # in units of F
     logs = np.log(np.where(lit := S.F > 0, indirect, np.nan)).reshape(T.grid)
     detail = np.diff(np.diff(logs, axis=0), axis=1) / 2.0
-    doubt = np.hypot(deviation / indirect, own * (1.0 + 1.0 / indirect))[lit] * S.inverse[lit]
-    doubt = _MARGIN * float(np.median(doubt))
+    doubt = _MARGIN * np.median(np.hypot(deviation / indirect, own + own / indirect)[lit] * S.inverse[lit])
     change = float(np.median(np.abs(np.append(detail[np.isfinite(detail)], 0.0)))) / _NORMAL
     return "flicker", math.sqrt(max(change**2 - doubt**2, 0.0)) if doubt < 0.3 else 0.0, ""
 
