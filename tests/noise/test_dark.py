@@ -157,6 +157,16 @@ def test_noise_is_not_estimated_without_need(monkeypatch) -> None:
         ltcl.Transport(T32 * DIM, (4, 8))
 
 
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.98])
+def test_most_pixels_may_be_dark_with_noise(share) -> None:
+    scene = ltcl.scenes.dihedral(8)
+    lit, noise = random.permutation(128) >= share * 128, 7e-4 * random.standard_normal((128, 128))
+    T = ltcl.Transport(scene.matrices()[0] * lit + noise, scene.grid)
+    np.testing.assert_array_equal(T.masked, ~lit)
+    with pytest.raises(InputError, match=r"noise.*every pixel|every pixel.*noise"):
+        ltcl.Transport(noise, scene.grid)
+
+
 # What a separation cannot be.
 
 
