@@ -245,9 +245,8 @@ def _compensate_frames(
     text |= {"most_clipped": most, "frames": [dataclasses.asdict(record) for record in records]}
     if most.clipped > _MANY:
         count = sum(record.clipped > _MANY for record in records)
-        frame = f"frame {most.number} ({most.name}) most"
-        advice = "a lower --gain helps where patterns are at 1"
-        note(f"{count} frame(s) ask for light beyond the projector's, {frame}; {advice}")
+        frame = f"frame {most.number} ({most.name}) most; a lower --gain helps where patterns are at 1"
+        note(f"{count} frame(s) ask for light beyond the projector's, {frame}")
     pace = f"{result.frames_per_second:.1f}" if result.solved else None
     columns = ("frames", "of this run", "a second", "gain", "worst error", "most clipped")
     error, clipped = percent(worst.error), percent(most.clipped)

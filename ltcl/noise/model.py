@@ -35,7 +35,7 @@ _PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; s
 _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
 _AT_ONCE, _FIRST = 1 << 22, 64  # samples; first bounces at least, whose variance has a factor of its own
 _G, _CHANCE = 0.375, 3.0  # ||G||; standard deviations of row sums that mean nothing
-_LARGEST, _EXPOSURE = 1e36, 1.2  # whose squared variances are finite; a third of a stop is 1.26
+_LARGEST, _UNITS, _EXPOSURE = 1e36, 1e6, 1.2  # at most: numbers, deviations over light, ratio of two T
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -84,8 +84,7 @@ class Noise:
                 value = np.full(n, value.ravel())
             ndim = 2 if name in ("rows", "columns", "white") else 1
             if value.ndim != ndim or len(value) != n:
-                text = f"{ndim}-dimensional, of {n} channel(s)"
-                raise InputError(f"noise.{name} has shape {value.shape}; it must be {text}")
+                raise InputError(f"noise.{name} has shape {value.shape}; it must be {ndim}-D, {n} channel(s)")
             largest = 1.0 if name == "neighbours" else _LARGEST
             valid = (value >= 0) & ((value <= largest) | (name == "white") & np.isinf(value))
             if not valid.all():
@@ -96,9 +95,8 @@ class Noise:
     @classmethod
     def uniform(cls, shape: tuple[int, int], floor: Any, photons: Any = 0.0, source: str = "given") -> Self:
         """The same for all entries of a T (M, N); `floor` and `photons` are floats, or one a channel."""
-        shape = checks.grid("shape", shape)
         f, p = np.broadcast_arrays(np.atleast_1d(floor), np.atleast_1d(photons))
-        rows, columns = (np.ones((len(f), n)) for n in shape)
+        rows, columns = (np.ones((len(f), n)) for n in checks.grid("shape", shape))
         return cls(p, f, rows, columns, np.full(rows.shape, np.inf), source)
 
     def __repr__(self) -> str:
@@ -163,15 +161,18 @@ class Noise:
             raise InputError("noise has the same entries as matrix; it must be a second measurement")
         shares, exposures = zip(*(_compared(*pair) for pair in pairs), strict=True)
         if not 1.0 / _EXPOSURE <= (ratio := max(exposures, key=lambda x: abs(np.log(x)))) <= _EXPOSURE:
-            text = f"noise is a second T, but {ratio:.3g} times as bright as matrix"
-            raise InputError(f"{text}; both must be measured with the same exposure and light")
+            raise InputError(f"noise is a T {ratio:.3g} times as bright as matrix; it needs the same exposure")
         return replace(noise, neighbours=shares)
 
-    def require(self, channels: int, shape: tuple[int, int]) -> None:
-        """InputError where this is the noise of a T of other channels or another shape (M, N)."""
+    def require(self, channels: int, shape: tuple[int, int], brightest: Any = 0.0) -> None:
+        """InputError where this is no noise of such a T (M, N), `brightest` (channels,), or 0 if unknown."""
         n, own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
         if (n, own) != (channels, shape):
             raise InputError(f"noise is of {n} channel(s) {own}; T has {channels} {shape}")
+        light = np.maximum(brightest, 0.0)
+        v = (self.photons * light + self.floor**2) * self.rows.max(axis=1) * self.columns.max(axis=1)
+        if np.any((light > 0.0) & (v > (_UNITS * light) ** 2)):
+            raise InputError(f"noise reaches {v.max() ** 0.5:.3g}, {_UNITS:g} times T or more; it needs the units of T")
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Numbers for files, by names that begin with ``noise_``."""

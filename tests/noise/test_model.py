@@ -164,6 +164,7 @@ BRIGHT = ltcl.Transport(1.5 * truth("corner", 8).to_numpy(), (8, 16))
         (0.1, InputTypeError, "noise is a float"),
         (Noise.uniform((3, 4), 0.1), InputError, r"noise.*\(3, 4\).*\(128, 128\)"),
         (Noise.uniform((128, 128), [0.1] * 3), InputError, "noise.*3 channel"),
+        (replace(Noise.uniform((128, 128), 1e30), direct=0.0), InputError, r"noise.*1e\+30.*T"),
         (ltcl.Transport(np.eye(12), (3, 4)), InputError, r"noise.*grid \(3, 4\)"),
         (ltcl.Transport([np.eye(128)] * 3, (8, 16)), InputError, "noise.*channels 3"),
         (measure(BRIGHT, noise_of(BRIGHT, 1e-3), 1), InputError, r"noise.*1\.5 times"),
