@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How much nearer to the truth `ltcl.denoise` brings pictures and bounces, on five scenes that are known.
 
-Noise is a floor, in median first bounces, alone or with photon noise of as much at that light. The bound is
-the same shrinkage with the Wiener factors of the true T: what its wavelets can reach at most.
+Noise is a floor, in median first bounces, alone or with photon noise of as much at that light. Two bounds: of
+the same bases, with Wiener factors and folds of the truth; and of the first bounce, which stays as measured:
+the errors of the truth with that. Thresholds were chosen on corner, box and glossy, 12 pixels a side, without
+photon noise, at another seed. The whole takes 3 minutes on 2 cores, in one process.
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
 import _figures as figures
 import ltcl
@@ -30,7 +34,7 @@ QUANTITIES = ("random", "smooth", "patch", "bounce 1", "bounce 2", "bounce 3")
 
 
 class Case(NamedTuple):
-    """`shares` (3, quantities): relative errors of the raw T; what is left of them, and the bound on that."""
+    """`shares` (4, quantities): errors of the raw T, relative; what is left of them; both bounds."""
 
     scene: str
     pixels: int
@@ -50,13 +54,17 @@ def patterns(grid: tuple[int, int]) -> list[np.ndarray]:
 
 
 def oracle(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:
-    """T denoised by Wiener factors of the truth."""
-    Y, bases = T.to_numpy(), denoising.multiwavelets(T.grid, T.grid)
-    problem = denoising.Problem.of(Y, T.noise.variance, T.grid, T.grid)
+    """T denoised by Wiener factors and folds of the truth."""
+    Y, grids = T.to_numpy(), (T.grid, T.grid)
+    problem = denoising.Problem.of(Y, T.noise.variance, *grids)
     pilot = (exact * problem.gauge).astype(np.float32)
-    np.fill_diagonal(pilot, np.diag(denoising.shrink(problem, bases, None)[0]))
-    entries = problem.restore(denoising.shrink(problem, bases, pilot)[0], Y)
-    return ltcl.Transport(entries, T.grid)
+    np.fill_diagonal(pilot, np.diag(denoising.shrink(problem, denoising.multiwavelets(grids), None)[0]))
+    return ltcl.Transport(problem.restore(denoising.refine(problem, pilot, pilot)[0], Y), T.grid)
+
+
+def first_only(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:
+    """The truth with the first bounce of T."""
+    return ltcl.Transport(exact + np.diag(np.diag(T.to_numpy() - exact)), T.grid)
 
 
 def measured(scene: str, n: int, level: float, photons: float) -> Case:
@@ -68,8 +76,8 @@ def measured(scene: str, n: int, level: float, photons: float) -> Case:
     def light(T: ltcl.Transport) -> list[np.ndarray]:
         return [T @ kind for kind in kinds] + list(ltcl.separate(T, picture, 3, method="direct").bounces)
 
-    T, true = measure(exact, noise, 0), light(exact)
-    lights = [light(some) for some in (T, ltcl.denoise(T), oracle(T, exact.to_numpy()))]
+    T, true, E = measure(exact, noise, n + int(photons)), light(exact), exact.to_numpy()
+    lights = [light(some) for some in (T, ltcl.denoise(T), oracle(T, E), first_only(T, E))]
     errors = np.array([[np.linalg.norm(a - b) for a, b in zip(x, true, strict=True)] for x in lights])
     errors[1:] /= errors[0]
     errors[0] /= [np.linalg.norm(b) for b in true]
@@ -77,22 +85,45 @@ def measured(scene: str, n: int, level: float, photons: float) -> Case:
 
 
 def claims(cases: Sequence[Case]) -> list[Claim]:
-    """Never worse; at most half, or near the bound."""
-    _, left, bound = np.stack([case.shares for case in cases], axis=1)
-    far = float((left / bound)[left > GOAL].max(initial=0.0))
+    """Never worse; at most half where the bound allows it, else near the bound."""
+    _, left, bound, first = np.stack([case.shares for case in cases], axis=1)
+    half, far = bound <= 0.4, float((left / bound)[left > GOAL].max(initial=0.0))
+    reached = f"{(left[half] <= GOAL).sum()} of {half.sum()}"
     found = [
         Claim("none is worse than before", f"{left.max():.2f} of it", "at most 1", left.max() <= 1.0),
-        Claim("others than at most half are near the bound", f"{far:.2f} of it", "at most 1.4", far <= 1.4),
+        Claim("at most half where the bound is at most 0.4", reached, "all", left[half].max() <= GOAL),
+        Claim(
+            "others than at most half are near the bound",
+            f"{far:.2f} of it",
+            "at most 1.3",
+            far <= 1.3,
+            differs="bounce 3 of gloss",
+        ),
+        Claim("the first bounce is no limit", f"{first.max():.2f}", "at most 0.1", first.max() <= 0.1),
     ]
     for level in LEVELS:
         own = [case.level == level for case in cases]
         few, possible = ((share[own] <= GOAL).sum() for share in (left, bound))
         means = f"means {left[own].mean():.2f} and {bound[own].mean():.2f}"
         shares = f"{few} of {left[own].size}, bound {possible}; {means}"
-        differs = "" if level == LEVELS[-1] else "most coefficients of so few pixels stand out of the noise"
+        differs = (
+            "gloss" if level == LEVELS[-1] else "most coefficients of so few pixels stand out of the noise"
+        )
         text = f"at most half is left at a noise of {level:g}"
         found.append(Claim(text, shares, "all", few == left[own].size, differs=differs))
     return found
+
+
+def tables(cases: Sequence[Case]) -> list[Table]:
+    """One a level: error of the raw T, share left (bound of the same bases, and of the first bounce)."""
+    result = []
+    for level in LEVELS:
+        table = Table("scene", *QUANTITIES, title=f"noise {level:g}: raw error, left (bounds)")
+        for case in (case for case in cases if case.level == level):
+            cells = [f"{raw:.2g}, {x:.2f} ({b:.2f}; {f:.2f})" for raw, x, b, f in case.shares.T]
+            table.add_row(f"{case.scene} {case.pixels}, {case.photons:g}", *cells)
+        result.append(table)
+    return result
 
 
 def draw(cases: Sequence[Case]) -> Any:
@@ -103,7 +134,7 @@ def draw(cases: Sequence[Case]) -> Any:
     axes.set_xscale("log")
     for scene, colour in zip({case.scene: 0 for case in cases}, OTHERS, strict=False):
         last = [case.shares for case in cases if case.scene == scene][-len(LEVELS) :]
-        _, left, bound = np.mean(last, axis=2).T
+        _, left, bound, _ = np.mean(last, axis=2).T
         axes.plot(LEVELS, left, color=colour, label=scene)
         axes.plot(LEVELS, bound, "--", color=colour)
     axes.legend(frameon=False, labelcolor="linecolor", fontsize=9)
@@ -120,6 +151,8 @@ def main() -> None:
     names = [f"{c.scene} {c.pixels}, noise {c.level:g}, photons {c.photons:g}" for c in cases]
     rows = [dict(zip(QUANTITIES, case.shares.T.round(5).tolist(), strict=True)) for case in cases]
     facts = dict(zip(names, rows, strict=True))
+    for table in tables(cases):
+        Console(width=180).print(table)
     figures.conclude(given, "Denoising against the truth", claims(cases), facts, lambda: draw(cases))
 
 

@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Denoising of a measured T: reciprocal pairs averaged, wavelet coefficients shrunk by the noise model.
+"""Denoising of a measured T: reciprocal pairs averaged, wavelet coefficients and singular values shrunk.
 
 1. The diagonal of a square T, the first bounce, stays as measured; it is left out of all that follows.
-2. Reciprocity: T_ij d_j = T_ji d_i of a Lambertian scene (`ltcl.diagnostics` fits d). In Z = D^-1/2 T D^1/2
-   both entries of a pair are the same light; they are averaged with weights 1 / variance, unless sums of
-   Z - Z^T between blocks of pixels exceed what the noise explains: a glossy scene, or another set-up.
-3. C = K Z K^T, K orthonormal multiwavelets of 1 or 2 vanishing moments (Alpert 1993) on the trees of a few
-   random shifts, whose results are averaged (cycle spinning, Coifman and Donoho 1995). What is below 3
-   standard deviations goes; with this first estimate P of C the Wiener factor P^2 / (P^2 + variance) is
-   applied to the measured C (Ghael, Sayeed and Baraniuk 1997). Sharp parts have large coefficients and stay.
-4. Negative entries become 0; between the same two blocks of pixels what is dim loses as much light.
+2. Reciprocity: T_ij d_j = T_ji d_i of a Lambertian scene. Errors of the fitted d (`ltcl.diagnostics`) are the
+   largest ones of smooth pictures; d holds areas and irradiance, no albedo: what of its wavelet coefficients
+   its errors explain goes. In Z = D^-1/2 T D^1/2 both entries of a pair are the same light; they are averaged
+   with weights 1 / variance, unless sums of Z - Z^T between blocks exceed what noise explains: gloss.
+3. C = K Z K^T, K orthonormal multiwavelets of 1 to 3 vanishing moments (Alpert 1993) at a few random shifts,
+   whose results are averaged (cycle spinning, Coifman and Donoho 1995). What is below 3 standard deviations
+   goes; with this first estimate P of C the Wiener factor P^2 / (P^2 + variance) is applied to the measured C
+   (Ghael, Sayeed and Baraniuk 1997), in bases that do not cross the folds between walls.
+4. Between two walls, light depends on rows and on columns of the picture nearly as few products
+   (Van Loan and Pitsianis 1993): singular values of entries in that order, (rows, rows') x (columns,
+   columns'), are shrunk (Gavish and Donoho 2017) below those of the noise that step 3 leaves, simulated.
+5. Negative entries become 0; between the same two blocks of pixels what is dim loses as much light.
 
-Known limit: where most coefficients stand out of the noise, at low noise or at few pixels, little is gained.
+Known limit: at low noise or few pixels most coefficients stand out; `bench/denoise.py` prints the bound.
 """
 
 from __future__ import annotations
@@ -19,10 +23,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 import scipy.sparse
+from scipy.linalg import block_diag
 
 from ltcl import checks
 from ltcl.diagnostics import log_scale
@@ -30,15 +36,20 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Operator
 from ltcl.transport import Transport, require
 
-SHIFTS = 8  # trees whose results are averaged
+SHIFTS = 4  # trees whose results are averaged, of `moments` and one more
 THRESHOLD = 3.0  # standard deviations of a coefficient
 _BLOCK = 4  # pixels along a side of a block
 _EXCESS = 1.5  # of the variance of Z - Z^T between blocks over that of noise: the most of a reciprocal T
 _SCALE = 3.0  # largest |log d|; beyond, d is fitted to noise
-_ARRAYS = 16  # of the size of T, float32, at once
+_FOLDS, _ALIKE = 3, 0.3  # along an axis at most; cosine of the light of neighbours across one
+_ORDERS = (0, 2, 1, 3), (0, 3, 1, 2)  # axes: rows with rows, columns with columns; rows with columns
+_EDGE, _GLOSS = 0.8, 0.5  # of the largest singular value of noise, and where T is not reciprocal
+_RANK = 96  # singular values of a large matrix
+_ARRAYS = 15  # of the size of T, float32, at once
 
 Grid = tuple[int, int]
 Bases = list[tuple[np.ndarray, ...]]
+Ends = list[list[int]]  # of parts of a picture, along its rows and columns
 
 
 def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = None) -> Transport:
@@ -64,7 +75,7 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     InputError
         3 x 3 blocks between colours.
     MemoryLimitError
-        The host lacks memory for 16 arrays of float32 of the size of T.
+        The host lacks memory for 15 arrays of float32 of the size of T.
 
     Examples
     --------
@@ -81,15 +92,12 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
         raise InputError("T has blocks between colours; denoise takes a T of 1 or 3 channels")
     for A in T.matrices:
         if isinstance(A, Operator) or not (isinstance(A, np.ndarray) or hasattr(A, "tocsr")):
-            kind = type(A).__name__
-            raise InputTypeError(
-                f"T is made of {kind}; it must be of arrays or sparse: denoise, then compress"
-            )
+            text = "it must be of arrays or sparse: denoise, then compress"
+            raise InputTypeError(f"T is made of {type(A).__name__}; {text}")
     if progress is not None and not callable(progress):
         raise InputTypeError(f"progress is {progress!r}; it must be callable(text, share), or None")
     checks.fits_host("denoising", 4 * _ARRAYS * T.shape[0] * T.shape[1])
-    noise, bases = T.noise, multiwavelets(T.camera_grid, T.grid)
-    matrices, left = [], np.ones(T.channels)
+    noise, matrices, left = T.noise, [], np.ones(T.channels)
 
     def note(done: int) -> None:
         if progress is not None:
@@ -98,9 +106,11 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     for c, matrix in enumerate(T.matrices):
         Y = (matrix if isinstance(matrix, np.ndarray) else matrix.tocsr().toarray()).astype(np.float32)
         problem = Problem.of(Y, partial(noise.variance, channel=c), T.camera_grid, T.grid)
-        pilot, _ = shrink(problem, bases, None, note)
-        estimate, left[c] = shrink(problem, bases, pilot, lambda done: note(SHIFTS + done))
+        pilot = shrink(problem, multiwavelets(problem.grids), None, note)[0]
+        estimate, error = refine(problem, pilot, pilot, lambda done: note(SHIFTS + done))
+        white = (error / problem.gauge).sum(axis=1, dtype=float)
         matrices.append(problem.restore(estimate, Y))
+        left[c] = white @ white / (noise.variance(matrices[-1], c).sum() or 1.0)
     noise = dataclasses.replace(noise, photons=noise.photons * left, floor=noise.floor * np.sqrt(left))
     settings = {"device": T._requested_device, "mixing": T.mixing, "noise": noise}
     first = T.first_bounce if T.is_square else "diagonal"
@@ -135,8 +145,8 @@ class Problem:
         largest = float(np.abs(X).max(initial=0.0))
         if not square or largest == 0.0:
             return cls(X, V, 1.0, False, grids)
-        log_d = log_scale(scipy.sparse.csr_array(X / largest))
-        r = np.exp(np.clip(log_d, -_SCALE, _SCALE) / 2).astype(np.float32)
+        log_d = np.clip(log_scale(scipy.sparse.csr_array(X / largest)), -_SCALE, _SCALE)
+        r = np.exp(_smooth(log_d, X, V, grid) / 2).astype(np.float32)
         gauge = r / r[:, None]
         Z, W = X * gauge, np.maximum(V * gauge**2, np.finfo(np.float32).tiny)
         between = np.triu_indices(rows.shape[1], 1)
@@ -154,7 +164,7 @@ class Problem:
         bright = np.maximum(Z, 0.0)
         dim = np.minimum(bright, 3.0 * np.sqrt(self.variance))  # what may well be 0
         surplus, room = _sums(bright - Z, rows, columns), _sums(dim, rows, columns)
-        share = np.minimum(np.divide(surplus, room, out=np.zeros_like(room), where=room > 0.0), 1.0)
+        share = np.minimum(surplus / np.maximum(room, np.finfo(np.float32).tiny), 1.0)
         T = (bright - dim * (rows @ share @ columns.T)) / self.gauge
         if self.grids[0] == self.grids[1]:
             np.fill_diagonal(T, np.diag(Y))
@@ -166,49 +176,129 @@ def shrink(
     bases: Bases,
     pilot: np.ndarray | None,
     step: Callable[[int], object] = lambda done: None,
-) -> tuple[np.ndarray, float]:
-    """Z of less noise, (M, N), by thresholds without a `pilot`; and the share of the variance that is left.
-
-    Of a picture under white: by Stein's unbiased estimate, or that of a Wiener filter where this is more.
-    """
-    Z = problem.Z
+) -> tuple[np.ndarray, np.ndarray]:
+    """Z of less noise, (M, N), by thresholds without a `pilot`, and simulated noise after the last basis."""
+    Z, noise = problem.Z, np.random.default_rng(0).standard_normal(problem.Z.shape, np.float32)
+    if problem.symmetric:
+        noise = (noise + noise.T) * np.float32(0.5**0.5)
     if pilot is not None and problem.grids[0] == problem.grids[1]:
         Z = Z + np.diag(np.diag(pilot))  # smooth where the first bounce was
-    result, sums = np.zeros(Z.shape, np.float32), np.zeros(3)
+    result = np.zeros(Z.shape, np.float32)
     for done, basis in enumerate(bases, 1):
-        C = _transform(Z, basis)
-        V = _transform(problem.variance, [A * A for A in basis])
+        C, V = _transform(Z, basis), _transform(problem.variance, [A * A for A in basis])
         if problem.symmetric:  # Z_ij is Z_ji: twice the variance on the diagonal
             np.einsum("ii->i", V)[:] *= 2.0
         if pilot is None:
-            factor = (C * C > THRESHOLD**2 * V).astype(np.float32)
+            C *= C * C > THRESHOLD**2 * V
         else:
-            P = _transform(np.maximum(pilot, 0.0), basis) ** 2
-            factor = P / np.maximum(P + V, np.finfo(np.float32).tiny)
-        white = np.kron(basis[2].sum(axis=1), basis[3].sum(axis=1)) ** 2
-        risks = (1.0 - factor) ** 2 * C * C + (2.0 * factor - 1.0) * V, factor * V, V
-        sums += [float((risk @ white).sum()) for risk in risks]
-        result += _transform(C * factor, [A.T for A in basis])
+            factor = _transform(np.maximum(pilot, 0.0), basis) ** 2
+            factor /= np.maximum(factor + V, np.finfo(np.float32).tiny)
+            C *= factor
+            if done == len(bases):
+                noise = _transform(noise * np.sqrt(factor * V), [A.T for A in basis])
+        result += _transform(C, [A.T for A in basis])
         step(done)
-    result /= len(bases)
-    return result, max(sums[:2]) / sums[2] if sums[2] else 1.0
+    return result / len(bases), noise
 
 
-def multiwavelets(camera_grid: Grid, grid: Grid, shifts: int = SHIFTS) -> Bases:
-    """Bases of columns and rows of pictures of camera and projector, at random shifts."""
+def refine(
+    problem: Problem, pilot: np.ndarray, light: np.ndarray, step: Callable[[int], object] = lambda done: None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Z and noise by Wiener factors of a `pilot` and products between walls, whose folds `light` shows."""
+    ends = [_folds(light, problem.grids[0]), _folds(light.T, problem.grids[1])]
+    pair = shrink(problem, multiwavelets(problem.grids, ends, moments=2), pilot, step)
+    walls, shape = [list(product(*map(pairwise, p))) for p in ends], sum(problem.grids, ())
+    before, after = [X.reshape(shape) for X in pair], [np.empty(shape, np.float32) for _ in pair]
+    for (p, to), (q, source) in product(*map(enumerate, walls)):
+        block, mirror = (tuple(slice(*ends) for ends in pair) for pair in ((*to, *source), (*source, *to)))
+        if problem.symmetric and q < p:
+            values = [X[mirror].transpose(2, 3, 0, 1) for X in after]
+        else:
+            edge = _EDGE if problem.symmetric else _GLOSS
+            values = _few_products(edge, *(X[block] for X in before))
+        for X, value in zip(after, values, strict=True):
+            X[block] = value
+    return after[0].reshape(problem.Z.shape), after[1].reshape(problem.Z.shape)
+
+
+def _few_products(lowest: float, X: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """X and its noise, (h, w, h', w'), by products in the best order, or as they are."""
+    least, best = 1.0, (X, noise)
+    for order in _ORDERS:
+        shape = tuple(X.shape[axis] for axis in order)
+        A, E = (Y.transpose(order).reshape(shape[0] * shape[1], -1) for Y in (X, noise))
+        (U, S, V), of_noise, beta = _svd(A), _svd(E)[1], min(A.shape) / max(A.shape)
+        most = 2.0 * of_noise > of_noise[0]
+        level = min(1.0, float((S[most] / of_noise[most]).min(initial=1.0)))  # the model may state too much
+        edge, power = lowest * level * of_noise[0], level**2 * float(np.vdot(E, E)) or 1.0
+        k, (m, n) = int(np.sum(edge < S)), A.shape
+        U, S, V = U[:, :k], S[:k], V[:k]
+        dropped = float(np.vdot(A, A) - S @ S) / power - (m - k) * (n - k) / (m * n)  # light, not noise
+        error = dropped + k * (m + n - k) / (m * n)
+        if k == min(m, n, _RANK) or error >= least:
+            continue
+        x = (edge / ((1.0 + beta**0.5) * S)) ** 2
+        S = S * np.sqrt(np.maximum((1.0 - (1.0 + beta) * x) ** 2 - 4.0 * beta * x**2, 0.0))
+        EV = E @ V.T
+        values = (U * S) @ V, U @ (U.T @ E) + (EV - U @ (U.T @ EV)) @ V
+        least, best = error, tuple(Y.reshape(shape).transpose(np.argsort(order)) for Y in values)
+    return best[0], best[1]
+
+
+def _svd(A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Singular values of A: all, or the largest by subspace iteration (Halko, Martinsson and Tropp 2011)."""
+    if min(A.shape) <= 4 * _RANK:
+        return np.linalg.svd(A, full_matrices=False)
+    Q = A @ np.random.default_rng(0).standard_normal((A.shape[1], _RANK), np.float32)
+    for _ in range(2):
+        Q = A @ (A.T @ np.linalg.qr(Q)[0])
+    Q = np.linalg.qr(Q)[0]
+    U, S, V = np.linalg.svd(Q.T @ A, full_matrices=False)
+    return Q @ U, S, V
+
+
+def _folds(Z: np.ndarray, grid: Grid) -> Ends:
+    """Ends of walls: where light, rows of Z, comes to neighbouring rows and columns from elsewhere."""
+    ends = []
+    for axis, size in enumerate(grid):
+        A = np.moveaxis(Z.reshape(*grid, -1), axis, 0)
+        power = np.einsum("ijk,ijk->i", A, A)
+        common, norm = np.einsum("ijk,ijk->i", A[1:], A[:-1]), np.sqrt(power[1:] * power[:-1])
+        alike = (common + (norm == 0.0)) / (norm + (norm == 0.0))  # where it is dark
+        ends.append([0, *sorted(1 + int(i) for i in np.argsort(alike)[:_FOLDS] if alike[i] < _ALIKE), size])
+    return ends
+
+
+def _smooth(log_d: np.ndarray, X: np.ndarray, V: np.ndarray, grid: Grid) -> np.ndarray:
+    """The fit of log d to X, (N,), without coefficients that its errors explain."""
+    d, light = np.exp(log_d).astype(np.float32), np.maximum(X, 0.0)
+    weight, W = light * light.T, V * (d / d[:, None])
+    degree, squares = weight.sum(axis=1), np.einsum("ij,ij->i", weight, W + W.T)
+    most = np.full(len(d), _SCALE**2)
+    error = np.minimum(np.divide(squares, degree**2, out=most.copy(), where=degree > 0.0), most)
+    smooth = np.zeros(len(d))
+    for basis in multiwavelets((grid, grid)):
+        c, v = _transform(log_d, basis[:2]), _transform(error, [A * A for A in basis[:2]])
+        smooth += _transform(c * (c * c > THRESHOLD**2 * v), [A.T for A in basis[:2]]) / SHIFTS
+    return smooth
+
+
+def multiwavelets(grids: tuple[Grid, Grid], ends: list[Ends] | None = None, moments: int = 1) -> Bases:
+    """Bases of rows and columns of pictures, camera and projector, at random shifts, each wall by itself."""
     random, bases = np.random.default_rng(0), []
-    for number in range(shifts):
-        rows, columns = (
-            [_multiwavelet(n, 1 + number % 2, int(random.integers(n))) for n in g]
-            for g in (camera_grid, grid)
-        )
-        bases.append((*(columns if camera_grid == grid else rows), *columns))
+    pictures = ends or [[[0, size] for size in grid] for grid in grids]
+    for number in range(SHIFTS):
+        axes = [
+            block_diag(*(_multiwavelet(b - a, moments + number % 2, random.random()) for a, b in pairwise(e)))
+            for e in (*pictures[0], *pictures[1])
+        ]
+        bases.append((*axes[:2], *axes[:2]) if pictures[0] == pictures[1] else tuple(axes))
     return bases
 
 
-def _multiwavelet(n: int, moments: int, shift: int) -> np.ndarray:
-    """Orthonormal rows (n, n) on intervals that halve, of lengths 2^k, the first `shift` pixels outside."""
-    details = []
+def _multiwavelet(n: int, moments: int, shift: float) -> np.ndarray:
+    """Orthonormal rows (n, n) on intervals that halve, of lengths 2^k; the first begins `shift` n outside."""
+    details, outside = [], int(shift * n)
 
     def scaling(start: int, length: int) -> np.ndarray:
         """Functions that hold all polynomials on an interval, (at most `moments`, n)."""
@@ -224,7 +314,7 @@ def _multiwavelet(n: int, moments: int, shift: int) -> np.ndarray:
         details.append(Q.T[moments:] @ children)
         return Q.T[:moments] @ children
 
-    top = scaling(-shift, 1 << (n + shift - 1).bit_length())
+    top = scaling(-outside, 1 << (n + outside - 1).bit_length())
     return np.vstack([top, *details]).astype(np.float32)
 
 

@@ -23,7 +23,7 @@ from ltcl.cli.main import main as main_of_ltcl
 from ltcl.device import Device
 
 ROOT = Path(__file__).resolve().parents[1]
-CORE = 13_145
+CORE = 13_240
 
 _TASKS = [f"ltcl/{name}" for name in ("compensation", "separation.py", "relighting.py", "analysis.py")]
 _NOISE = ["ltcl/noise", *(f"ltcl/{name}.py" for name in ("uncertainty", "denoising", "verdict"))]
@@ -35,8 +35,8 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "theory and diagnostics": (1100, ["ltcl/theory", "ltcl/diagnostics.py"]),
     "compression": (1760, ["ltcl/compression"]),
     "compensation, separation, relighting, analysis": (1370, _TASKS),
-    # Noise is new, and other parts use it: together 1 800 of the 3 000 lines for noise, scale and viewer.
-    "noise": (1250, _NOISE),
+    # Noise is new, and other parts use it: together 1 890 of the 3 000 lines for noise, scale and viewer.
+    "noise": (1345, _NOISE),
     "transport and the rest": (1390, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")

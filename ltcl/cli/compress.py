@@ -15,7 +15,7 @@ from ltcl.cli import options, transports
 from ltcl.cli.analyze import COLOURS
 from ltcl.cli.command import Answer, Context, command, table
 from ltcl.errors import InputError
-from ltcl.store import formats, save_inverse
+from ltcl.store import save_inverse
 
 _UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "ki": 1024, "mi": 1024**2, "gi": 1024**3}
 
@@ -62,11 +62,7 @@ def compress(
     from ltcl import store
     from ltcl.compression import compress
 
-    formats.find(out)  # refused before a long computation
-    if out.suffix.lower() not in (".npz", ".zarr"):
-        raise InputError(f"--out is {out}; a compressed transport must be a .npz or a .zarr")
-    transports.refuse_same(out, file)
-    T = transports.load(context, file)
+    T = transports.load_source(context, file, out)
     if T.is_compressed and T.error:
         error = f"with an error of {T.error:.2g}"
         raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
@@ -98,9 +94,7 @@ def invert(
     """Find A = I - S^-1, one physical bounce, so that each further picture costs one product."""
     from ltcl.compression import INVERSE_NAMES, invert
 
-    formats.find(out, inverse=True)  # refused before a long computation
-    transports.refuse_same(out, file)
-    T = transports.load(context, file)
+    T = transports.load_source(context, file, out, inverse=True)
     rtol, basis = context.options["rtol"], context.options["basis"] or INVERSE_NAMES
     inverse = invert(T, rtol, basis=basis, progress=partial(context.progress, total=1.0))
     save_inverse(out, inverse)

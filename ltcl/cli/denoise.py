@@ -10,8 +10,6 @@ from typing import Annotated
 from ltcl.cli import options, transports
 from ltcl.cli.analyze import COLOURS
 from ltcl.cli.command import Answer, Context, command, table
-from ltcl.errors import InputError
-from ltcl.store import formats
 
 
 @command(options.file_options, options.transport_options)
@@ -24,11 +22,7 @@ def denoise(
     from ltcl import store
     from ltcl.denoising import denoise
 
-    formats.find(out)  # refused before a long computation
-    if out.suffix.lower() not in (".npz", ".zarr"):
-        raise InputError(f"--out is {out}; a denoised transport must be a .npz or a .zarr")
-    transports.refuse_same(out, file)
-    T = transports.load(context, file)
+    T = transports.load_source(context, file, out)
     result = denoise(T, progress=partial(context.progress, total=1.0))
     store.save(out, result)
     transports.note_lost(file, out)

@@ -15,6 +15,7 @@ from ltcl.cli.command import Context, note, table
 from ltcl.device import open_device
 from ltcl.errors import InputError
 from ltcl.solvers.solve import SAMPLED
+from ltcl.store import formats
 from ltcl.transport import Transport, default_rtol, resolve_reference
 from ltcl.verdict import Verdict
 
@@ -95,10 +96,14 @@ def verdicts(files: Mapping[str, Verdict]) -> list[Any]:
     return ["", table(["verdict", *files], rows), *lines] if names else lines
 
 
-def refuse_same(out: Path, file: Path) -> None:
-    """Refuse to replace a transport by what is made of it."""
+def load_source(context: Context, file: Path, out: Path, inverse: bool = False) -> Transport:
+    """The transport that becomes another one in `out`, which is checked before a long computation."""
+    formats.find(out, inverse=inverse)
+    if not inverse and out.suffix.lower() not in (".npz", ".zarr"):
+        raise InputError(f"--out is {out}; a {context.name}ed transport must be a .npz or a .zarr")
     if out.exists() and file.exists() and out.samefile(file):
         raise InputError(f"--out is {out}, which is TRANSPORT itself; it must be another file")
+    return load(context, file)
 
 
 def caveat(what: str, T: Transport, exact: Path | None = None) -> str | None:

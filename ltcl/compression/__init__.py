@@ -9,14 +9,5 @@ from ltcl.compression.invert import invert
 from ltcl.compression.norms import inverse_norm
 from ltcl.compression.sparse_inverse import SparseInverse, invert_coefficients
 
-__all__ = [
-    "INVERSE_NAMES",
-    "ChannelCompression",
-    "Compression",
-    "SparseInverse",
-    "Trial",
-    "compress",
-    "inverse_norm",
-    "invert",
-    "invert_coefficients",
-]
+__all__ = ["INVERSE_NAMES", "ChannelCompression", "Compression", "SparseInverse", "Trial", "compress"]
+__all__ += ["inverse_norm", "invert", "invert_coefficients"]

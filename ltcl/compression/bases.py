@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,24 +16,14 @@ from ltcl.compression.norms import estimate_norm
 from ltcl.compression.sources import Rows
 from ltcl.device import Device
 from ltcl.errors import InputError, InputTypeError
-from ltcl.operators import (
-    Basis,
-    Compressed,
-    SubsetBasis,
-    Tiles,
-    Wavelet,
-    basis,
-    multiresolution_order,
-    restrict_to_support,
-    smallest,
-)
+from ltcl.operators import Basis, Compressed, SubsetBasis, Tiles, Wavelet, basis, smallest
+from ltcl.operators.bases import multiresolution_order, restrict_to_support
 from ltcl.operators.tiles import Packed
 from ltcl.operators.wavelets import filters
 
 PIXELS, ROWS = "pixels", " rows"
 INVERSE_NAMES = ("db2", "haar", "db4", PIXELS)  # compared where none is named, in this order
 _SIGNS = 32  # pictures of random signs
-_TRANSFORM = 4  # launches of a wavelet transform, all levels
 
 
 def validate_names(names: Any, *, for_inverse: bool = False) -> list[str]:
@@ -57,32 +47,35 @@ def validate_names(names: Any, *, for_inverse: bool = False) -> list[str]:
 
 @dataclass(frozen=True)
 class Bases:
-    """R = out^T C into; None is pixels."""
+    """R = out^T C into; None is pixels.
+
+    `weights` (N,) of columns, at least 1, are the root of 1 + N e: the squares that a number which is dropped
+    costs a single pixel, and light of energies e.
+    """
 
     name: str
     out: Basis | None
     into: Basis | None
+    weights: np.ndarray
 
     @classmethod
-    def named(cls, device: Device, grid: tuple[int, int], name: str) -> Bases:
-        """Those of a name, on a grid."""
+    def named(cls, device: Device, grid: tuple[int, int], name: str, light: Any = None) -> Bases:
+        """Those of a name, on a grid, with weights by `light` (N, k) of norm 1."""
         W = basis(device, grid, name.removesuffix(ROWS))
         if isinstance(W, Wavelet):  # large coefficients then lie side by side, in fewer tiles
             order = multiresolution_order(grid, W.levels)
             W = SubsetBasis(device, grid, order, of=W)
-        return cls(name, None if name.endswith(ROWS) else W, W)
-
-    @property
-    def launches(self) -> int:
-        """Of a product in a solve, which runs on the core alone where both sides have one basis."""
-        return 1 if self.out is self.into else _TRANSFORM + 1
+        weights = np.sqrt(1.0 + (0.0 if light is None else len(light) * energies(W, light)))
+        return cls(name, None if name.endswith(ROWS) else W, W, np.broadcast_to(weights, grid[0] * grid[1]))
 
     def restricted(self, core: Any) -> tuple[Any, Bases]:
-        """Core and bases without coefficients that it does not touch, where both sides have one basis."""
+        """Core without weights; without coefficients it does not touch, where both sides have one basis."""
+        data = (core.data / self.weights[core.indices]).astype(core.dtype)
+        core = scipy.sparse.csr_array((data, core.indices, core.indptr), core.shape)
         if self.into is None or self.out is not self.into:
             return core, self
         core, W = restrict_to_support(core, self.into)
-        return core, Bases(self.name, W, W)
+        return core, replace(self, out=W, into=W)
 
     def operator(
         self, device: Device, core: Packed, error: float = 0.0, diagonal: np.ndarray | None = None
@@ -91,16 +84,20 @@ class Bases:
         return Compressed(Tiles(device, core), self.out, self.into, error, diagonal=diagonal)
 
     def gather(self, R: Rows, progress: Progress = lambda share: None, **limits: Any) -> Coefficients:
-        """The numbers of R within the `limits` of `coefficients`."""
-        out, into = (None if W is None else partial(_on_host, W) for W in (self.out, self.into))
+        """The numbers of R, times the weights, within the `limits` of `coefficients`."""
+        weights = self.weights[:, None].astype(np.float32)
+
+        def into(x: np.ndarray) -> np.ndarray:
+            return weights * (x if self.into is None else _on_host(self.into, x))
+
+        out = None if self.out is None else partial(_on_host, self.out)
         return coefficients(R, out, into, progress=progress, **limits)
 
-    def noise(self, variances: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Standard deviations of rows and columns of coefficients, of random signs: each within 13 %."""
+    def noise(self, variances: Any) -> list[np.ndarray]:
+        """Standard deviations of rows and columns of weighted numbers, of random signs: each within 13 %."""
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (variances.shape[1], _SIGNS))
-        sides = zip((self.out, self.into), variances, strict=True)
-        rows, columns = (np.sqrt(energies(W, np.sqrt(each)[:, None] * signs)) for W, each in sides)
-        return rows, columns
+        sides = zip((self.out, self.into), variances, (1.0, self.weights), strict=True)
+        return [weights * np.sqrt(energies(W, np.sqrt(each)[:, None] * signs)) for W, each, weights in sides]
 
 
 def energies(W: Basis | None, x: np.ndarray) -> np.ndarray:

@@ -9,8 +9,10 @@ What is dropped has a known Frobenius norm f. What it makes of pictures (`pictur
 measured, rounding and all: how far below f it lies changes slowly, so that a few measurements find the f
 that is needed. Bases are compared on a window.
 
-Noise gives coefficients variances (W^2 u)_k (W^2 v)_l of rows and columns; those of _NOISE standard
-deviations remain, in the basis of least error of pictures: squares lost, and twice the variance of the rest.
+A dropped number c of column l costs light of energies e about c^2 e_l: it is weighted by sqrt(1 + N e_l), for
+single pixels and for pictures. Noise gives coefficients variances (W^2 u)_k (W^2 v)_l. By SURE (squares lost,
+and twice the variance of the rest) c^2 above 2 variances is worth its bytes where e_l is large; where it is
+average, N e_l = 1, above 9: 2 + 14 / (1 + N e_l) variances. Of bases the one of least SURE is taken.
 """
 
 from __future__ import annotations
@@ -19,16 +21,15 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ltcl import checks
-from ltcl.compression.bases import INVERSE_NAMES, Bases, energies, quantize, validate_names
+from ltcl.compression.bases import INVERSE_NAMES, Bases, quantize, validate_names
 from ltcl.compression.coefficients import Coefficients
 from ltcl.compression.norms import MISS, Starts, fresh_starts, inverse_norm
-from ltcl.compression.pictures import CONFIDENCE, PictureError, draw, losses, picture_error
+from ltcl.compression.pictures import CONFIDENCE, PictureError, losses, picture_error, typical_light
 from ltcl.compression.sources import Inputs, Problem, memory_errors, validate_inputs, window_of
 from ltcl.device import Device
 from ltcl.errors import ConvergenceError, InputError, InputTypeError, ToleranceError
@@ -41,13 +42,13 @@ Note = Callable[[str, float], object]
 _GATHER = 0.7  # of what is allowed: Frobenius norm of what need not even be looked at
 _MORE = 4  # times the numbers kept on the window, which the whole may need
 _TRIES = 8
-_AIM, _GROWTH = 0.94, 8.0  # of the tolerance, what is tried next; no step grows by more
-_CLOSE = 0.85  # of the tolerance is good enough
+_AIM, _GROWTH = 0.96, 8.0  # of the tolerance, what is tried next; no step grows by more
+_CLOSE = 0.92  # of the tolerance is good enough
 _UNIT = 2.0**-24  # rounding of float32
 _ROUNDING = {"worst": 0.05, "pictures": 0.3}  # of what is allowed, for rounding the core
 _GUESS = 64  # pictures by which bases are compared
 _COARSE = 1.5  # between the bounds of a norm on which no choice depends
-_NOISE = 3.0  # deviations by which coefficients stand out: 3 of 1000 that are noise do
+_NOISE = math.sqrt(2.0), 3.0  # deviations that stand out, where light is most, and where it is average
 _LEAST = 0.5  # of T.noise: more of it is never taken back
 _QUIET = 0.1  # of the noise of pictures, for the rounding of the core
 _TRANSFORMS = 1e-6  # of coefficients that went through transforms in float32, rounded there
@@ -63,8 +64,8 @@ class Trial:
     """R in one basis, tried on a window of pixels or on the whole.
 
     `format` ("tiles"; "csr" where none were made), `width` and `precision` are of the core. `kept` numbers in
-    a row take `nbytes`, and a product of a solve so many `launches`. `error` is an upper bound on the 2-norm
-    of R~ - R, rounding included; None where pictures chose, or the basis was `left` before, and why.
+    a row take `nbytes`. `error` is an upper bound on the 2-norm of R~ - R, rounding included; None where
+    pictures chose, or the basis was `left` before, and why.
     """
 
     basis: str
@@ -73,7 +74,6 @@ class Trial:
     precision: str
     kept: float
     nbytes: int
-    launches: int
     error: float | None
     left: str = ""
 
@@ -82,11 +82,12 @@ class Trial:
 class ChannelCompression(Trial):
     """One colour channel: what was taken, of the whole R.
 
-    Numbers below `threshold` were dropped; `dropped` is their Frobenius norm, where memory was short a bound
-    on it, and `quantisation` that of what rounding of the core changed. `inverse_norm` bounds the 2-norm of
-    S~^-1; its product with `error` is `error_bound`, which bounds ``||x~ - x|| / ||x||``. `confidence` is
-    that the bounds of all channels hold, over the random starts of the norms. `solution_error` is what the
-    norm states: this bound, or that of `pictures`, which has a share and confidence of its own.
+    Numbers below `threshold` were dropped, times the weights of columns, at least 1, unless the norm is
+    "worst"; `dropped` is the Frobenius norm of these products, so a bound on that of what was dropped, and
+    `quantisation` of what rounding of the core changed. `inverse_norm` bounds the 2-norm of S~^-1; its
+    product with `error` is `error_bound`, which bounds ``||x~ - x|| / ||x||``. `confidence` is that the
+    bounds of all channels hold, over the random starts of the norms. `solution_error` is what the norm
+    states: this bound, or that of `pictures`, which has a share and confidence of its own.
     """
 
     threshold: float
@@ -100,7 +101,7 @@ class ChannelCompression(Trial):
     trials: tuple[Trial, ...]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Compression:
     """How a compressed transport was made; its ``.compression``.
 
@@ -115,10 +116,6 @@ class Compression:
     window: tuple[int, int]
     seconds: float
     channels: tuple[ChannelCompression, ...]
-
-    def __repr__(self) -> str:
-        bases = ", ".join(channel.basis for channel in self.channels)
-        return f"<ltcl Compression of {checks.size(self.uncompressed)} to rtol {self.rtol} in {bases}>"
 
 
 def compress(
@@ -144,7 +141,8 @@ def compress(
         operator, whose rows are products of its transpose; a sequence of 3 of these for RGB.
     rtol : float or "noise"
         The relative error that pictures may have, in the 2-norm, or that is allowed of every light; see
-        `norm`. "noise" keeps what stands out of `T.noise`, a Transport's, by 3 standard deviations.
+        `norm`. "noise" keeps what stands out of `T.noise`, a Transport's, by 3 standard deviations; by
+        1.4 where pictures have most of their light, by 4 where they have none.
     budget : int, optional
         Bytes that the cores of all channels may take together on the device.
     norm : "pictures" or "worst"
@@ -314,7 +312,7 @@ class _Fit:
         packed, per_row = self.packed, self.numbers.core.nnz / (len(self.numbers.core.indptr) - 1)
         form = (self.bases.name, "tiles", packed.width, packed.precision)
         error = self.norm.upper if self.norm else None
-        return Trial(*form, per_row, packed.nbytes, self.bases.launches, error)
+        return Trial(*form, per_row, packed.nbytes, error)
 
     def report(self, trials: Sequence[Trial]) -> ChannelCompression:
         """What is reported of a channel."""
@@ -406,30 +404,38 @@ def _certain(numbers: Coefficients, packed: Packed) -> float:
     return numbers.dropped + transforms + packed.difference[0]
 
 
+def _bases(problem: Problem, name: str, goal: Goal) -> Bases:
+    """Those of a name, with weights where pictures or noise decide."""
+    worst = goal.norm == "worst" and not math.isnan(goal.rtol)
+    light = None if worst else typical_light(problem, _GUESS)
+    return Bases.named(problem.operator.device, problem.grid, name, light)
+
+
 def _significant(problem: Problem, bases: Bases, note: Callable[[str], object]) -> _Fit:
     """R~ of the numbers that stand out of the noise."""
     note(f"{bases.name}, noise")
     rows, columns = bases.noise(problem.noise)
-    least = [float(np.min(side, where=side > 0.0, initial=np.inf)) for side in (rows, columns)]
-    least = _LEAST * _NOISE * math.prod(least) if max(least) < math.inf else 0.0
+    weights, (low, middle) = bases.weights**2, _NOISE
+    limits = np.sqrt(low**2 + 2.0 * (middle**2 - low**2) / weights)
+    least = [float(np.min(side, where=side > 0.0, initial=np.inf)) for side in (rows, limits * columns)]
+    least = _LEAST * math.prod(least) if max(least) < math.inf else 0.0
     coefficients = bases.gather(problem.R, threshold=least)
     core, total = coefficients.core.copy(), float(np.sum(rows**2) * np.sum(columns**2))
     sizes = np.repeat(rows, np.diff(core.indptr)) * columns[core.indices]
-    small = np.abs(core.data) < _NOISE * sizes
+    small = np.abs(core.data) < limits[core.indices] * sizes
     # What is dropped has all of its noise: where it is less than T.noise says, that is too much.
     left, noise = coefficients.dropped**2 + np.sum(core.data[small] ** 2), total - np.sum(sizes[~small] ** 2)
     sizes *= np.clip(math.sqrt(left / noise), _LEAST, 1.0) if noise > 0.0 else 1.0
-    small = np.abs(core.data) < _NOISE * sizes
+    small = np.abs(core.data) < limits[core.indices] * sizes
     second, core.data[small] = math.hypot(coefficients.second, np.linalg.norm(core.data[small])), 0.0
     core.eliminate_zeros()
     numbers, indices = replace(coefficients, core=core, second=second), coefficients.core.indices[~small]
     core, support = bases.restricted(core)
-    of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2))  # what noise makes of light of norm 1
+    of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2 / weights))  # noise in light of norm 1
     packed = quantize(core, _QUIET * of_pictures)
-    x = draw(problem.grid, _GUESS, np.random.default_rng(0)) * problem.F[:, None]
-    x /= np.maximum(np.linalg.norm(x, axis=0), 1e-30)
-    lost = losses(problem, support.operator(problem.operator.device, packed), x)[0]
-    risk = np.sum(lost**2) / _GUESS + 2.0 * np.sum(sizes[~small] ** 2 * energies(bases.into, x)[indices])
+    R, light = support.operator(problem.operator.device, packed), typical_light(problem, _GUESS)
+    energies = ((1.0 - 1.0 / weights) / len(weights))[indices]  # over the weights, which `sizes` have
+    risk = np.sum(losses(problem, R, light)[0] ** 2) / _GUESS + 2.0 * np.sum(sizes[~small] ** 2 * energies)
     return _Fit(bases, coefficients, numbers, support, packed, None, _DIFFUSE, None, float(risk))
 
 
@@ -444,7 +450,7 @@ def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> 
             note(f"trying {text}", at)
 
         tried(name)
-        bases = Bases.named(device, window.grid, name)
+        bases = _bases(window, name, goal)
         if math.isnan(goal.rtol):
             fits.append(_significant(window, bases, tried))
             trials.append(fits[-1].trial())
@@ -472,7 +478,7 @@ def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> 
             except ToleranceError as error:
                 refusals.append(error)
                 left = str(error)
-        form = (name, "csr", 1, "float32", count / pixels, 8 * count, bases.launches)
+        form = (name, "csr", 1, "float32", count / pixels, 8 * count)
         trials.append(Trial(*form, error=None, left=left))
     if not fits:
         raise refusals[0]
@@ -483,18 +489,16 @@ def _whole(problem: Problem, best: _Fit, goal: Goal, starts: Starts, draws: Star
     """All of R in the bases that are best on the window, confirmed by norms or pictures from fresh starts."""
     pixels, N = len(best.numbers.core.indptr) - 1, problem.R.shape[0]
     bases, candidates, drop = best.bases, best.candidates, best.numbers.dropped
+    if pixels < N:
+        bases = _bases(problem, bases.name, goal)
     if math.isnan(goal.rtol):
-        if pixels < N:
-            bases = Bases.named(problem.operator.device, problem.grid, bases.name)
-            best = _significant(problem, bases, lambda text: note(text, 0.5))
+        best = best if pixels == N else _significant(problem, bases, lambda text: note(text, 0.5))
         return _bounded(problem, best, goal, starts, draws)
     if pixels < N:  # begun where the window ended: the same is dropped of each row
-        bases = Bases.named(problem.operator.device, problem.grid, bases.name)
         drop *= math.sqrt(N / pixels)
         allowed = max(drop, goal.frobenius(best.inverse, N))
         most = _MORE * math.ceil(best.numbers.core.nnz / pixels) * N
-        read = partial(note, "coefficients of all pixels")
-        share = lambda share: read(0.5 + 0.4 * share)  # noqa: E731
+        share = lambda share: note("coefficients of all pixels", 0.5 + 0.4 * share)  # noqa: E731
         candidates = bases.gather(problem.R, share, drop=_GATHER * allowed, most=most)
     fresh = draws if goal.norm == "pictures" else starts
     fit = _fit(problem, bases, candidates, goal, best.inverse, drop, fresh, lambda text: note(text, 0.9))

@@ -61,6 +61,12 @@ def losses(problem: Problem, R: Operator, x: np.ndarray) -> tuple[np.ndarray, np
     return compressed - exact, exact
 
 
+def typical_light(problem: Problem, count: int) -> np.ndarray:
+    """Light F p (N, count) of norm 1, always of the same pictures: to choose by, not to confirm."""
+    x = draw(problem.grid, count, np.random.default_rng(0)) * problem.F[:, None]
+    return x / np.maximum(np.linalg.norm(x, axis=0), 1e-30)
+
+
 def draw(grid: tuple[int, int], count: int, random: np.random.Generator) -> np.ndarray:
     """(N, count) random pictures of linear light up to 1, of each kind in turn."""
     kinds: tuple[Callable[..., np.ndarray], ...] = (_spectrum, _edges, _strokes, _patch)

@@ -184,7 +184,7 @@ def validate_inputs(
     F, *_ = _first_bounce.mask_dark(F, F <= 0.0, grid, may_mask=False)
     R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
     problems = [Problem(r, Host(device, r), grid, f) for r, f in zip(R, F, strict=True)]
-    return Inputs(problems, F, grid, _dense_nbytes(F))
+    return Inputs(problems, F, grid, 4 * F.size * F.shape[1])  # in float32
 
 
 def of_transport(T: Transport, memory: int | None = None, noise: Noise | None = None) -> Inputs:
@@ -195,13 +195,21 @@ def of_transport(T: Transport, memory: int | None = None, noise: Noise | None = 
     else:
         R = [interreflection(source("T", matrix, memory), f) for matrix, f in zip(T.matrices, F, strict=True)]
     try:
-        operators, nbytes = [S.R for S in T.systems], T.nbytes or _dense_nbytes(F)
+        operators, nbytes = [S.R for S in T.systems], T.nbytes
     except MemoryError:  # of the device, or of the host
-        operators, nbytes = [Host(T.device, rows) for rows in R], _dense_nbytes(F)
+        operators, nbytes = [Host(T.device, rows) for rows in R], 0
     problems = [Problem(r, product, T.grid, f) for r, product, f in zip(R, operators, F, strict=True)]
     if noise is not None:
         problems = [replace(p, noise=_noise_of(p, noise, c)) for c, p in enumerate(problems)]
-    return Inputs(problems, F, T.grid, nbytes, bool(T.masked.any()), T.mixing, noise or T.measured_noise)
+    return Inputs(
+        problems,
+        F,
+        T.grid,
+        nbytes or 4 * F.size * F.shape[1],
+        bool(T.masked.any()),
+        T.mixing,
+        noise or T.measured_noise,
+    )
 
 
 def _noise_of(problem: Problem, noise: Noise, channel: int) -> np.ndarray:
@@ -211,11 +219,6 @@ def _noise_of(problem: Problem, noise: Noise, channel: int) -> np.ndarray:
     light = noise.photons[channel] * F * np.maximum(sums, 0.0) / len(F) + noise.floor[channel] ** 2
     columns = np.divide(noise.columns[channel] * light, F**2, out=np.zeros(len(F)), where=F > 0)
     return np.stack([noise.rows[channel], columns])
-
-
-def _dense_nbytes(F: np.ndarray) -> int:
-    """Of T in float32, of its first bounces (channels, N)."""
-    return 4 * F.size * F.shape[1]
 
 
 def rows_at_once(values: int, memory: int | None = None) -> int:
