@@ -161,7 +161,8 @@ class Noise:
             raise InputError("noise has the same entries as matrix; it must be a second measurement")
         shares, exposures = zip(*(_compared(*pair) for pair in pairs), strict=True)
         if not 1.0 / _EXPOSURE <= (ratio := max(exposures, key=lambda x: abs(np.log(x)))) <= _EXPOSURE:
-            raise InputError(f"noise is a T {ratio:.3g} times as bright as matrix; it needs the same exposure")
+            text = f"noise is a second T, {ratio:.3g} times as bright as matrix"
+            raise InputError(f"{text}; both must be measured with the same exposure and light")
         return replace(noise, neighbours=shares)
 
     def require(self, channels: int, shape: tuple[int, int], brightest: Any = 0.0) -> None:
@@ -172,7 +173,8 @@ class Noise:
         light = np.maximum(brightest, 0.0)
         v = (self.photons * light + self.floor**2) * self.rows.max(axis=1) * self.columns.max(axis=1)
         if np.any((light > 0.0) & (v > (_UNITS * light) ** 2)):
-            raise InputError(f"noise reaches {v.max() ** 0.5:.3g}, {_UNITS:g} times T or more; it needs the units of T")
+            text = f"noise reaches {v.max() ** 0.5:.3g}, more than {_UNITS:g} times the light of T"
+            raise InputError(f"{text}; it must be in the units of T")
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Numbers for files, by names that begin with ``noise_``."""
