@@ -113,7 +113,7 @@ def compensate(
     settings |= {"weights": weights and read(weights), "background": background and read(background)}
     resolved = {"rtol": settings["rtol"], "gain": settings["gain"]}
     notes = [transports.caveat("errors are", T, context.options["exact"])]
-    notes += ["masked pixels do not count in errors"] * bool(T.masked.any())
+    notes += ["masked pixels do not count in errors"] * bool(weights is None and T.masked.any())
     if setup is not None:
         notes.append("pattern .png holds the codes of the measured projector: show it pixel for pixel")
     if setup is not None and background is None:
