@@ -213,13 +213,13 @@ def test_noise_of_no_shape_is_refused(shape: Any) -> None:
 @pytest.mark.parametrize("extension", ["npz", "h5"])
 def test_files_of_damaged_noise_are_refused(name: str, value: Any, extension: str, tmp_path: Path) -> None:
     """Those of before `neighbours` are not damaged."""
-    arrays = {"T": np.eye(4), "grid": [2, 2], **Noise.uniform((4, 4), 0.01).to_arrays()}
+    arrays: dict[str, Any] = {"T": np.eye(4), "grid": [2, 2], **Noise.uniform((4, 4), 0.01).to_arrays()}
     del arrays["noise_neighbours"]
     path = tmp_path / f"T.{extension}"
 
     def write() -> None:
         if extension == "npz":
-            np.savez(path, **{n: np.asarray(a) for n, a in arrays.items() if a is not None})
+            np.savez(path, allow_pickle=False, **{n: a for n, a in arrays.items() if a is not None})
             return
         with h5py.File(path, "w") as file:
             file.update({n: a for n, a in arrays.items() if a is not None})
