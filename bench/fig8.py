@@ -23,7 +23,7 @@ from _harness import options
 from ltcl.scenes import Scene, box
 
 ALBEDO, LAMP, FEW, MANY = 0.4, (0.85, 0.75, 0.8), 30, 1000
-COUNTS, SEEDS = np.array([8, 16, 32, 64, 128, 256, 512]), 3
+COUNTS, SEEDS = np.array([8, 16, 32, 64, 128, 256, 512]), 12
 KINDS: dict[str, dict[str, Any]] = {"plain": {}, "final gather": {"gather": True}}
 
 

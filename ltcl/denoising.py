@@ -13,6 +13,7 @@
 4. Between two walls, light depends on rows and on columns of the picture nearly as few products
    (Van Loan and Pitsianis 1993): singular values of entries in that order, (rows, rows') x (columns,
    columns'), are shrunk (Gavish and Donoho 2017) below those of the noise that step 3 leaves, simulated.
+   Left out where errors of neighbouring columns cancel, so that sums are known better than entries.
 5. Negative entries become 0; between the same two blocks of pixels what is dim loses as much light.
 
 Known limit: at low noise or few pixels most coefficients stand out; `bench/denoise.py` prints the bound.
@@ -22,7 +23,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise, product
 from typing import Any
 
@@ -33,6 +33,7 @@ from scipy.linalg import block_diag
 from ltcl import checks
 from ltcl.diagnostics import log_scale
 from ltcl.errors import InputError, InputTypeError
+from ltcl.noise import Noise
 from ltcl.operators import Operator
 from ltcl.transport import Transport, require
 
@@ -105,13 +106,14 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
 
     for c, matrix in enumerate(T.matrices):
         Y = (matrix if isinstance(matrix, np.ndarray) else matrix.tocsr().toarray()).astype(np.float32)
-        problem = Problem.of(Y, partial(noise.variance, channel=c), T.camera_grid, T.grid)
+        problem = Problem.of(Y, noise, c, T.camera_grid, T.grid)
         pilot = shrink(problem, multiwavelets(problem.grids), None, note)[0]
         estimate, error = refine(problem, pilot, pilot, lambda done: note(SHIFTS + done))
         white = (error / problem.gauge).sum(axis=1, dtype=float)
         matrices.append(problem.restore(estimate, Y))
         left[c] = white @ white / (noise.variance(matrices[-1], c).sum() or 1.0)
-    noise = dataclasses.replace(noise, photons=noise.photons * left, floor=noise.floor * np.sqrt(left))
+    light = {"photons": noise.photons * left, "floor": noise.floor * np.sqrt(left), "neighbours": 0.0}
+    noise = dataclasses.replace(noise, **light)
     settings = {"device": T._requested_device, "mixing": T.mixing, "noise": noise}
     first = T.first_bounce if T.is_square else "diagonal"
     result = Transport(matrices, T.grid, first, T.camera_grid, dark=0.0, **settings)
@@ -128,12 +130,13 @@ class Problem:
     gauge: np.ndarray | float
     symmetric: bool
     grids: tuple[Grid, Grid]
+    noise: Noise
+    channel: int
+    half: np.ndarray | None = None  # of the difference of both entries of a pair
 
     @classmethod
-    def of(
-        cls, Y: np.ndarray, variance: Callable[[np.ndarray], np.ndarray], camera_grid: Grid, grid: Grid
-    ) -> Problem:
-        """Of measured entries, and the variance of entries of so much light."""
+    def of(cls, Y: np.ndarray, noise: Noise, channel: int, camera_grid: Grid, grid: Grid) -> Problem:
+        """Of measured entries and their noise."""
         square, grids = camera_grid == grid, (camera_grid, grid)
         X = Y.copy()
         if square:
@@ -141,10 +144,10 @@ class Problem:
         rows, columns = _blocks(camera_grid), _blocks(grid)
         sizes = np.outer(rows.sum(axis=0), columns.sum(axis=0))
         light = rows @ (_sums(X, rows, columns) / sizes) @ columns.T  # of a block: hardly any noise
-        V = variance(light).astype(np.float32)
+        V = noise.variance(light, channel).astype(np.float32)
         largest = float(np.abs(X).max(initial=0.0))
         if not square or largest == 0.0:
-            return cls(X, V, 1.0, False, grids)
+            return cls(X, V, 1.0, False, grids, noise, channel)
         log_d = np.clip(log_scale(scipy.sparse.csr_array(X / largest)), -_SCALE, _SCALE)
         r = np.exp(_smooth(log_d, X, V, grid) / 2).astype(np.float32)
         gauge = r / r[:, None]
@@ -152,9 +155,22 @@ class Problem:
         between = np.triu_indices(rows.shape[1], 1)
         excess = _sums(Z - Z.T, rows, rows)[between] ** 2 / _sums(W + W.T, rows, rows)[between]
         if len(excess) and excess.mean() > _EXCESS:
-            return cls(X, V, 1.0, False, grids)
-        mean = (Z * W.T + Z.T * W) / (W + W.T)
-        return cls(mean, 1.0 / (1.0 / W + 1.0 / W.T), gauge, True, grids)
+            return cls(X, V, 1.0, False, grids, noise, channel)
+        mean, half = (Z * W.T + Z.T * W) / (W + W.T), (Z - Z.T) / 2 if noise.neighbours[channel] else None
+        return cls(mean, 1.0 / (1.0 / W + 1.0 / W.T), gauge, True, grids, noise, channel, half)
+
+    def coefficients(self, Z: np.ndarray, basis: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Of Z in a basis, and their variance: less where errors of neighbouring columns cancel."""
+        C, V = _transform(Z, basis), _transform(self.variance, [A * A for A in basis])
+        share = self.noise.relative_variance(basis[2:], self.channel)
+        if self.symmetric:  # Z_ij is Z_ji: twice the variance on the diagonal
+            np.einsum("ii->i", V)[:] *= 2.0
+            if self.half is not None:
+                C += _transform(self.half, basis) * ((share[:, None] - share) / (share[:, None] + share))
+                V *= 2.0 * share * (share[:, None] / (share[:, None] + share))
+        else:
+            V *= share
+        return C, V
 
     def restore(self, Z: np.ndarray, Y: np.ndarray) -> np.ndarray:
         """Entries of T, without negative ones, the diagonal of a square T as in Y."""
@@ -185,9 +201,7 @@ def shrink(
         Z = Z + np.diag(np.diag(pilot))  # smooth where the first bounce was
     result = np.zeros(Z.shape, np.float32)
     for done, basis in enumerate(bases, 1):
-        C, V = _transform(Z, basis), _transform(problem.variance, [A * A for A in basis])
-        if problem.symmetric:  # Z_ij is Z_ji: twice the variance on the diagonal
-            np.einsum("ii->i", V)[:] *= 2.0
+        C, V = problem.coefficients(Z, basis)
         if pilot is None:
             C *= C * C > THRESHOLD**2 * V
         else:
@@ -207,6 +221,8 @@ def refine(
     """Z and noise by Wiener factors of a `pilot` and products between walls, whose folds `light` shows."""
     ends = [_folds(light, problem.grids[0]), _folds(light.T, problem.grids[1])]
     pair = shrink(problem, multiwavelets(problem.grids, ends, moments=2), pilot, step)
+    if problem.noise.neighbours[problem.channel]:  # sums are known better than few products keep them
+        return pair
     walls, shape = [list(product(*map(pairwise, p))) for p in ends], sum(problem.grids, ())
     before, after = [X.reshape(shape) for X in pair], [np.empty(shape, np.float32) for _ in pair]
     for (p, to), (q, source) in product(*map(enumerate, walls)):

@@ -130,6 +130,16 @@ class Noise:
             mean = scipy.ndimage.correlate1d(mean, [0.25, 0.5, 0.25], axis=axis, mode="nearest")
         return (pictures - c * mean.reshape(pictures.shape)) / (1.0 - 0.5 * c + (_G * c) ** 2) ** 0.5
 
+    def relative_variance(self, bases: Sequence[np.ndarray], channel: int = 0) -> np.ndarray:
+        """||`filtered` b||^2, (N,) float32, of pictures b: products of orthonormal bases (h, h), (w, w)."""
+        c, same, seen = self.neighbours[channel], [], []
+        for A in bases:
+            mean = scipy.ndimage.correlate1d(A, [0.25, 0.5, 0.25], axis=1, mode="nearest")
+            same.append(np.sum(A * mean, axis=1))
+            seen.append(np.sum(mean**2, axis=1))
+        shares = (1.0 - 2.0 * c * np.kron(*same) + c**2 * np.kron(*seen)) / (1.0 - 0.5 * c + (_G * c) ** 2)
+        return shares.astype(np.float32)
+
     @classmethod
     def fit(
         cls, shape: tuple[int, int], samples: Sequence[Samples], source: str, white: Any = np.inf

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -54,6 +55,24 @@ def test_entries_pictures_and_bounces_come_nearer_to_the_truth(
     assert relative(lambda some: bounces(some) - bounces(exact), T, D) < light
     assert np.array_equal(D.first_bounce, T.first_bounce)
     assert D.to_numpy().min() >= 0.0
+
+
+@pytest.mark.parametrize(("c", "most"), [(0.6, 0.7), (0.9, 1.15)])
+def test_errors_of_neighbours_that_cancel_are_no_reason_to_move_light(c: float, most: float) -> None:
+    """Of a path tracer: pictures are known better than entries say, and stay so."""
+    exact = truth("corner", 12)
+    known = dataclasses.replace(noise_of(exact, 1e-3), neighbours=c)
+    E = np.sqrt(known.variance(exact.to_numpy())) * random.standard_normal(exact.shape)
+    E = known.filtered(np.ascontiguousarray(E.T), exact.grid).T * (1.0 - np.eye(len(E)))
+    T, independent = (
+        ltcl.Transport(exact.to_numpy() + E, exact.grid, noise=noise)
+        for noise in (known, dataclasses.replace(known, neighbours=0.0))
+    )
+    white = np.ones(T.grid)
+    left = [
+        relative(lambda some: (some @ white) - (exact @ white), T, ltcl.denoise(X)) for X in (T, independent)
+    ]
+    assert left[0] < min(most, left[1])
 
 
 @pytest.mark.parametrize("scene", SCENES)
