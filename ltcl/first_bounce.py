@@ -122,7 +122,8 @@ def dark(matrices: Sequence[Any], share: float, noise: Any, known: bool, F: np.n
         light = np.minimum(F, [_diagonal(T) for T in matrices])
     median = np.array([[np.median(f[f > 0]) if np.any(f > 0) else 0.0] for f in light])
     least = np.maximum(1e-300, share * median)  # 0 is dark as well, whose inverse is no number
-    faint = (light > least) & (light < _FAINT * median)
+    below = _SIGMAS * np.maximum(-light.min(axis=1, keepdims=True), 0.0)  # light is never negative, noise is
+    faint = (light > least) & (light < np.maximum(_FAINT * median, below))
     if known or (entries and faint.any()):
         sigma = noise().diagonal(light)
         for T, own, j in zip(matrices, sigma, faint, strict=True) if not known else ():

@@ -205,7 +205,10 @@ class Transport:
 
     def _checked_noise(self, noise: Any) -> Noise | Transport | None:
         if isinstance(noise, Noise):
-            noise.require(self.channels, self.shape)
+            entries = all(isinstance(T, _first_bounce.ENTRIES) for T in self.matrices)
+            known = entries or (self.is_square and all(hasattr(T, "diagonal") for T in self.matrices))
+            light = [(T if entries else T.diagonal()).max() for T in self.matrices if known]
+            noise.require(self.channels, self.shape, light or 0.0)
         elif isinstance(noise, Transport):
             for name in ("grid", "camera_grid", "channels"):
                 if getattr(noise, name) != getattr(self, name):

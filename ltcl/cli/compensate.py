@@ -113,6 +113,7 @@ def compensate(
     settings |= {"weights": weights and read(weights), "background": background and read(background)}
     resolved = {"rtol": settings["rtol"], "gain": settings["gain"]}
     notes = [transports.caveat("errors are", T, context.options["exact"])]
+    notes += ["masked pixels do not count in errors"] * bool(weights is None and T.masked.any())
     if setup is not None:
         notes.append("pattern .png holds the codes of the measured projector: show it pixel for pixel")
     if setup is not None and background is None:
@@ -244,9 +245,8 @@ def _compensate_frames(
     text |= {"most_clipped": most, "frames": [dataclasses.asdict(record) for record in records]}
     if most.clipped > _MANY:
         count = sum(record.clipped > _MANY for record in records)
-        frame = f"frame {most.number} ({most.name}) most"
-        advice = "a lower --gain helps where patterns are at 1"
-        note(f"{count} frame(s) ask for light beyond the projector's, {frame}; {advice}")
+        frame = f"frame {most.number} ({most.name}) most; a lower --gain helps where patterns are at 1"
+        note(f"{count} frame(s) ask for light beyond the projector's, {frame}")
     pace = f"{result.frames_per_second:.1f}" if result.solved else None
     columns = ("frames", "of this run", "a second", "gain", "worst error", "most clipped")
     error, clipped = percent(worst.error), percent(most.clipped)

@@ -33,8 +33,7 @@ def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
         second = {name: settings[name] for name in names[:3] if name in settings}
         settings["noise"] = store.load(noise, device=device, **second)
     T = store.load(path, device=device, **settings)
-    dark = int(T.masked.sum())
-    if dark and dark_note and not T.dark:  # which was logged
+    if (dark := int(T.masked.sum())) and dark_note and not T.dark:  # which was logged
         note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
     return T
 
@@ -49,8 +48,7 @@ def is_measured(path: Path) -> bool:
 def note_lost(source: Path, target: Path) -> None:
     """Say what a copy of a measured transport does not keep."""
     if is_measured(source):
-        advice = f"use compensate --calibration {source}"
-        note(f"{target}: does not keep how the projector was measured; {advice}")
+        note(f"{target}: does not keep how the projector was measured; use compensate --calibration {source}")
 
 
 def solving(context: Context, T: Transport, rtol: float) -> dict[str, Any]:

@@ -79,8 +79,8 @@ def estimate(matrices: Sequence[Any], grid: tuple[int, int], camera_grid: tuple[
     """
     for T in matrices:
         if made_with(T) is not None or not (isinstance(T, _ARRAYS) or hasattr(T, "between")):
-            text = f"T is made of {type(T).__name__}, whose noise does not show in its entries"
-            raise InputError(f"noise is None, but {text}; give noise=, as that of what it was made from")
+            text = "noise is None, but T is compressed, or an operator, and shows no entries with noise"
+            raise InputError(f"{text}; give noise= (--noise) to what it was made from, which keeps it")
     channels = [_channel(T, grid, camera_grid) for T in matrices]
     photons, floor, rows, columns, *others = (np.stack(values) for values in zip(*channels, strict=True))
     return Noise(photons, floor, rows, columns, np.full(rows.shape, np.inf), "estimated", *others)

@@ -35,6 +35,7 @@ _PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; s
 _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
 _AT_ONCE, _FIRST = 1 << 22, 64  # samples; first bounces at least, whose variance has a factor of its own
 _G, _CHANCE = 0.375, 3.0  # ||G||; standard deviations of row sums that mean nothing
+_LARGEST, _UNITS, _EXPOSURE = 1e36, 1e6, 1.2  # at most: numbers, deviations over light, ratio of two T
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -56,7 +57,7 @@ class Noise:
     neighbours : (channels,) float64
         Share c of its neighbours that an entry's error lacks, 0 to 1; 0 where errors are independent.
 
-    InputError for other shapes, NaN, and negative numbers.
+    InputError for other shapes, NaN, negative numbers, and finite ones above 1e36.
 
     Examples
     --------
@@ -77,15 +78,17 @@ class Noise:
     def __post_init__(self) -> None:
         n = np.size(self.photons)
         checks.one_of("noise.source", self.source, SOURCES)
-        for name in ("direct", "neighbours"):
-            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), n))
         for name in (f.name for f in fields(self) if f.name != "source"):
             value = checks.real(f"noise.{name}", getattr(self, name)).astype(np.float64)
+            if name in ("direct", "neighbours") and value.size == 1:
+                value = np.full(n, value.ravel())
             ndim = 2 if name in ("rows", "columns", "white") else 1
-            largest = np.inf if name == "white" else np.finfo(float).max
-            if value.ndim != ndim or len(value) != n or not np.all((value >= 0) & (value <= largest)):
-                text = f"noise.{name} has shape {value.shape}; it must be {ndim}-dimensional, channels first"
-                raise InputError(f"{text}, without negative numbers, NaN or infinite ones")
+            if value.ndim != ndim or len(value) != n:
+                raise InputError(f"noise.{name} has shape {value.shape}; it must be {ndim}-D, {n} channel(s)")
+            largest = 1.0 if name == "neighbours" else _LARGEST
+            valid = (value >= 0) & ((value <= largest) | (name == "white") & np.isinf(value))
+            if not valid.all():
+                raise InputError(f"noise.{name} is {value[~valid][0]:g}; it must be from 0 to {largest:g}")
             object.__setattr__(self, name, value)
         checks.shape("noise.white", self.white, self.rows.shape)
 
@@ -93,7 +96,7 @@ class Noise:
     def uniform(cls, shape: tuple[int, int], floor: Any, photons: Any = 0.0, source: str = "given") -> Self:
         """The same for all entries of a T (M, N); `floor` and `photons` are floats, or one a channel."""
         f, p = np.broadcast_arrays(np.atleast_1d(floor), np.atleast_1d(photons))
-        rows, columns = (np.ones((len(f), n)) for n in shape)
+        rows, columns = (np.ones((len(f), n)) for n in checks.grid("shape", shape))
         return cls(p, f, rows, columns, np.full(rows.shape, np.inf), source)
 
     def __repr__(self) -> str:
@@ -156,22 +159,32 @@ class Noise:
         """Of a T (M, N) and of a second measurement, equally noisy: (T_1 - T_2)^2 / 2 has its variance.
 
         What changed smoothly between both, as a lamp does, counts as noise. InputError where entries are the
-        same, or do not show; entries that are 0 in both do not count.
+        same, or do not show, or one T is 1.2 times as bright; entries that are 0 in both do not count.
         """
         pairs = list(zip(matrices, others, strict=True))
         for T in (T for pair in pairs for T in pair if not hasattr(T, "rows")):
             if not isinstance(T, np.ndarray) and not scipy.sparse.issparse(T):
-                raise InputError(f"noise is a second T, but one is made of {type(T).__name__}; give entries")
+                text = "noise is a second T, but one of both is compressed, or an operator without entries"
+                raise InputError(f"{text}; compare those that they were made from, which keeps the noise")
         noise = cls.fit(matrices[0].shape, [_differences(*pair) for pair in pairs], "measured twice")
         if not np.any(noise.floor + noise.photons):
             raise InputError("noise has the same entries as matrix; it must be a second measurement")
-        return replace(noise, neighbours=[_cancellation(*pair) for pair in pairs])
+        shares, exposures = zip(*(_compared(*pair) for pair in pairs), strict=True)
+        if not 1.0 / _EXPOSURE <= (ratio := max(exposures, key=lambda x: abs(np.log(x)))) <= _EXPOSURE:
+            text = f"noise is a second T, {ratio:.3g} times as bright as matrix"
+            raise InputError(f"{text}; both must be measured with the same exposure and light")
+        return replace(noise, neighbours=shares)
 
-    def require(self, channels: int, shape: tuple[int, int]) -> None:
-        """InputError where this is the noise of a T of other channels or another shape (M, N)."""
+    def require(self, channels: int, shape: tuple[int, int], brightest: Any = 0.0) -> None:
+        """InputError where this is no noise of such a T (M, N), `brightest` (channels,), or 0 if unknown."""
         n, own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
         if (n, own) != (channels, shape):
             raise InputError(f"noise is of {n} channel(s) {own}; T has {channels} {shape}")
+        light = np.maximum(brightest, 0.0)
+        v = (self.photons * light + self.floor**2) * self.rows.max(axis=1) * self.columns.max(axis=1)
+        if np.any((light > 0.0) & (v > (_UNITS * light) ** 2)):
+            text = f"noise reaches {v.max() ** 0.5:.3g}, more than {_UNITS:g} times the light of T"
+            raise InputError(f"{text}; it must be in the units of T")
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Numbers for files, by names that begin with ``noise_``."""
@@ -180,13 +193,14 @@ class Noise:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
-        """What `to_arrays` gave; None where it is not there."""
-        if "noise_floor" not in arrays:
-            return None
-        if missing := [f.name for f in fields(cls) if f"noise_{f.name}" not in arrays]:
-            raise InputError(f"noise_{missing[0]} is missing; noise has {len(fields(cls))} arrays")
-        values = {f.name: arrays[f"noise_{f.name}"] for f in fields(cls)}
-        return cls(**{**values, "source": SOURCES[int(values["source"]) % len(SOURCES)]})
+        """What `to_arrays` gave; None where nothing of it is there. Older files have no neighbours."""
+        names = [f.name for f in fields(cls)]
+        values = {name: arrays[f"noise_{name}"] for name in names if f"noise_{name}" in arrays}
+        if missing := values and set(names) - values.keys() - {"neighbours"}:
+            raise InputError(f"noise_{min(missing)} is missing; noise is the arrays of {', '.join(names)}")
+        number = np.asarray(values.get("source", 0)).tolist()
+        source = SOURCES[int(checks.one_of("noise_source", number, range(len(SOURCES))))]
+        return cls(**{**values, "source": source}) if values else None
 
 
 def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ...]:
@@ -240,16 +254,18 @@ def _differences(first: Any, second: Any) -> Iterator[tuple[np.ndarray, ...]]:
         yield i + start, j, (a + b) / 2, (a - b) ** 2 / 2
 
 
-def _cancellation(first: Any, second: Any) -> float:
-    """c by the differences of two T (M, N), but for their diagonal."""
-    sums: list[float] = []
+def _compared(first: Any, second: Any) -> tuple[float, float]:
+    """c by the differences of two T (M, N), but for their diagonal; and how much brighter the second is."""
+    sums, ratios = list[float](), list[float]()
     for start, A, B in _rows(first, second):
+        norms = np.linalg.norm([B, A], axis=2)
+        ratios.extend(np.divide(*norms[:, norms.all(axis=0)]))
         E = A - B
         if first.shape[0] == first.shape[1]:
             np.fill_diagonal(E[:, start:], 0.0)
         noisy = E[E.any(axis=1)]
         sums.extend(np.sum(noisy, axis=1) ** 2 / np.sum(noisy**2, axis=1))
-    return cancellation(float(np.mean(sums or [1.0])), len(sums))
+    return cancellation(float(np.mean(sums or [1.0])), len(sums)), float(np.median(ratios or [1.0]))
 
 
 def cancellation(ratio: float, rows: int) -> float:

@@ -157,8 +157,7 @@ def load_inverse(path: str | os.PathLike[str], *, device: Any = None) -> Inverse
 
 def read(path: str | os.PathLike[str], *, variable: str | None = None) -> Record | Parts:
     """A `Record`, or `Parts` of a compressed transport or of an inverse; errors are those of `load`."""
-    path = as_path(path)
-    suffix = find(path)
+    suffix = find(path := as_path(path))
     if variable is not None and suffix in (".npy", ".mtx", ".zarr"):
         raise FileError(f"{path}: variable is {variable!r}, but the matrix of this format has no name")
     if suffix != ".zarr":
@@ -169,18 +168,18 @@ def read(path: str | os.PathLike[str], *, variable: str | None = None) -> Record
 
 def write(path: str | os.PathLike[str], content: Record | Parts) -> None:
     """Write a transport file whole or not at all; errors are those of `save`."""
-    path = as_path(path)
-    suffix = find(path, inverse=isinstance(content, Parts) and content.format == INVERSE)
-    lost = f"{path}: {path.suffix} does not keep"
+    suffix = find(path := as_path(path), inverse=isinstance(content, Parts) and content.format == INVERSE)
+    lost, bare = f"{path}: {path.suffix} does not keep", suffix in (".npy", ".mtx")
     if isinstance(content, Parts):
         if suffix not in (".npz", ".zarr"):
             raise FileError(f"{lost} compressed transports; .npz and .zarr do")
-    elif suffix in (".npy", ".mtx"):
-        if content.mixing is not None:
-            raise FileError(f"{lost} how the projector's colours mix; .npz does")
+    elif bare and content.mixing is not None:
+        raise FileError(f"{lost} how the projector's colours mix; .npz does")
+    elif bare or suffix == ".mat":
         F, diagonals = content.first_bounce, [T.diagonal() for T in content.matrices]
-        if F is not None and not np.allclose(F, diagonals, rtol=1e-6, atol=0):
-            logging.getLogger(__name__).warning("%s the first bounce; .npz does", lost)
+        other = bare and F is not None and not np.allclose(F, diagonals, rtol=1e-6, atol=0)
+        if names := ["the first bounce"] * other + ["the noise"] * (content.noise is not None):
+            logging.getLogger(__name__).warning("%s %s; .npz does", lost, " and ".join(names))
     with about(path):
         content = content.in_memory() if isinstance(content, Record) else content
         if suffix == ".zarr":
@@ -213,7 +212,7 @@ def _read_npz(path: Path, variable: str | None = None) -> Record | Parts:
         layout = str(load("format")) if "format" in headers else None
         if layout in (COMPRESSED, INVERSE):
             return Parts({name: load(name) for name in headers if name != "format"}, layout)
-        shapes = {name: shape for name, (shape, dtype) in headers.items() if dtype.kind in "fiubc"}
+        shapes = {n: s for n, (s, dtype) in headers.items() if dtype.kind in "fiubc" or n[:6] == "noise_"}
         matrices: dict[str, Any] = {}
         if layout and variable is None:
             if "shape" not in headers:
@@ -249,9 +248,8 @@ def _headers(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
 
 
 def _write_npz(path: Path, content: Record | Parts) -> None:
-    arrays: dict[str, Any]
     if isinstance(content, Parts):
-        arrays = {"format": content.format, **content.arrays}
+        arrays: dict[str, Any] = {"format": content.format, **content.arrays}
     elif content.dense:
         arrays = content.arrays()
     else:  # one matrix as SciPy writes it: bytes, and a flag for csr_array

@@ -103,6 +103,7 @@ def test_the_command_line_does_the_same_and_shows_them(program, tmp_path: Path) 
     (picture,) = program(*common, "--dark", "0.01", "--json").json["pictures"]
     best = ltcl.compensate(ltcl.Transport(case.true, GRID), DESIRED["grey"], gain="auto").gain
     assert picture["gain"] == pytest.approx(best, rel=0.02)
+    assert "masked" in program(*common).out
     program(*common, "--on-dark", "raise").refused("T.npz", "13 of 1024 pixels")
     for command in ("info", "analyze"):
         (facts,) = program(command, path, "--show-dark", tmp_path / "dark.png", "--json").json
@@ -155,6 +156,16 @@ def test_noise_is_not_estimated_without_need(monkeypatch) -> None:
     ltcl.Transport(T32 * ~SOME, (4, 8))
     with pytest.raises(TypeError, match="NoneType"):
         ltcl.Transport(T32 * DIM, (4, 8))
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.98])
+def test_most_pixels_may_be_dark_with_noise(share) -> None:
+    scene = ltcl.scenes.dihedral(8)
+    lit, noise = random.permutation(128) >= share * 128, 7e-4 * random.standard_normal((128, 128))
+    T = ltcl.Transport(scene.matrices()[0] * lit + noise, scene.grid)
+    np.testing.assert_array_equal(T.masked, ~lit)
+    with pytest.raises(InputError, match=r"noise.*every pixel|every pixel.*noise"):
+        ltcl.Transport(noise, scene.grid)
 
 
 # What a separation cannot be.

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import scipy.sparse
@@ -154,14 +155,20 @@ def test_second_measurement_shows_the_noise(layout: Any, photons: float) -> None
     assert 1 / CLOSE < np.median(np.diag(ratio)) < CLOSE
 
 
+BRIGHT = ltcl.Transport(1.5 * truth("corner", 8).to_numpy(), (8, 16))
+
+
 @pytest.mark.parametrize(
     ("noise", "error", "match"),
     [
         (0.1, InputTypeError, "noise is a float"),
         (Noise.uniform((3, 4), 0.1), InputError, r"noise.*\(3, 4\).*\(128, 128\)"),
         (Noise.uniform((128, 128), [0.1] * 3), InputError, "noise.*3 channel"),
+        (replace(Noise.uniform((128, 128), 1e30), direct=0.0), InputError, r"noise.*1e\+30.*T"),
         (ltcl.Transport(np.eye(12), (3, 4)), InputError, r"noise.*grid \(3, 4\)"),
         (ltcl.Transport([np.eye(128)] * 3, (8, 16)), InputError, "noise.*channels 3"),
+        (measure(BRIGHT, noise_of(BRIGHT, 1e-3), 1), InputError, r"noise.*1\.5 times"),
+        (ltcl.compress(truth("corner", 8), rtol=0.1), InputError, "noise.*compressed"),
     ],
 )
 def test_other_noise_is_refused(noise: Any, error: type[Exception], match: str) -> None:
@@ -170,21 +177,59 @@ def test_other_noise_is_refused(noise: Any, error: type[Exception], match: str) 
         ltcl.Transport(T.to_numpy(), T.grid, noise=noise)
 
 
-BAD = {
-    "floor": [-1.0],
-    "photons": [np.nan],
-    "neighbours": [-0.1],
-    "rows": np.ones(4),
-    "columns": [[np.inf] * 4],
-    "white": [[1.0]],
-}
+BAD = [
+    ("floor", [-1.0], "-1"),
+    ("floor", [1e300], "1e.300"),
+    ("floor", [1.0, 1.0], r"shape \(2,\)"),
+    ("photons", [np.nan], "nan"),
+    ("neighbours", [-0.1], "-0.1"),
+    ("direct", [0.1, 0.2], r"shape \(2,\)"),
+    ("rows", np.ones(4), r"shape \(4,\)"),
+    ("rows", np.full((1, 4), 1e300), "1e.300"),
+    ("columns", [[np.inf] * 4], "inf"),
+    ("white", [[1.0]], r"shape \(1, 1\)"),
+    ("white", [[np.nan] * 4], "nan"),
+    ("source", "guessed", "guessed"),
+]
 
 
-@pytest.mark.parametrize(("name", "value"), [*BAD.items(), ("floor", [1.0, 1.0]), ("source", "guessed")])
-def test_bad_noise_is_refused(name: str, value: Any) -> None:
+@pytest.mark.parametrize(("name", "value", "says"), BAD)
+def test_bad_noise_is_refused(name: str, value: Any, says: str) -> None:
     good = Noise.uniform((4, 4), 0.1)
-    with pytest.raises((InputError, InputTypeError), match=rf"noise\.{name}"):
+    with pytest.raises((InputError, InputTypeError), match=rf"noise\.{name} .*{says}"):
         Noise(**{**vars(good), name: value})
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 4, 4), None, "ab", (-1, 2), (2.5, 2)])
+def test_noise_of_no_shape_is_refused(shape: Any) -> None:
+    with pytest.raises(InputError, match="shape is"):
+        Noise.uniform(shape, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("floor", None), ("floor", "a"), ("source", 9), ("source", -1), ("source", [0]), ("source", "given")],
+)
+@pytest.mark.parametrize("extension", ["npz", "h5"])
+def test_files_of_damaged_noise_are_refused(name: str, value: Any, extension: str, tmp_path: Path) -> None:
+    """Those of before `neighbours` are not damaged."""
+    arrays: dict[str, Any] = {"T": np.eye(4), "grid": [2, 2], **Noise.uniform((4, 4), 0.01).to_arrays()}
+    del arrays["noise_neighbours"]
+    path = tmp_path / f"T.{extension}"
+
+    def write() -> None:
+        if extension == "npz":
+            np.savez(path, allow_pickle=False, **{n: a for n, a in arrays.items() if a is not None})
+            return
+        with h5py.File(path, "w") as file:
+            file.update({n: a for n, a in arrays.items() if a is not None})
+
+    write()
+    assert same(ltcl.load(path).measured_noise, Noise.uniform((4, 4), 0.01))
+    arrays[f"noise_{name}"] = value
+    write()
+    with pytest.raises(InputError, match=f"noise[_.]{name}"):
+        ltcl.load(path)
 
 
 def test_a_transport_is_no_second_measurement_of_itself() -> None:

@@ -18,6 +18,7 @@ import scipy.sparse
 
 import ltcl
 from ltcl.errors import FileError, InputTypeError, LtclError, MemoryLimitError
+from ltcl.noise import Noise
 from ltcl.store import Record, formats
 from ltcl.store.record import Matrix
 
@@ -80,6 +81,8 @@ def test_npy_keeps_the_matrix_alone(tmp_path: Path, T: Any, caplog: Any) -> None
     with caplog.at_level(logging.WARNING):
         formats.write(tmp_path / "T.npy", Record(T))
         assert not caplog.messages
+        formats.write(tmp_path / "T.mat", replace(Record(T), noise=Noise.uniform(T[0].shape, [0.1] * len(T))))
+        assert "T.mat: .mat does not keep the noise" in caplog.text
         if len(T) == 3:
             formats.write(tmp_path / "T.npy", Record(T, first_bounce=np.ones(12)))
             assert "first bounce" in caplog.text
