@@ -35,8 +35,8 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "theory and diagnostics": (1100, ["ltcl/theory", "ltcl/diagnostics.py"]),
     "compression": (1760, ["ltcl/compression"]),
     "compensation, separation, relighting, analysis": (1370, _TASKS),
-    # Noise is new, and other parts use it: together 1 890 of the 3 000 lines for noise, scale and viewer.
-    "noise": (1345, _NOISE),
+    # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
+    "noise": (1375, _NOISE),
     "transport and the rest": (1390, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
