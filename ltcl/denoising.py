@@ -106,12 +106,16 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
 
     for c, matrix in enumerate(T.matrices):
         Y = (matrix if isinstance(matrix, np.ndarray) else matrix.tocsr().toarray()).astype(np.float32)
-        problem = Problem.of(Y, noise, c, T.camera_grid, T.grid)
+        unit = np.float32(2.0 ** int(np.frexp(np.abs(Y).max(initial=0.0))[1]))  # squares fit into float32
+        Y /= unit
+        model = dataclasses.replace(noise, photons=noise.photons / unit, floor=noise.floor / unit)
+        problem = Problem.of(Y, model, c, T.camera_grid, T.grid)
         pilot = shrink(problem, multiwavelets(problem.grids), None, note)[0]
         estimate, error = refine(problem, pilot, pilot, lambda done: note(SHIFTS + done))
         white = (error / problem.gauge).sum(axis=1, dtype=float)
-        matrices.append(problem.restore(estimate, Y))
-        left[c] = white @ white / (noise.variance(matrices[-1], c).sum() or 1.0)
+        estimate = problem.restore(estimate, Y)
+        left[c] = white @ white / (model.variance(estimate, c).sum() or 1.0)
+        matrices.append(unit * estimate)
     light = {"photons": noise.photons * left, "floor": noise.floor * np.sqrt(left), "neighbours": 0.0}
     noise = dataclasses.replace(noise, **light)
     settings = {"device": T._requested_device, "mixing": T.mixing, "noise": noise}
