@@ -180,7 +180,7 @@ class Noise:
         n, own = len(self.floor), (self.rows.shape[1], self.columns.shape[1])
         if (n, own) != (channels, shape):
             raise InputError(f"noise is of {n} channel(s) {own}; T has {channels} {shape}")
-        light = np.maximum(brightest, 0.0)
+        light = np.maximum(brightest, 0.0).astype(np.float64)
         v = (self.photons * light + self.floor**2) * self.rows.max(axis=1) * self.columns.max(axis=1)
         if np.any((light > 0.0) & (v > (_UNITS * light) ** 2)):
             text = f"noise reaches {v.max() ** 0.5:.3g}, more than {_UNITS:g} times the light of T"
