@@ -150,7 +150,9 @@ def main() -> None:
     some = SCENES[: 1 if given.smoke else None]
     cases = [measured(name, n, level, light) for n, light in sizes for name in some for level in LEVELS]
     names = [f"{c.scene} {c.pixels}, noise {c.level:g}, photons {c.photons:g}" for c in cases]
-    rows = [dict(zip(QUANTITIES, case.shares.T.astype(float).round(5).tolist(), strict=True)) for case in cases]
+    rows = [
+        dict(zip(QUANTITIES, case.shares.T.astype(float).round(5).tolist(), strict=True)) for case in cases
+    ]
     facts = dict(zip(names, rows, strict=True))
     for table in tables(cases):
         Console(width=180).print(table)
