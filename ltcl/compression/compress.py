@@ -101,7 +101,7 @@ class ChannelCompression(Trial):
     trials: tuple[Trial, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Compression:
     """How a compressed transport was made; its ``.compression``.
 
@@ -116,6 +116,10 @@ class Compression:
     window: tuple[int, int]
     seconds: float
     channels: tuple[ChannelCompression, ...]
+
+    def __repr__(self) -> str:
+        bases = ", ".join(channel.basis for channel in self.channels)
+        return f"<ltcl Compression of {checks.size(self.uncompressed)} to rtol {self.rtol} in {bases}>"
 
 
 def compress(
