@@ -41,6 +41,7 @@ from ltcl.transport import Transport, default_rtol
 
 _DRAWS, _FRAME_DRAWS, _WHOLE_DRAWS = 8, 4, 16  # of one picture, of each of several, without a closed form
 _TOGETHER = 8  # pictures whose draws are solved at once
+_ROUNDING = 1e-12  # relative, of a variance
 _RTOL = 0.05  # of solves, whose solutions are the smaller part
 
 
@@ -203,8 +204,11 @@ def _square(T: Transport, noise: Noise, c: int, z: np.ndarray, Rz: np.ndarray) -
 def _draws(q: np.ndarray, random: np.random.Generator, pictures: int) -> np.ndarray:
     """Random errors (M, k, draws, n) of the covariances q (M, k, n, n), for a task of so many pictures."""
     draws = {0: _WHOLE_DRAWS, 1: _DRAWS}.get(pictures, _FRAME_DRAWS)
-    values, vectors = np.linalg.eigh(q)
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    roots, rest = np.zeros(q.shape), q.copy()
+    for n in range(q.shape[-1]):  # Cholesky's, of all pixels at once; what rounding leaves is no direction
+        pivot = np.where(rest[..., n, n] > _ROUNDING * q[..., n, n], rest[..., n, n], 0.0)
+        roots[..., n] = column = _ratio(rest[..., n], np.sqrt(pivot)[..., None])
+        rest -= column[..., None] * column[..., None, :]
     return random.standard_normal((*q.shape[:2], draws, q.shape[-1])) @ np.swapaxes(roots, -1, -2)
 
 
