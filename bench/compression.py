@@ -72,7 +72,7 @@ def loss(T: ltcl.Transport, C: ltcl.Transport, count: int) -> float:
     light, ours = (ltcl.solve(each, b, rtol=ACCURATE).x for each in (S, approximate))
     undone = ltcl.solve(approximate, seen, rtol=ACCURATE).x
     pairs = ((approximate @ direct, seen), (undone, direct), (ours, light), (S @ ours, b))
-    return max(relative(*pair) for pair in pairs)
+    return max(relative(*map(np.asarray, pair)) for pair in pairs)
 
 
 def case(name: str, pair: list[ltcl.Transport], count: int) -> tuple[dict[str, Any], list[Claim]]:
@@ -82,7 +82,8 @@ def case(name: str, pair: list[ltcl.Transport], count: int) -> tuple[dict[str, A
     R = [each.to_numpy() / each.first_bounce for each in pair]
 
     def off(C: ltcl.Transport) -> float:
-        return relative((C.operators[0] @ p).ravel(), (other.operators[0] @ p).ravel())
+        ours, exact = (np.asarray(A.operators[0] @ p).ravel() for A in (C, other))
+        return relative(ours, exact)
 
     exact = off(T)
     differ = np.linalg.norm(R[1] - R[0]) / np.linalg.norm(R[0] - np.eye(len(p)))
