@@ -21,17 +21,13 @@ from ltcl.acquisition.rigs.mitsuba import SCENES
 BOUNCES = 5  # direct light, bounces 1 to 3, and all further ones
 _EYE, _DEPTH = 3.0, 64  # place on the z axis; vertices
 _SIZE, _SURE = 1 << 22, 4  # paths at once; vertices before Russian roulette
-_WHITE, _GREY, _RED, _GREEN = (0.7,) * 3, (0.6,) * 3, (0.63, 0.06, 0.05), (0.14, 0.45, 0.09)
-_ROOM = (_WHITE, _RED, _GREEN, _WHITE, _WHITE)  # back, left, right, floor, ceiling
 # Middle, half of the sides, and degrees around y.
 _BLOCKS = ((-0.2, -0.2, 0.35), (0.14, 0.3, 0.14), 20.0), ((0.2, -0.35, 0.65), (0.15, 0.15, 0.15), -17.0)
-# Walls, their albedo, roughness of the blocks (0: diffuse; None: no blocks), tangent of half the frame.
-TRACED: dict[str, tuple[str, Any, float | None, float]] = {
-    "corner": ("dihedral", (_WHITE,) * 2, None, 0.1666),
-    "box": ("box", (_WHITE,) * 5, None, 0.2499),
-    "blocks": ("box", (_GREY,) * 5, 0.0, 0.2499),
-    "colours": ("box", _ROOM, 0.0, 0.2499),
-    "gloss": ("box", _ROOM, 0.3, 0.2499),
+# Walls, their albedo, blocks among them, tangent of half the frame.
+TRACED = {
+    "corner": ("dihedral", 0.7, (), 0.1666),
+    "box": ("box", 0.7, (), 0.2499),
+    "blocks": ("box", 0.6, _BLOCKS, 0.2499),
 }
 
 
@@ -43,42 +39,28 @@ def unavailable() -> str:
     return f"Mitsuba's llvm_ad_rgb ended with {tried.returncode}: {why}" if tried.returncode else ""
 
 
-def scene(name: str) -> tuple[dict[str, Any], float]:
-    """What `mitsuba.load_dict` takes, without light and camera, and the tangent of half the frame."""
-    import mitsuba as mi
+def trace(name: str, grid: tuple[int, int], paths: int, seed: int) -> np.ndarray:
+    """T by bounces (`BOUNCES`, N, N) float32 of a scene of `TRACED`; their sum is T.
 
-    walls, albedo, roughness, tangent = TRACED[name]
-    described: dict[str, Any] = {"type": "scene"}
-    for k, (start, right, up) in enumerate(np.array(SCENES[walls], np.float64)):
-        axes = right / 2, up / 2, np.cross(right, up), start + (right + up) / 2
-        place = mi.ScalarTransform4f(np.vstack([np.transpose(axes), [0, 0, 0, 1]]))
-        described[f"wall {k}"] = {"type": "rectangle", "to_world": place, "bsdf": _diffuse(albedo[k])}
-    metal = {"type": "roughconductor", "distribution": "ggx", "alpha": roughness or 1.0}
-    for k, (middle, half, degrees) in enumerate(() if roughness is None else _BLOCKS):
-        turned = mi.ScalarTransform4f().translate(list(middle)).rotate([0, 1, 0], degrees).scale(list(half))
-        bsdf = metal if roughness and k == 0 else _diffuse(albedo[0])
-        described[f"block {k}"] = {"type": "cube", "to_world": turned, "bsdf": bsdf}
-    return described, tangent
-
-
-def _diffuse(albedo: tuple[float, float, float]) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(albedo)}}
-
-
-def trace(name: str, grid: tuple[int, int], paths: int, seed: int, channels: int = 1) -> np.ndarray:
-    """T by bounces (`BOUNCES`, channels, N, N) float32 of a scene of `TRACED`; their sum is T.
-
-    A camera pixel sends at least so many `paths`. One channel is the green one. Seeds give independent
-    measurements.
+    A camera pixel sends at least so many `paths`. Seeds give independent measurements.
     """
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
     import drjit as dr
 
-    described, tangent = scene(name)
+    walls, albedo, blocks, tangent = TRACED[name]
+    matt = {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
+    described: dict[str, Any] = {"type": "scene"}
+    for k, (start, right, up) in enumerate(np.array(SCENES[walls], np.float64)):
+        axes = right / 2, up / 2, np.cross(right, up), start + (right + up) / 2
+        place = mi.ScalarTransform4f(np.vstack([np.transpose(axes), [0, 0, 0, 1]]))
+        described[f"wall {k}"] = {"type": "rectangle", "to_world": place, "bsdf": matt}
+    for k, (middle, half, degrees) in enumerate(blocks):
+        place = mi.ScalarTransform4f().translate(list(middle)).rotate([0, 1, 0], degrees).scale(list(half))
+        described[f"block {k}"] = {"type": "cube", "to_world": place, "bsdf": matt}
     world, (h, w), n = mi.load_dict(described), grid, grid[0] * grid[1]
-    T = dr.zeros(mi.Float, BOUNCES * channels * n * n)
+    T = dr.zeros(mi.Float, BOUNCES * n * n)
     eye, context, random = mi.Point3f(0.0, 0.0, _EYE), mi.BSDFContext(), np.random.default_rng(seed)
     passes = -(-paths * n // _SIZE)
     count = math.ceil(math.sqrt(paths / passes)) ** 2
@@ -103,9 +85,8 @@ def trace(name: str, grid: tuple[int, int], paths: int, seed: int, channels: int
             j = i if k == 0 else dr.minimum(mi.UInt32(v * h), h - 1) * w + dr.minimum(mi.UInt32(u * w), w - 1)
             value = weight * bsdf.eval(context, hit, hit.to_local(-dr.normalize(ways)), lit)
             value *= dr.norm(ways) / far**3  # irradiance across the ray, of 1 at distance 1
-            for c in range(channels):
-                at = (mi.UInt32(min(k, BOUNCES - 1) * channels + c) * n + i) * n + j
-                dr.scatter_reduce(dr.ReduceOp.Add, T, value[c if channels == 3 else 1], at, lit)
+            at = (mi.UInt32(min(k, BOUNCES - 1)) * n + i) * n + j
+            dr.scatter_reduce(dr.ReduceOp.Add, T, value[1], at, lit)  # all walls are grey
             sample, share = bsdf.sample(context, hit, sampler.next_1d(), sampler.next_2d(), active)
             weight *= share
             if k >= _SURE:
@@ -118,7 +99,7 @@ def trace(name: str, grid: tuple[int, int], paths: int, seed: int, channels: int
             sampler.schedule_state()
             if not dr.any(active):
                 break
-    return np.array(T / (passes * count)).reshape(BOUNCES, channels, n, n)
+    return np.array(T / (passes * count)).reshape(BOUNCES, n, n)
 
 
 if __name__ == "__main__":

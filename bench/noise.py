@@ -3,71 +3,55 @@
 
 `Transport.noise` from T alone and from a second measurement, with noise of 1e-5 to 1e-2 of the median first
 bounce: a floor alone; with photon noise as large at the first bounce; and with 300 times its variance, which
-is as large as the floor where light is indirect. Medians of all entries, and of the diagonal. Goal: 1 / 1.3
-to 1.3. The first bounce of the glossy scene is traced, with errors of 7.6e-6 of its own.
+is as large as the floor where light is indirect. For each level: medians of all entries / of the diagonal,
+and the share of entries from 1 / 1.3 to 1.3. The first bounce of the glossy scene is traced, with errors of
+7.6e-6 of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
 from itertools import product
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from matplotlib.figure import Figure
 
+import _figures as figures
 import ltcl
-from _harness import options, record, write_json
-from ltcl import scenes
-from ltcl.noise import Noise
+from _figures import Claim
+from _harness import options
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from tests.noise.measured import SCENES, measure, noise_of, truth
 
 LEVELS, PHOTONS, GOAL = (1e-5, 1e-4, 1e-3, 1e-2), (0.0, 1.0, 300.0), 1.3
-BLOCK = scenes.Block((0.3, 0.3, 0.2), (0.3, 0.3, 0.3))
-GLOSSY = {"albedo": 0.6, "gloss": 0.4, "projector": (0.5, 0.8, 1.5)}
-SCENES: dict[str, Callable[[int], ltcl.Transport]] = {
-    "corner": lambda n: scenes.dihedral(n, albedo=0.6).transport(),
-    "painted": lambda n: scenes.trihedral(n, albedo=[[0.9], [0.3], [0.6]]).transport(),
-    "box": lambda n: scenes.box(n, 3, albedo=0.7).transport(),
-    "occluded": lambda n: scenes.box(n, 3, albedo=0.7, occluder=BLOCK).transport(),
-    "glossy": lambda n: scenes.glossy(scenes.dihedral(n), n, **GLOSSY).transport(),
-}
 
 
-def ratios(
-    T: np.ndarray, grid: tuple[int, int], level: float, photons: float, twice: bool
-) -> tuple[float, float, float]:
+def ratios(exact: ltcl.Transport, level: float, photons: float, twice: bool) -> tuple[float, float, float]:
     """Estimated over true: median of all entries and of the diagonal; share of entries within the goal."""
-    F, random = float(np.median(np.diag(T))), np.random.default_rng(0)
-    true = Noise.uniform(T.shape, level * F, photons * level**2 * F)
-    root = np.sqrt(true.variance(T))
-    first, second = ((T + root * random.standard_normal(T.shape)).astype(np.float32) for _ in range(2))
-    other = ltcl.Transport(second, grid) if twice else None
-    ratio = np.sqrt(ltcl.Transport(first, grid, noise=other).noise.variance(T)) / root
+    true, T = noise_of(exact, level, photons), exact.to_numpy()
+    first, second = (measure(exact, true, seed, known=False) for seed in (0, 1))
+    measured = ltcl.Transport(first.to_numpy(), exact.grid, noise=second if twice else None)
+    ratio = np.sqrt(measured.noise.variance(T) / true.variance(T))
     within = float(np.mean(np.abs(np.log(ratio)) < np.log(GOAL)))
     return float(np.median(ratio)), float(np.median(np.diag(ratio))), within
 
 
 def main() -> None:
-    """Print a table of each way, and write the figures."""
-    given = options(__doc__ or "")
-    console, rows = Console(width=150), []
-    transports = {name: make(6 if given.smoke else 12) for name, make in SCENES.items()}
-    for twice, photons in product((False, True), PHOTONS):
-        title = f"{'from a second measurement' if twice else 'from T alone'}, {photons:g} times photon noise"
-        table = Table("scene", *map(str, LEVELS), title=f"Entries / first bounce {title}", width=70)
-        for name, transport in transports.items():
-            T, cells = transport.to_numpy().astype(np.float64), []
-            for level in LEVELS:
-                entries, first, within = ratios(T, transport.grid, level, photons, twice)
-                rows.append({"title": title, "scene": name, "level": level, "within": within})
-                rows[-1] |= {"entries": entries, "first_bounce": first}
-                cells.append(f"{entries:.2f} / {first:.2f}")
-            table.add_row(name, *cells)
-        console.print(table)
-    good = np.mean([row["within"] >= 0.95 for row in rows])
-    console.print(f"{good:.0%} of the cases have 95 % of the entries within a factor {GOAL}")
-    if given.json is not None:
-        write_json(given.json, record(given, "Noise of T", {"cases within": float(good)}) | {"rows": rows})
+    """Judge each way, scene and noise."""
+    given, facts, good = options(__doc__ or ""), dict[str, Any](), list[bool]()
+    for twice, photons, scene in product((False, True), PHOTONS, SCENES):
+        exact = truth(scene, 6 if given.smoke else 12)
+        found = [ratios(exact, level, photons, twice) for level in LEVELS]
+        way = "a second measurement" if twice else "T alone"
+        text = "; ".join(f"{entries:.2f} / {first:.2f}, {within:.0%}" for entries, first, within in found)
+        facts[f"{scene}, {photons:g} times photon noise, by {way}"] = text
+        good += [within >= 0.95 for *_, within in found]
+    text = f"cases of which 95 % of the entries are within a factor {GOAL}"
+    listed = [Claim(text, f"{sum(good)} of {len(good)}", "all", all(good))]
+    figures.conclude(given, "Noise of T, estimated over true", listed[given.smoke :], facts, Figure)
 
 
 if __name__ == "__main__":

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import _figures as figures
 import ltcl
 from _figures import Claim
-from _harness import Options, options, seconds
-from ltcl.plots.page import COLOURS, INK
+from _harness import options, seconds
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.noise.measured import SCENES, measure, noise_of, truth
@@ -90,35 +90,18 @@ def claims(shares: dict[tuple[str, float], np.ndarray], ratios: dict[str, float]
     return listed
 
 
-def draw(shares: dict[tuple[str, float], np.ndarray]) -> Any:
-    """Shares of every case, against those of normal errors."""
-    page = figures.page(
-        420, "Errors within one and two standard deviations", "each point: a scene and a level"
-    )
-    axes = figures.graph(page, (80, 110, 880, 250), "share of errors", "", "linear")
-    for n, (wanted, colour) in enumerate(zip(WANTED, (COLOURS["direct"], COLOURS["jacobi"]), strict=True)):
-        axes.axhline(wanted, color=INK, lw=0.8)
-        for k in range(len(NAMES)):
-            axes.plot(
-                np.full(len(shares), k), [each[k, n] for each in shares.values()], "o", ms=4, color=colour
-            )
-    axes.set_xticks(range(len(NAMES)), NAMES)
-    return page
-
-
-def run(given: Options) -> None:
+def main() -> None:
     """Measure, and conclude; so few repetitions as of --smoke show that it runs."""
+    given = options(__doc__ or "")
+    logging.getLogger("ltcl").setLevel(logging.ERROR)  # of glossy scenes, each time
     scenes, repetitions = (SCENES[:1], 2) if given.smoke else (SCENES, 200)
     shares = {(s, level): coverage(s, level, repetitions) for s in scenes for level in LEVELS}
-    ratios = costs(6 if given.smoke else 32, given.smoke)
+    listed = claims(shares, costs(6 if given.smoke else 32, given.smoke))
     facts: dict[str, Any] = {"repetitions": repetitions, "pixels": max(truth(s).shape[1] for s in scenes)}
     for (scene, level), each in shares.items():
         facts[f"{scene}, {level:g}: within 1 and 2"] = ", ".join(f"{a:.1%} {b:.1%}" for a, b in each)
-    listed = claims(shares, ratios)
-    listed = [c for c in listed if not given.smoke]
-    figures.conclude(given, "Uncertainty, pixel by pixel", listed, facts, lambda: draw(shares))
+    figures.conclude(given, "Uncertainty, pixel by pixel", [] if given.smoke else listed, facts, Figure)
 
 
 if __name__ == "__main__":
-    logging.getLogger("ltcl").setLevel(logging.ERROR)  # of glossy scenes, each time
-    run(options(__doc__ or ""))
+    main()

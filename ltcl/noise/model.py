@@ -34,7 +34,8 @@ Samples = Iterable[Sequence[np.ndarray]]
 _PASSES, _LIGHTS, _ENTRIES = 6, 32, 256  # of a fit: passes; octaves of light; samples of a row, about
 _CLIPPED, _MEAN = 9.0, 0.995  # variances of a sample at most, and the mean of normal ones so clipped
 _AT_ONCE, _FIRST = 1 << 22, 64  # samples; first bounces at least, whose variance has a factor of its own
-_G, _CHANCE = 0.375, 3.0  # ||G||; standard deviations of row sums that mean nothing
+_BINOMIAL, _CENTRE, _G = [0.25, 0.5, 0.25], 0.25, 0.375  # G along an axis; G_00; ||G||
+_CHANCE = 3.0  # standard deviations of row sums that mean nothing
 _LARGEST, _UNITS, _EXPOSURE = 1e36, 1e6, 1.2  # at most: numbers, deviations over light, ratio of two T
 
 
@@ -127,18 +128,16 @@ class Noise:
             return pictures
         c, mean = self.neighbours[channel], pictures.reshape(-1, *grid, *pictures.shape[1:])
         for axis in (1, 2):
-            mean = scipy.ndimage.correlate1d(mean, [0.25, 0.5, 0.25], axis=axis, mode="nearest")
-        return (pictures - c * mean.reshape(pictures.shape)) / (1.0 - 0.5 * c + (_G * c) ** 2) ** 0.5
+            mean = scipy.ndimage.correlate1d(mean, _BINOMIAL, axis=axis, mode="nearest")
+        return (pictures - c * mean.reshape(pictures.shape)) / _norm2(c) ** 0.5
 
     def relative_variance(self, bases: Sequence[np.ndarray], channel: int = 0) -> np.ndarray:
         """||`filtered` b||^2, (N,) float32, of pictures b: products of orthonormal bases (h, h), (w, w)."""
-        c, same, seen = self.neighbours[channel], [], []
-        for A in bases:
-            mean = scipy.ndimage.correlate1d(A, [0.25, 0.5, 0.25], axis=1, mode="nearest")
-            same.append(np.sum(A * mean, axis=1))
-            seen.append(np.sum(mean**2, axis=1))
-        shares = (1.0 - 2.0 * c * np.kron(*same) + c**2 * np.kron(*seen)) / (1.0 - 0.5 * c + (_G * c) ** 2)
-        return shares.astype(np.float32)
+        c = self.neighbours[channel]
+        means = [scipy.ndimage.correlate1d(A, _BINOMIAL, axis=1, mode="nearest") for A in bases]
+        same = np.kron(*(np.sum(A * mean, axis=1) for A, mean in zip(bases, means, strict=True)))
+        seen = np.kron(*(np.sum(mean**2, axis=1) for mean in means))
+        return ((1.0 - 2.0 * c * same + c**2 * seen) / _norm2(c)).astype(np.float32)
 
     @classmethod
     def fit(
@@ -268,13 +267,18 @@ def _compared(first: Any, second: Any) -> tuple[float, float]:
     return cancellation(float(np.mean(sums or [1.0])), len(sums)), float(np.median(ratios or [1.0]))
 
 
+def _norm2(c: float) -> float:
+    """||1 - c G||^2."""
+    return 1.0 - 2.0 * _CENTRE * c + (_G * c) ** 2
+
+
 def cancellation(ratio: float, rows: int) -> float:
-    """c, so that (1 - c)^2 / ||1 - c G||^2 is the variance of row sums over that of independent errors.
+    """c, so that (1 - c)^2 / `_norm2` is the variance of row sums over that of independent errors.
 
     0 where it may be below 1 by chance, of so many rows.
     """
     certain = ratio * (1.0 + _CHANCE * (2.0 / max(rows, 1)) ** 0.5) < 1.0
-    a, b = 1.0 - _G**2 * ratio, 1.0 - 0.25 * ratio  # of a c^2 - 2 b c + 1 - ratio = 0
+    a, b = 1.0 - _G**2 * ratio, 1.0 - _CENTRE * ratio  # of a c^2 - 2 b c + 1 - ratio = 0
     return (b - (b * b - a * (1.0 - ratio)) ** 0.5) / a if certain else 0.0
 
 
