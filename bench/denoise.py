@@ -4,8 +4,8 @@
 Noise is a floor, in median first bounces, alone or with photon noise of as much at that light. Two bounds: of
 the same bases, with Wiener factors and folds of the truth; and of the first bounce, which stays as measured:
 the errors of the truth with that. Thresholds were chosen on corner, box and glossy, 12 pixels a side, without
-photon noise, at another seed; that of scenes that are not reciprocal after a look at glossy, here. The whole
-takes 3 minutes on 2 cores, in one process.
+photon noise, at another seed; that of scenes that are not reciprocal after a look at glossy, here; bases of
+reciprocal ones by cases here, checked on five other scenes. It takes 3 minutes on 2 cores, one process.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def oracle(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:
     problem = denoising.Problem.of(Y, T.noise, 0, *grids)
     pilot = (exact * problem.gauge).astype(np.float32)
     np.fill_diagonal(pilot, np.diag(denoising.shrink(problem, denoising.multiwavelets(grids), None)[0]))
-    return ltcl.Transport(problem.restore(denoising.refine(problem, pilot, pilot)[0], Y), T.grid)
+    return ltcl.Transport(problem.restore(denoising.refine(problem, pilot)[0], Y), T.grid)
 
 
 def first_only(T: ltcl.Transport, exact: np.ndarray) -> ltcl.Transport:

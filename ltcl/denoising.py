@@ -6,10 +6,12 @@
    largest ones of smooth pictures; d holds areas and irradiance, no albedo: what of its wavelet coefficients
    its errors explain goes. In Z = D^-1/2 T D^1/2 both entries of a pair are the same light; they are averaged
    with weights 1 / variance, unless sums of Z - Z^T between blocks exceed what noise explains: gloss.
-3. C = K Z K^T, K orthonormal multiwavelets of 1 to 3 vanishing moments (Alpert 1993) at a few random shifts,
+3. C = K Z K^T, K orthonormal multiwavelets of 1 to 4 vanishing moments (Alpert 1993) at a few random shifts,
    whose results are averaged (cycle spinning, Coifman and Donoho 1995). What is below 3 standard deviations
    goes; with this first estimate P of C the Wiener factor P^2 / (P^2 + variance) is applied to the measured C
-   (Ghael, Sayeed and Baraniuk 1997), in bases that do not cross the folds between walls.
+   (Ghael, Sayeed and Baraniuk 1997), in bases that do not cross the folds between walls: of a reciprocal T in
+   P's own singular vectors along rows and columns (De Lathauwer et al. 2000), then, by that estimate, in more
+   multiwavelets. Where T is not reciprocal both are left out: they move light of bounces at low noise.
 4. Between two walls, light depends on rows and on columns of the picture nearly as few products
    (Van Loan and Pitsianis 1993): singular values of entries in that order, (rows, rows') x (columns,
    columns'), are shrunk (Gavish and Donoho 2017) below those of the noise that step 3 leaves, simulated.
@@ -37,7 +39,7 @@ from ltcl.noise import Noise
 from ltcl.operators import Operator
 from ltcl.transport import Transport, require
 
-SHIFTS = 4  # trees whose results are averaged, of `moments` and one more
+SHIFTS = 4, 6  # trees whose results are averaged; in the last estimate of a reciprocal T
 THRESHOLD = 3.0  # standard deviations of a coefficient
 _BLOCK = 4  # pixels along a side of a block
 _EXCESS = 1.5  # of the variance of Z - Z^T between blocks over that of noise: the most of a reciprocal T
@@ -50,6 +52,8 @@ _ARRAYS = 15  # of the size of T, float32, at once
 
 Grid = tuple[int, int]
 Bases = list[tuple[np.ndarray, ...]]
+Pair = tuple[np.ndarray, np.ndarray]
+Step = Callable[[float], object]  # of the share that is done
 Ends = list[list[int]]  # of parts of a picture, along its rows and columns
 
 
@@ -100,9 +104,9 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
     checks.fits_host("denoising", 4 * _ARRAYS * T.shape[0] * T.shape[1])
     noise, matrices, left = T.noise, [], np.ones(T.channels)
 
-    def note(done: int) -> None:
+    def note(share: float) -> None:
         if progress is not None:
-            progress("denoising", (len(matrices) + done / (2 * SHIFTS)) / T.channels)
+            progress("denoising", (len(matrices) + share / 2) / T.channels)
 
     for c, matrix in enumerate(T.matrices):
         Y = (matrix if isinstance(matrix, np.ndarray) else matrix.tocsr().toarray()).astype(np.float32)
@@ -111,7 +115,9 @@ def denoise(T: Transport, *, progress: Callable[[str, float], object] | None = N
         model = dataclasses.replace(noise, photons=noise.photons / unit, floor=noise.floor / unit)
         problem = Problem.of(Y, model, c, T.camera_grid, T.grid)
         pilot = shrink(problem, multiwavelets(problem.grids), None, note)[0]
-        estimate, error = refine(problem, pilot, pilot, lambda done: note(SHIFTS + done))
+        if problem.symmetric:
+            pilot = shrink(problem, [own_basis(pilot, T.grid)], pilot)[0]
+        estimate, error = refine(problem, pilot, lambda share: note(1.0 + share))
         white = (error / problem.gauge).sum(axis=1, dtype=float)
         estimate = problem.restore(estimate, Y)
         left[c] = white @ white / (model.variance(estimate, c).sum() or 1.0)
@@ -147,7 +153,7 @@ class Problem:
             np.fill_diagonal(X, 0.0)
         rows, columns = _blocks(camera_grid), _blocks(grid)
         sizes = np.outer(rows.sum(axis=0), columns.sum(axis=0))
-        light = rows @ (_sums(X, rows, columns) / sizes) @ columns.T  # of a block: hardly any noise
+        light = rows @ (rows.T @ X @ columns / sizes) @ columns.T  # of a block: hardly any noise
         V = noise.variance(light, channel).astype(np.float32)
         largest = float(np.abs(X).max(initial=0.0))
         if not square or largest == 0.0:
@@ -157,13 +163,13 @@ class Problem:
         gauge = r / r[:, None]
         Z, W = X * gauge, np.maximum(V * gauge**2, np.finfo(np.float32).tiny)
         between = np.triu_indices(rows.shape[1], 1)
-        excess = _sums(Z - Z.T, rows, rows)[between] ** 2 / _sums(W + W.T, rows, rows)[between]
+        excess = (rows.T @ (Z - Z.T) @ rows)[between] ** 2 / (rows.T @ (W + W.T) @ rows)[between]
         if len(excess) and excess.mean() > _EXCESS:
             return cls(X, V, 1.0, False, grids, noise, channel)
         mean, half = (Z * W.T + Z.T * W) / (W + W.T), (Z - Z.T) / 2 if noise.neighbours[channel] else None
         return cls(mean, 1.0 / (1.0 / W + 1.0 / W.T), gauge, True, grids, noise, channel, half)
 
-    def coefficients(self, Z: np.ndarray, basis: Any) -> tuple[np.ndarray, np.ndarray]:
+    def coefficients(self, Z: np.ndarray, basis: Any) -> Pair:
         """Of Z in a basis, and their variance: less where errors of neighbouring columns cancel."""
         C, V = _transform(Z, basis), _transform(self.variance, [A * A for A in basis])
         share = self.noise.relative_variance(basis[2:], self.channel)
@@ -183,7 +189,7 @@ class Problem:
         rows, columns = map(_blocks, self.grids)
         bright = np.maximum(Z, 0.0)
         dim = np.minimum(bright, 3.0 * np.sqrt(self.variance))  # what may well be 0
-        surplus, room = _sums(bright - Z, rows, columns), _sums(dim, rows, columns)
+        surplus, room = (rows.T @ A @ columns for A in (bright - Z, dim))
         share = np.minimum(surplus / np.maximum(room, np.finfo(np.float32).tiny), 1.0)
         T = (bright - dim * (rows @ share @ columns.T)) / self.gauge
         if self.grids[0] == self.grids[1]:
@@ -191,12 +197,7 @@ class Problem:
         return T
 
 
-def shrink(
-    problem: Problem,
-    bases: Bases,
-    pilot: np.ndarray | None,
-    step: Callable[[int], object] = lambda done: None,
-) -> tuple[np.ndarray, np.ndarray]:
+def shrink(problem: Problem, bases: Bases, pilot: np.ndarray | None, step: Step = lambda share: None) -> Pair:
     """Z of less noise, (M, N), by thresholds without a `pilot`, and simulated noise after the last basis."""
     Z, noise = problem.Z, np.random.default_rng(0).standard_normal(problem.Z.shape, np.float32)
     if problem.symmetric:
@@ -215,16 +216,14 @@ def shrink(
             if done == len(bases):
                 noise = _transform(noise * np.sqrt(factor * V), [A.T for A in basis])
         result += _transform(C, [A.T for A in basis])
-        step(done)
+        step(done / len(bases))
     return result / len(bases), noise
 
 
-def refine(
-    problem: Problem, pilot: np.ndarray, light: np.ndarray, step: Callable[[int], object] = lambda done: None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Z and noise by Wiener factors of a `pilot` and products between walls, whose folds `light` shows."""
-    ends = [_folds(light, problem.grids[0]), _folds(light.T, problem.grids[1])]
-    pair = shrink(problem, multiwavelets(problem.grids, ends, moments=2), pilot, step)
+def refine(problem: Problem, pilot: np.ndarray, step: Step = lambda share: None) -> Pair:
+    """Z and noise by Wiener factors of a `pilot` and products between walls, whose folds it shows."""
+    ends = [_folds(pilot, problem.grids[0]), _folds(pilot.T, problem.grids[1])]
+    pair = shrink(problem, multiwavelets(problem.grids, ends, SHIFTS[problem.symmetric]), pilot, step)
     if problem.noise.neighbours[problem.channel]:  # sums are known better than few products keep them
         return pair
     walls, shape = [list(product(*map(pairwise, p))) for p in ends], sum(problem.grids, ())
@@ -241,7 +240,7 @@ def refine(
     return after[0].reshape(problem.Z.shape), after[1].reshape(problem.Z.shape)
 
 
-def _few_products(lowest: float, X: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _few_products(lowest: float, X: np.ndarray, noise: np.ndarray) -> Pair:
     """X and its noise, (h, w, h', w'), by products in the best order, or as they are."""
     least, best = 1.0, (X, noise)
     for order in _ORDERS:
@@ -297,19 +296,29 @@ def _smooth(log_d: np.ndarray, X: np.ndarray, V: np.ndarray, grid: Grid) -> np.n
     most = np.full(len(d), _SCALE**2)
     error = np.minimum(np.divide(squares, degree**2, out=most.copy(), where=degree > 0.0), most)
     smooth = np.zeros(len(d))
-    for basis in multiwavelets((grid, grid)):
+    for basis in multiwavelets((grid, grid), count=SHIFTS[1]):
         c, v = _transform(log_d, basis[:2]), _transform(error, [A * A for A in basis[:2]])
-        smooth += _transform(c * (c * c > THRESHOLD**2 * v), [A.T for A in basis[:2]]) / SHIFTS
+        smooth += _transform(c * (c * c > THRESHOLD**2 * v), [A.T for A in basis[:2]]) / SHIFTS[1]
     return smooth
 
 
-def multiwavelets(grids: tuple[Grid, Grid], ends: list[Ends] | None = None, moments: int = 1) -> Bases:
+def own_basis(light: np.ndarray, grid: Grid) -> tuple[np.ndarray, ...]:
+    """Singular vectors of `light`, (N, N), along rows and columns of a picture, each wall by itself."""
+    light, axes = np.maximum(light, 0.0), []
+    for axis, ends in enumerate(_folds(light, grid)):
+        A = np.moveaxis(light.reshape(*grid, -1), axis, 0).reshape(grid[axis], -1)
+        axes.append(block_diag(*(np.linalg.eigh(A[a:b] @ A[a:b].T)[1].T for a, b in pairwise(ends))))
+    return (*axes, *axes)
+
+
+def multiwavelets(grids: tuple[Grid, Grid], ends: list[Ends] | None = None, count: int = SHIFTS[0]) -> Bases:
     """Bases of rows and columns of pictures, camera and projector, at random shifts, each wall by itself."""
-    random, bases = np.random.default_rng(0), []
+    random, bases, least = np.random.default_rng(0), [], 1 if ends is None else 2
     pictures = ends or [[[0, size] for size in grid] for grid in grids]
-    for number in range(SHIFTS):
+    for number in range(count):
+        order = least + number % (count // 2)  # vanishing moments
         axes = [
-            block_diag(*(_multiwavelet(b - a, moments + number % 2, random.random()) for a, b in pairwise(e)))
+            block_diag(*(_multiwavelet(b - a, order, random.random()) for a, b in pairwise(e)))
             for e in (*pictures[0], *pictures[1])
         ]
         bases.append((*axes[:2], *axes[:2]) if pictures[0] == pictures[1] else tuple(axes))
@@ -351,8 +360,3 @@ def _blocks(grid: Grid) -> np.ndarray:
     rows, columns = (np.arange(size) // _BLOCK for size in grid)
     number = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
     return (number[:, None] == np.arange(number[-1] + 1)).astype(np.float32)
-
-
-def _sums(Z: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Between blocks."""
-    return rows.T @ Z @ columns
