@@ -142,21 +142,21 @@ def negative_bounce(S: IdentityPlus, grid: tuple[int, int]) -> float:
     return float(np.nansum(np.maximum(-between, 0.0)) / light) if light > 0.0 else 0.0
 
 
-def between_parts(inverse: Callable[..., Any], grid: tuple[int, int], side: int) -> np.ndarray:
-    """Mean light that parts of a picture, `side` x `side`, get from each other in one bounce; NaN within."""
+def between_parts(inverse: Callable[..., Any], grid: tuple[int, int], side: int, step: int = 1) -> np.ndarray:
+    """Mean light that parts of a picture, `side` squared, get from each `step`-th in a bounce, NaN within."""
     rows, columns = (np.arange(size) * min(side, size) // size for size in grid)
     number = (rows[:, None] * (columns[-1] + 1) + columns).ravel()
     parts = (number[:, None] == np.arange(number[-1] + 1)).astype(np.float64)  # (N, parts), indicators e
-    count = parts.sum(axis=0)
-    between = parts.T @ (parts - inverse(parts)) / (count[:, None] * count)  # e A e
-    np.fill_diagonal(between, np.nan)
+    count, some = parts.sum(axis=0), parts[:, ::step]
+    between = parts.T @ (some - inverse(some)) / (count[:, None] * count[::step])  # e A e
+    np.fill_diagonal(between[::step], np.nan)
     return between
 
 
-def ambient(inverse: Callable[..., Any], grid: tuple[int, int]) -> float:
+def ambient(inverse: Callable[..., Any], grid: tuple[int, int], step: int = 1) -> float:
     """Least light of `between_parts` over its mean: no flat wall lights itself, but ambient light does."""
-    between = between_parts(inverse, grid, 2 * _PARTS)
-    least = max(float(np.median(np.nanmin(between, axis=1))), 0.0)
+    between = between_parts(inverse, grid, 2 * _PARTS, step)
+    least = max(float(np.median(np.nanmin(between, axis=int(step == 1)))), 0.0)
     return least / max(float(np.nanmean(np.abs(between))), 1e-300)
 
 

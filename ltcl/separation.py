@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import checks, layout
-from ltcl.errors import InputError, InputTypeError
-from ltcl.solvers import Inverse, Solution, solve_each
+from ltcl import checks, diagnostics, layout
+from ltcl.errors import ConvergenceError, InputError, InputTypeError
+from ltcl.first_bounce import ENTRIES
+from ltcl.solvers import Inverse, Solution, solve, solve_each
 from ltcl.solvers.solve import METHODS, SAMPLED
 from ltcl.transport import Transport, default_rtol, error_note, require, require_inverse, resolve_reference
 from ltcl.uncertainty import SeparationStd, of_separation
@@ -32,6 +33,7 @@ logger = logging.getLogger(__name__)
 # Of a scene taken for Lambertian: noise of path tracing alone gives a defect of 0.05 and takes 0.0004.
 LARGEST_DEFECT = 0.1
 LARGEST_NEGATIVE = 0.005
+LARGEST_AMBIENT = 0.05  # as of the verdict; 0 of clean scenes, mostly above with 1 % of ambient light
 RTOL = 1e-3
 _SIGMAS = 5.0  # of direct light beyond what it can be: no noise
 _UNKNOWN = 0.5  # of the image: direct light that is uncertain by more is no result
@@ -56,8 +58,8 @@ class Separation:
         Of T, see `ltcl.diagnostics`: both 0 of a Lambertian scene measured without noise; NaN where unknown.
         The relative error of the first bounce of a glossy scene is a few times the latter, of others more.
     warning : str
-        Why the bounces are only approximate, also logged; empty where the defect is at most 0.1 and the
-        negative light at most 0.005, or unknown; of a compressed T both may be more by its error.
+        Why the bounces are only approximate, also logged; empty where the defect is at most 0.1, the negative
+        light at most 0.005, of a compressed T more by its error, and T shows no ambient light; or unknown.
     transport_error : float
         ``.error`` of T, or of `exact` where that was given, beyond the tolerance of each solve.
     """
@@ -176,6 +178,9 @@ def separate(
             _refuse_impossible(true, columns, b_k, max(options["rtol"], *(s.residual for s in solutions[0])))
         pictures.append(picture(b_k))
     warning = _warning(true.reciprocity_defect, max(true.negative_bounces), true.error)
+    if (ambient := _ambient(true)) > LARGEST_AMBIENT:
+        text = f"{ambient:.0%} of a bounce looks like ambient light left in T, and bounces are too bright"
+        warning = f"{text}: subtract black from each picture of T; {warning}".removesuffix("; ")
     if warning:
         logger.warning(warning)
     return Separation(
@@ -223,6 +228,16 @@ def _refuse_impossible(T: Transport, image: list[np.ndarray], direct: list[np.nd
             "it must be from 0 to 100 %: T or its first bounce is wrong or noisy, most of all at the pixels "
             f"(row, column): {where}; mask dark ones by dark=, or measure T again"
         )
+
+
+def _ambient(T: Transport) -> float:
+    """`diagnostics.ambient` of the worst channel, by 10 parts; 0 where T shows no entries, or few."""
+    if "_ambient" not in (facts := vars(T)):  # as a cached property
+        shown = len(T.masked) >= 64 and all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
+        solves = [lambda e, S=S: solve(S.as_it_stands(), e, rtol=1e-2).x for S in T.systems if shown]
+        with suppress(ConvergenceError):
+            facts["_ambient"] = max((diagnostics.ambient(x, T.grid, 7) for x in solves), default=0.0)
+    return facts.setdefault("_ambient", 0.0)
 
 
 def _warning(defect: float, negative: float, error: float) -> str:

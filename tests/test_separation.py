@@ -134,3 +134,24 @@ def test_a_view_dependent_scene_carries_a_warning(device, caplog, glossy):
         assert b.reciprocity_defect < 1e-5
         assert b.negative_bounce < 1e-5
         assert b.warning == ""
+
+
+SMALL_SCENES = {name: getattr(ltcl.scenes, name)(8, albedo=0.7) for name in ("dihedral", "trihedral")}
+SMALL_SCENES |= {"room": ltcl.scenes.box(8, sides=5, albedo=0.8), "closed": ltcl.scenes.box(6, albedo=0.9)}
+
+
+@pytest.mark.parametrize("name", SMALL_SCENES)
+@pytest.mark.parametrize(
+    ("ambient", "noise"), [(0.01, 0.0), (0.01, 1e-3), (0.0, 0.0), (0.0, 1e-3), (0.0, 1e-2)]
+)
+def test_ambient_light_left_in_T_is_warned_of_and_no_clean_scene_is(device, caplog, name, ambient, noise):
+    T = SMALL_SCENES[name].transport().to_numpy()
+    error = np.random.default_rng(5).standard_normal(T.shape) * noise * np.median(T.diagonal())
+    measured = ltcl.Transport(
+        T + ambient * T.sum(axis=1).mean() + error, SMALL_SCENES[name].grid, device=device
+    )
+    for _ in range(2):
+        caplog.clear()
+        b = ltcl.separate(measured, measured @ np.ones(measured.grid), bounces=1)
+        assert ("ambient light" in caplog.text, "ambient light" in b.warning) == (ambient > 0,) * 2
+    assert sum(record.name == "ltcl.separation" for record in caplog.records) <= 1
