@@ -140,6 +140,10 @@ class Device:
         with kernels.translated(f"copying on {self.name}"):
             self.cl.enqueue_copy(self.queue, to, of, **sizes)
 
+    def agreed(self, value: Any) -> Any:
+        """A measured `value`; where processes solve in lock-step, that of the first."""
+        return value
+
     def finish(self) -> None:
         """Wait until everything queued has run."""
         with kernels.translated(f"waiting for {self.name}"):

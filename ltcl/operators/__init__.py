@@ -13,15 +13,26 @@ from ltcl.operators.bases import Basis, Pyramid, SubsetBasis, multiresolution_or
 from ltcl.operators.composed import Compressed, Coupled, Host, IdentityPlus, ScaledColumns
 from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
+from ltcl.operators.distributed import Distributed, rank_device
 from ltcl.operators.interreflection import interreflections
 from ltcl.operators.stored import basis
 from ltcl.operators.tiles import Tiles, smallest
 from ltcl.operators.wavelets import Wavelet
 
-__all__ = ["CSR", "Basis", "Compressed", "Coupled", "Dense", "Epilogue", "Host", "IdentityPlus", "Norms"]
-__all__ += ["Operator", "Pyramid", "RowBlocks", "ScaledColumns", "SubsetBasis", "Tiles", "Wavelet"]
+__all__ = [
+    "CSR",
+    "Basis",
+    "Compressed",
+    "Coupled",
+    "Dense",
+    "Distributed",
+    "Epilogue",
+    "Host",
+    "IdentityPlus",
+]
+__all__ += ["Norms", "Operator", "Pyramid", "RowBlocks", "ScaledColumns", "SubsetBasis", "Tiles", "Wavelet"]
 __all__ += ["as_operator", "basis", "interreflections", "multiresolution_order", "restrict_to_support"]
-__all__ += ["smallest"]
+__all__ += ["rank_device", "smallest"]
 
 
 def as_operator(matrix: Any, device: Device | None = None) -> Operator:

@@ -86,6 +86,11 @@ class RowOperator(Operator):
 
     def norms(self) -> Norms:
         """Norms of what it stands for, in float64."""
+        columns, inf, squares, lowest = self.sums()
+        return Norms(float(columns.max(initial=0.0)), inf, squares**0.5, lowest)
+
+    def sums(self) -> tuple[np.ndarray, float, float, float]:
+        """Of |A_ij| in each column, (N,), and the largest of a row; of squares; and the lowest entry or 0."""
         columns, inf, squares, lowest = np.zeros(self.shape[1]), 0.0, 0.0, 0.0
         for _, rows in self.blocks():
             values = rows.data if scipy.sparse.issparse(rows) else rows
@@ -94,7 +99,7 @@ class RowOperator(Operator):
             sizes = abs(rows)
             columns += sizes.sum(axis=0)
             inf = max(inf, float(sizes.sum(axis=1).max(initial=0.0)))
-        return Norms(float(columns.max(initial=0.0)), inf, squares**0.5, lowest)
+        return columns, inf, squares, lowest
 
     def _dense(self) -> np.ndarray:
         dense = np.empty(self.shape)

@@ -174,6 +174,7 @@ def plan(S: Operator, rtol: float, columns: int, refines: bool = False) -> Itera
         candidates.append(_candidate(S, columns, Direct()))
     bandwidth, flops = _bandwidth(S.device), _flops()
     candidates.sort(key=lambda candidate: candidate.seconds(bandwidth, flops))
+    candidates = S.device.agreed(candidates)
     first, ranking = candidates[0].method, f"fastest first: {', '.join(map(str, candidates))}"
     reasons = f"{ranking}; {surveyed}{' made before' if made_before else ''}"
     yield first, reasons, 0 if made_before else len(surveyed.residuals) - 1
