@@ -71,7 +71,7 @@ def model(sizes: Any, found: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
-    """Median seconds of solves and products; a quarter of a matrix on each of two ranks stands for 4 ranks."""
+    """Median seconds of solves and products; a quarter of a matrix on two ranks stands for four."""
     device, half = ltcl.open_device(), n // 2
     b, operators = np.random.default_rng(1).random(n, np.float32), {}
     if comm.rank == 0:

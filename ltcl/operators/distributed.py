@@ -25,12 +25,14 @@ import numpy as np
 import scipy.sparse
 
 from ltcl import errors
-from ltcl.device import Array, Device, list_devices, open_device, vectors
+from ltcl.device import Array, Device, list_devices, open_device
 from ltcl.device.discovery import choose
 from ltcl.errors import DeviceError, InputError, LtclError
-from ltcl.operators.base import PLAIN, Epilogue, Norms, Operator
+from ltcl.operators.base import PLAIN, Norms, Operator
 from ltcl.operators.csr import CSR
 from ltcl.operators.dense import Dense
+from ltcl.operators.parts import Parts
+from ltcl.operators.rows import RowOperator
 
 _opened: weakref.WeakValueDictionary[tuple[int, Device], RankDevice] = weakref.WeakValueDictionary()
 
@@ -40,7 +42,12 @@ class RankDevice(Device):
 
     def __init__(self, comm: Any, own: Device) -> None:
         vars(self).update(vars(own))  # one queue, memory pool and set of kernels
-        self.comm = comm
+        self.comm, self.others = comm, (own,) * (comm.size - 1)  # which are alike
+
+    def over_ranks(self, rows: int, make: Callable[[Device, slice], RowOperator]) -> Operator:
+        """What `make` puts on the device of each rank: as many rows as on others."""
+        start, stop = (rows * end // self.comm.size for end in (self.comm.rank, self.comm.rank + 1))
+        return Distributed(self.comm, together(self.comm, lambda: make(self, slice(start, stop))))
 
     def agreed(self, value: Any) -> Any:
         """What rank 0 has measured."""
@@ -97,7 +104,7 @@ def together(comm: Any, make: Callable[[], Any]) -> Any:
     return result
 
 
-class Distributed(Operator):
+class Distributed(Parts):
     """A matrix (M, N) on the devices of all ranks: the first rows on that of rank 0, and so on.
 
     Parameters
@@ -120,6 +127,9 @@ class Distributed(Operator):
     >>> (Distributed(comm, np.array_split(A, comm.size)[comm.rank]) @ np.ones(2)).tolist()
     [3.0, 3.0]
     """
+
+    where = "on several ranks"
+    exact: Any = None
 
     def __init__(self, comm: Any, rows: Any, device: Device | str | None = None) -> None:
         shapes = comm.allgather(np.shape(rows))
@@ -154,13 +164,6 @@ class Distributed(Operator):
         else:
             self.comm.Allgatherv(product.get(), [whole, [count * x.columns for count in self.counts]])
         return whole
-
-    def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        a, b, y, c = epilogue.without_shift(x)
-        product = out.like().set(self._gathered(x, transpose))
-        vectors.axpby(a, product, b, product if y is None or not b else y, out)
-        if c:
-            vectors.axpy(c, x, out)
 
 
 def _operator(device: Device, rows: Any) -> Any:

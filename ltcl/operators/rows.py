@@ -52,29 +52,11 @@ class Variant:
         return (rows * group if self.shared else rows), group, kernel.device.local(width * group)
 
 
-class RowOperator(Operator):
-    """An operator stored as slabs of rows. Subclasses set `file`, `defines`, `slabs`, and give `blocks`."""
+class ReadableRows(Operator):
+    """An operator whose entries the host can read. Subclasses give `blocks`."""
 
-    file: str  # stem of the kernel file
-    defines: dict[str, Any]
-    unit = 1.0  # of the numbers in the slabs
-    slabs: list[Slab]
     # (first row, rows on the host): float64 arrays or csr_arrays (rows, N) of what it stands for.
     blocks: Callable[[], Iterator[tuple[int, Any]]]
-    _transposed_rows: Callable[[], RowOperator]
-
-    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
-        super().__init__(device, shape)
-        self.defines = {}
-        self._fastest: dict[tuple[int, int], Variant] = {}
-        self._transposed: RowOperator | None = None
-        self.relaxations: dict[tuple[Any, ...], Any] = {}  # of relaxation.py: lives as long
-        self.tables: dict[str, Any] = {}  # of walks.py
-
-    def arrays(self) -> set[Array]:
-        """Of all slabs, and of the transpose once it was asked for."""
-        arrays = {x for slab in self.slabs for x in slab.arguments if isinstance(x, Array)}
-        return arrays if self._transposed is None else arrays | self._transposed.arrays()
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64."""
@@ -107,6 +89,29 @@ class RowOperator(Operator):
             here = rows.toarray() if scipy.sparse.issparse(rows) else rows
             dense[first : first + len(here)] = here
         return dense
+
+
+class RowOperator(ReadableRows):
+    """An operator stored as slabs of rows. Subclasses set `file`, `defines`, `slabs`, and give `blocks`."""
+
+    file: str  # stem of the kernel file
+    defines: dict[str, Any]
+    unit = 1.0  # of the numbers in the slabs
+    slabs: list[Slab]
+    _transposed_rows: Callable[[], RowOperator]
+
+    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
+        super().__init__(device, shape)
+        self.defines = {}
+        self._fastest: dict[tuple[int, int], Variant] = {}
+        self._transposed: RowOperator | None = None
+        self.relaxations: dict[tuple[Any, ...], Any] = {}  # of relaxation.py: lives as long
+        self.tables: dict[str, Any] = {}  # of walks.py
+
+    def arrays(self) -> set[Array]:
+        """Of all slabs, and of the transpose once it was asked for."""
+        arrays = {x for slab in self.slabs for x in slab.arguments if isinstance(x, Array)}
+        return arrays if self._transposed is None else arrays | self._transposed.arrays()
 
     def transposed_copy(self) -> RowOperator:
         """A^T in rows of its own, made at the first call and kept."""

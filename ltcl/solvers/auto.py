@@ -206,7 +206,7 @@ def _candidate(S: Operator, columns: int, method: Any, products: float = 0) -> _
         return _Candidate(method, 0, nbytes, 0.0, factorize + 4.0 * n * n * columns)
     moved, launches, waits = _STEPS[method.name]
     passes = math.ceil(columns / _AT_ONCE)
-    nbytes = S.nbytes * passes + 4.0 * n * columns * moved
+    nbytes = S.nbytes * passes + S.bytes_read() + 4.0 * n * columns * moved
     launch, wait = _overheads(S.device)
     overhead = passes * launches * launch + waits * wait
     return _Candidate(method, products, products * nbytes, products * overhead)

@@ -20,6 +20,7 @@ import scipy.sparse.linalg
 
 from ltcl import checks, layout
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError, MemoryLimitError
+from ltcl.files import read_ahead
 from ltcl.noise import Noise
 
 EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
@@ -90,8 +91,9 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
 
     def row_blocks(self) -> Iterator[tuple[int, scipy.sparse.csr_array]]:
         """Each block with its first row."""
-        for block in range(self._layout.blocks()):
-            yield self._layout.span(block)[0], self._read(block)
+        blocks = range(self._layout.blocks())
+        for block, rows in zip(blocks, read_ahead(self._read, blocks), strict=True):
+            yield self._layout.span(block)[0], rows
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1, (stop - start, N)."""

@@ -108,7 +108,7 @@ def refusals() -> None:
         rank_device(comm, "absent" if other else None)
     with pytest.raises(DeviceError, match=r"^device is 'absent'"):
         rank_device(comm, "absent")
-    device = rank_device(comm)
+    device = rank_device(comm, ltcl.device.Device(ltcl.open_device().description))  # of its own
     device.memory = 1 if other else device.memory
     with pytest.raises(MemoryLimitError, match=r"rank 1: a dense matrix .* needs 24 B"):
         Distributed(comm, np.ones((2, 3)), device)
