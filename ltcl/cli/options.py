@@ -24,6 +24,7 @@ from ltcl.cli.command import Context, note, table
 from ltcl.device import open_device
 from ltcl.errors import FileError, InputError
 from ltcl.first_bounce import DARK
+from ltcl.operators import rank_device
 from ltcl.solvers.solve import METHODS, SAMPLED
 from ltcl.transport import Transport, default_rtol, resolve_reference
 from ltcl.verdict import Verdict
@@ -153,7 +154,12 @@ TASK = (*TRANSPORT, solve_options, picture_options)
 
 def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
     """Open the device, then load: a mistyped device does not wait for a large file."""
-    device = open_device(context.options["device"])
+    device: Any = context.options["device"]
+    if context.options.get("mpi"):
+        from mpi4py import MPI
+
+        device = rank_device(MPI.COMM_WORLD, device)
+    device = open_device(device)
     context.progress(f"reading {path}")
     names = ("variable", "grid", "camera_grid", "first_bounce", "on_dark", "dark")
     settings = {name: context.options[name] for name in names if context.options.get(name) is not None}

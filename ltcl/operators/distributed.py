@@ -136,7 +136,9 @@ class Distributed(Parts):
         if any(len(shape) != 2 or 0 in shape or shape[1] != shapes[0][1] for shape in shapes):
             raise InputError(f"rows have the shapes {shapes}, by rank; they must be (m, N), with m above 0")
         device = rank_device(comm, rows.device if isinstance(rows, Operator) else device)
-        self.comm, self.rows = comm, together(comm, lambda: _operator(device, rows))
+        kind = CSR if scipy.sparse.issparse(rows) else Dense
+        make = lambda: rows if isinstance(rows, Operator) else kind(device, rows)  # noqa: E731
+        self.comm, self.rows = comm, together(comm, make)
         self.counts = [count for count, _ in shapes]
         self.first = sum(self.counts[: comm.rank])
         super().__init__(device, (sum(self.counts), shapes[0][1]), self.rows)
@@ -164,9 +166,3 @@ class Distributed(Parts):
         else:
             self.comm.Allgatherv(product.get(), [whole, [count * x.columns for count in self.counts]])
         return whole
-
-
-def _operator(device: Device, rows: Any) -> Any:
-    if isinstance(rows, Operator):
-        return rows
-    return CSR(device, rows) if scipy.sparse.issparse(rows) else Dense(device, rows)
