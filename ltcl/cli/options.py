@@ -80,7 +80,7 @@ def out(help: str, callback: Any = writable_file, metavar: str = "FILE") -> Any:
 
 
 FORMATS = "Light transport: .npz, .npy, .mtx, .mat or .zarr; with the extra hdf5 also .h5, and .mat of v7.3."
-_DEVICE = "gpu, cpu, an index of 'ltcl devices', or part of a name. Default: LTCL_DEVICE, else the best."
+_DEVICE = "gpu, cpu, an index of 'ltcl devices', part of a name, or all. Default: LTCL_DEVICE, else the best."
 _GRID, _CAMERA = "Projector pixels, if the file lacks them.", "Camera pixels, if other ones."
 _METHOD = f"One of {', '.join(METHODS)}."
 _INVERSE = "From 'ltcl invert': each picture takes one product and no solve."

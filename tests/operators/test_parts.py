@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -281,6 +282,17 @@ def test_the_command_line_takes_all_devices(two, tmp_path, capsys):
     np.testing.assert_allclose(patterns[1], patterns[0], rtol=1e-5)
 
 
+def test_the_page_on_scale_runs(two, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).resolve().parents[2] / "docs" / "scale.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(code, names)  # noqa: S102
+    assert isinstance(names["T"].systems[0].R, MultiDevice)
+    assert names["patterns"].shape == (8, 24, 48)
+    assert abs(names["separated"].direct - 0.5 * names["T"].first_bounce.reshape(24, 48)).max() < 1e-3
+
+
 CAPPED = """
 import resource, sys
 import numpy as np
@@ -290,6 +302,7 @@ folder, side = sys.argv[1], int(sys.argv[2])
 small = ltcl.Transport(np.eye(16) + 0.01, (4, 4))
 ltcl.separate(small, ltcl.compensate(small, np.full((4, 4), 0.5)).appearance)  # kernels, libraries
 picture, rough = np.load(folder + "/picture.npy"), ltcl.load(folder + "/rough.npz")
+rough.systems
 with open("/proc/self/statm") as file:
     used = int(file.read().split()[5]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_DATA, (used + (192 << 20),) * 2)
