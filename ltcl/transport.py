@@ -39,8 +39,8 @@ class Transport:
     matrix : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3 for RGB, or 3 x 3 of them
         T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j, row-major.
         matrix[c][d] is what camera channel c sees of projector channel d; such a T has no S, it relights and
-        compensates. Arrays are kept, not copied: they must not be changed afterwards. A numpy.memmap or rows of
-        a store that do not fit the device or the host stay on the disk and are read at each product.
+        compensates. Arrays are kept, not copied: they must not be changed afterwards. A numpy.memmap, or rows
+        of a store, that do not fit the device or the host stay on the disk and are read at each product.
     grid : (h, w)
         Of the projector; N = h * w. A warning is logged where rows of T are much smoother on another grid.
     first_bounce : "diagonal", "exact", "estimate" or array (N,) or (3, N)

@@ -298,9 +298,16 @@ import resource, sys
 import numpy as np
 import ltcl
 
+def solve(T, rough, picture):
+    return {
+        "pattern": ltcl.compensate(T, picture).pattern,
+        "bounces": ltcl.separate(T, picture[0], 2).bounces,
+        "corrected": ltcl.compensate(rough, picture, exact=T, rtol=1e-4).pattern,
+    }
+
 folder, side = sys.argv[1], int(sys.argv[2])
-small = ltcl.Transport(np.eye(16) + 0.01, (4, 4))
-ltcl.separate(small, ltcl.compensate(small, np.full((4, 4), 0.5)).appearance)  # kernels, libraries
+small = ltcl.Transport(np.load(folder + "/small.npy"), (24, 24))
+solve(small, small, np.full((3, 24, 24), 0.5, np.float32))  # compiling takes more than solving
 picture, rough = np.load(folder + "/picture.npy"), ltcl.load(folder + "/rough.npz")
 rough.systems
 with open("/proc/self/statm") as file:
@@ -311,13 +318,7 @@ try:
     raise SystemExit("there is room for T")
 except MemoryError:
     pass
-T = ltcl.load(folder + "/T.npy", grid=(side, side))
-results = {
-    "pattern": ltcl.compensate(T, picture).pattern,
-    "bounces": ltcl.separate(T, picture[0], 2).bounces,
-    "corrected": ltcl.compensate(rough, picture, exact=T, rtol=1e-4).pattern,
-}
-np.savez(folder + "/results.npz", **results)
+np.savez(folder + "/results.npz", **solve(ltcl.load(folder + "/T.npy", grid=(side, side)), rough, picture))
 """
 
 
@@ -326,6 +327,7 @@ def test_a_file_beyond_the_memory_of_the_process(tmp_path):
     side = 90  # T has 262 MB, the process 201 MB for it
     matrix = light(side * side)
     np.save(tmp_path / "T.npy", matrix)
+    np.save(tmp_path / "small.npy", light(24 * 24))
     T = ltcl.Transport(matrix, (side, side))
     near = scipy.sparse.csr_array(np.where(matrix > 0.9 / side**2, matrix, 0.0))
     rough = ltcl.Transport(near, (side, side), T.first_bounce)
@@ -343,4 +345,4 @@ def test_a_file_beyond_the_memory_of_the_process(tmp_path):
     }
     with np.load(tmp_path / "results.npz") as results:
         for name, values in expected.items():
-            np.testing.assert_allclose(results[name], values, rtol=0, atol=1e-6, err_msg=name)
+            assert np.linalg.norm(results[name] - values) <= 1e-6 * np.linalg.norm(values), name
