@@ -90,7 +90,7 @@ def out(help: str, callback: Any = writable_file, metavar: str = "FILE") -> Any:
 
 
 FORMATS = "Light transport: .npz, .npy, .mtx, .mat or .zarr; with the extra hdf5 also .h5, and .mat of v7.3."
-_DEVICE = "gpu, cpu, an index of 'ltcl devices', or part of a name. Default: LTCL_DEVICE, else the best."
+_DEVICE = "gpu, cpu, an index of 'ltcl devices', part of a name, or all. Default: LTCL_DEVICE, else the best."
 _SEED = "Of monte_carlo and hybrid: the same numbers."
 _ENCODING = "Of pictures; auto: integers sRGB, floats linear."
 _RTOL = "Relative residual that ends a solve. Default: 0.01 (separate: 0.001), or the error of T where more."

@@ -30,7 +30,7 @@ from ltcl.operators.dense import Dense
 from ltcl.operators.rows import ReadableRows, RowOperator, Slab, cut
 
 logger = logging.getLogger(__name__)
-_READ = 1 << 23  # bytes of rows in one reading: long for a disk, few for a host
+_READ = 1 << 22  # bytes of rows in one reading: what caches hold, while a disk is busy for long
 _TRIAL = 4096  # rows and columns of the product by which devices are compared: beyond the caches
 
 

@@ -93,7 +93,7 @@ def dense(S: Operator) -> tuple[np.ndarray, bool]:
     if (numbers := _numbers(S, read=True)) is None:
         return S.to_dense(), False
     A, d, e = numbers
-    A = A.to_dense() if isinstance(A, Streamed) else A
+    A: Any = A.to_dense() if isinstance(A, Streamed) else A
     A = A.product(np.eye(n)) if isinstance(A, Host) else A.toarray() if scipy.sparse.issparse(A) else A
     matrix = np.multiply(A, d, dtype=np.float64)
     matrix[np.diag_indices(n)] += e
