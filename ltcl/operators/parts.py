@@ -206,8 +206,8 @@ def on_devices(device: Device, matrix: Any, pattern: Pattern | None = None) -> O
 
 def over_devices(device: Device, rows: int, make: Callable[[Device, slice], RowOperator]) -> Operator:
     """What `make` puts on a device: all rows, or a share where there are other devices or ranks of MPI."""
-    if hasattr(device, "over_ranks"):
-        return device.over_ranks(rows, make)
+    if (over_ranks := getattr(device, "over_ranks", None)) is not None:
+        return over_ranks(rows, make)
     parts = [make(each, own) for each, own in shares(device, rows)]
     return parts[0] if len(parts) == 1 else MultiDevice(device, parts)
 
