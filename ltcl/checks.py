@@ -184,11 +184,12 @@ def host_memory() -> int:
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource  # not on Windows
 
-        limit, _ = resource.getrlimit(resource.RLIMIT_AS)  # of addresses, not of pages in use
-        if limit != resource.RLIM_INFINITY:
-            with open("/proc/self/statm", encoding="ascii") as file:
-                used = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-            available = min(available, max(limit - used, 0))
+        for kind, column in ((resource.RLIMIT_AS, 0), (resource.RLIMIT_DATA, 5)):  # addresses; without files
+            limit, _ = resource.getrlimit(kind)
+            if limit != resource.RLIM_INFINITY:
+                with open("/proc/self/statm", encoding="ascii") as file:
+                    used = int(file.read().split()[column]) * os.sysconf("SC_PAGE_SIZE")
+                available = min(available, max(limit - used, 0))
     return available
 
 

@@ -16,7 +16,9 @@ import secrets
 import shutil
 import stat
 import zlib
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -210,3 +212,15 @@ def _flush(path: Path) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def read_ahead(read: Callable[[Any], Any], keys: Iterable[Any], ahead: int = 2) -> Iterator[Any]:
+    """`read` of each key, in order, by threads that are so many keys ahead of the caller."""
+    with ThreadPoolExecutor(ahead) as threads:
+        waiting: deque[Future[Any]] = deque()
+        for key in keys:
+            waiting.append(threads.submit(read, key))
+            if len(waiting) > ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()

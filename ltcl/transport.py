@@ -39,7 +39,8 @@ class Transport:
     matrix : (M, N) array, scipy.sparse matrix, LinearOperator, a sequence of 3 for RGB, or 3 x 3 of them
         T[i, j] is the radiance at camera pixel i for unit linear light from projector pixel j, row-major.
         matrix[c][d] is what camera channel c sees of projector channel d; such a T has no S, it relights and
-        compensates. Arrays are kept, not copied: they must not be changed afterwards.
+        compensates. Arrays are kept, not copied: they must not be changed afterwards. A numpy.memmap, or rows
+        of a store, that do not fit the device or the host stay on the disk and are read at each product.
     grid : (h, w)
         Of the projector; N = h * w. A warning is logged where rows of T are much smoother on another grid.
     first_bounce : "diagonal", "exact", "estimate" or array (N,) or (3, N)
@@ -48,7 +49,7 @@ class Transport:
     camera_grid : (h, w), optional
         Of the camera where T is rectangular, M = h * w; S then does not exist: T relights and compensates.
     device : Device or str, optional
-        As `open_device` takes it; opened at the first product. Operators have one already.
+        As `open_device` takes it, "all" for rows on several; opened at the first product. Operators have one.
     on_dark : "mask" or "raise"
         Pixels whose first bounce is 0 or within 5 standard deviations of its noise, estimated if need be:
         leave them dark in compensations and warn of it, or refuse them. Relighting stays exact.

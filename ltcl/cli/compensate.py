@@ -67,6 +67,9 @@ def compensate(
     background: Annotated[Path | None, file(_BACKGROUND)] = None,
     calibration: Annotated[Path | None, file("The store of 'ltcl acquire' behind TRANSPORT.")] = None,
     weights: Annotated[Path | None, file("Picture of how much the error at each pixel counts.")] = None,
+    mpi: Annotated[
+        bool, option("Share each solve: 'mpiexec -n 2 ltcl compensate ... --mpi'.", "--mpi")
+    ] = False,
 ) -> Answer:
     """Find the projector patterns that make a scene look like PICTURE.
 
@@ -84,6 +87,10 @@ def compensate(
     from ltcl.acquisition import Setup
 
     film = _film(picture, context.options)
+    if mpi and film is not None:
+        raise InputError(
+            f"--mpi is given, but {film} holds frames; it is for pictures, whose solves it shares"
+        )
     measured = calibration or (transport if options.is_measured(transport) else None)
     setup = Setup.of(measured) if measured else None
     T = options.load(context, transport)

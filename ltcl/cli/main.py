@@ -11,13 +11,14 @@ from typing import Annotated
 import typer
 
 from ltcl import __version__
+from ltcl.cli import ranks
 from ltcl.cli.acquire import app as acquire
 from ltcl.cli.acquire import show, simulate
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
 from ltcl.cli.compensate import compensate, relight, separate
 from ltcl.cli.doctor import demo, devices, doctor
 from ltcl.cli.files import analyze, compress, convert, denoise, info, invert
-from ltcl.errors import LtclError
+from ltcl.errors import InputError, LtclError
 
 app = typer.Typer(
     name="ltcl",
@@ -47,6 +48,13 @@ def _options(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program with `arguments`, by default those of the command line; returns its exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        return ranks.on_every_rank(_run, words) if "--mpi" in words else _run(words)
+    except InputError as error:  # there is no MPI
+        return fail(error, "--json" in words)["exit_code"]
+
+
+def _run(words: list[str]) -> int:
     try:
         return app(args=words, prog_name="ltcl", standalone_mode=False) or 0
     except UsageError as error:

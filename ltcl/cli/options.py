@@ -24,6 +24,7 @@ from ltcl.cli.command import Context, note, table
 from ltcl.device import open_device
 from ltcl.errors import FileError, InputError
 from ltcl.first_bounce import DARK
+from ltcl.operators import rank_device
 from ltcl.solvers.solve import METHODS, SAMPLED
 from ltcl.transport import Transport, default_rtol, resolve_reference
 from ltcl.verdict import Verdict
@@ -89,7 +90,7 @@ def out(help: str, callback: Any = writable_file, metavar: str = "FILE") -> Any:
 
 
 FORMATS = "Light transport: .npz, .npy, .mtx, .mat or .zarr; with the extra hdf5 also .h5, and .mat of v7.3."
-_DEVICE = "gpu, cpu, an index of 'ltcl devices', or part of a name. Default: LTCL_DEVICE, else the best."
+_DEVICE = "gpu, cpu, an index of 'ltcl devices', part of a name, or all. Default: LTCL_DEVICE, else the best."
 _SEED = "Of monte_carlo and hybrid: the same numbers."
 _ENCODING = "Of pictures; auto: integers sRGB, floats linear."
 _RTOL = "Relative residual that ends a solve. Default: 0.01 (separate: 0.001), or the error of T where more."
@@ -153,7 +154,12 @@ TASK = (*TRANSPORT, solve_options, picture_options)
 
 def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
     """Open the device, then load: a mistyped device does not wait for a large file."""
-    device = open_device(context.options["device"])
+    device: Any = context.options["device"]
+    if context.options.get("mpi"):
+        from mpi4py import MPI
+
+        device = rank_device(MPI.COMM_WORLD, device)
+    device = open_device(device)
     context.progress(f"reading {path}")
     names = ("variable", "grid", "camera_grid", "first_bounce", "on_dark", "dark")
     settings = {name: context.options[name] for name in names if context.options.get(name) is not None}

@@ -40,6 +40,8 @@ class Device:
         How often OpenCL has been asked for memory; arrays from the pool do not count.
     launches : Counter
         How often each kernel has been queued.
+    others : tuple of Device
+        Of ``open_device("all")``, the other devices of its platform: rows of matrices are on all of them.
     """
 
     def __init__(self, description: Description) -> None:
@@ -58,6 +60,7 @@ class Device:
         self.local_memory: int = handle.local_mem_size
         self.max_allocation: int = handle.max_mem_alloc_size
         self.memory: int = checks.host_memory() if self.is_cpu else handle.global_mem_size
+        self.others: tuple[Device, ...] = ()
         self.allocations, self.launches = 0, Counter[str]()
         self._pool = MemoryPool(ImmediateAllocator(self.queue), leading_bits_in_bin_id=4)  # 1/16 too large
         self._largest_pooled = min(self.memory // _POOLED, self.max_allocation // 16)
@@ -139,6 +142,15 @@ class Device:
         """Copy between a host array and a buffer (which waits), or two buffers (which is queued)."""
         with kernels.translated(f"copying on {self.name}"):
             self.cl.enqueue_copy(self.queue, to, of, **sizes)
+
+    def agreed(self, value: Any) -> Any:
+        """A measured `value`; where processes solve in lock-step, that of the first."""
+        return value
+
+    def flush(self) -> None:
+        """Have the device begin with what is queued."""
+        with kernels.translated(f"starting {self.name}"):
+            self.queue.flush()
 
     def finish(self) -> None:
         """Wait until everything queued has run."""

@@ -13,7 +13,7 @@ import re
 import sys
 import threading
 import weakref
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ltcl.device import kernels
@@ -95,8 +95,10 @@ def open_device(select: str | Device | None = None) -> Device:
     Parameters
     ----------
     select : str or Device, optional
-        "gpu", "cpu" or "accelerator"; an index "platform:device" as `ltcl devices` prints it; or a part of
-        the name of device or driver. Without it, ``LTCL_DEVICE`` says so, else the best is taken.
+        "gpu", "cpu" or "accelerator"; an index "platform:device" as `ltcl devices` prints it; a part of the
+        name of device or driver; or "all": the best, with the others of its platform, over which the rows of
+        matrices that are not compressed are spread by measured speed. Without it, ``LTCL_DEVICE`` says so,
+        else the best is taken.
 
     Raises
     ------
@@ -113,9 +115,17 @@ def open_device(select: str | Device | None = None) -> Device:
         return select
     if not isinstance(select, str | None):
         raise InputTypeError(f"device is {select!r}; it must be a Device, a name or an index like '0:1'")
-    description = choose(list_devices(), select or os.environ.get("LTCL_DEVICE"))
+    devices, select = list_devices(), select or os.environ.get("LTCL_DEVICE")
+    if every := (select or "").strip().lower() == "all":
+        select = None
+    description, others = choose(devices, select), []
+    if every:
+        platform = description.index.partition(":")[0] + ":"
+        others = [open_device(d.index) for d in devices if d.index.startswith(platform) and d != description]
+        description = replace(description, index="all") if others else description
     with _opening:
         device = _opened.get(description.index) or Device(description)
+        device.others = tuple(others)
         return _opened.setdefault(description.index, device)
 
 

@@ -5,23 +5,33 @@ from __future__ import annotations
 
 from typing import Any
 
-import scipy.sparse
-
 from ltcl.device import Device, open_device
 from ltcl.operators.base import Epilogue, Norms, Operator
 from ltcl.operators.bases import Basis, Pyramid, SubsetBasis, multiresolution_order, restrict_to_support
 from ltcl.operators.composed import Compressed, Coupled, Host, IdentityPlus, ScaledColumns
 from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
+from ltcl.operators.distributed import Distributed, rank_device
 from ltcl.operators.interreflection import interreflections
+from ltcl.operators.parts import MultiDevice, Parts, Streamed, on_devices, stays_on_disk, stored_rows
 from ltcl.operators.stored import basis
 from ltcl.operators.tiles import Tiles, smallest
 from ltcl.operators.wavelets import Wavelet
 
-__all__ = ["CSR", "Basis", "Compressed", "Coupled", "Dense", "Epilogue", "Host", "IdentityPlus", "Norms"]
-__all__ += ["Operator", "Pyramid", "RowBlocks", "ScaledColumns", "SubsetBasis", "Tiles", "Wavelet"]
-__all__ += ["as_operator", "basis", "interreflections", "multiresolution_order", "restrict_to_support"]
-__all__ += ["smallest"]
+__all__ = [
+    "CSR",
+    "Basis",
+    "Compressed",
+    "Coupled",
+    "Dense",
+    "Distributed",
+    "Epilogue",
+    "Host",
+    "IdentityPlus",
+]
+__all__ += ["MultiDevice", "Norms", "Operator", "Parts", "Pyramid", "RowBlocks", "ScaledColumns", "Streamed"]
+__all__ += ["SubsetBasis", "Tiles", "Wavelet", "as_operator", "basis", "interreflections"]
+__all__ += ["multiresolution_order", "rank_device", "restrict_to_support", "smallest"]
 
 
 def as_operator(matrix: Any, device: Device | None = None) -> Operator:
@@ -42,10 +52,10 @@ def as_operator(matrix: Any, device: Device | None = None) -> Operator:
     if isinstance(matrix, Operator):
         return matrix
     device = device if device is not None else open_device()
-    if scipy.sparse.issparse(matrix):
-        return CSR(device, matrix)
+    if device.agreed(stays_on_disk([matrix], device)):
+        return Streamed(device, matrix)
     if hasattr(matrix, "row_blocks"):
-        return RowBlocks(device, matrix.shape, matrix.row_blocks, matrix.nnz)
+        return stored_rows(device, matrix)
     if hasattr(matrix, "matvec"):
         return Host(device, matrix)
-    return Dense(device, matrix)
+    return on_devices(device, matrix)

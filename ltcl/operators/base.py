@@ -80,6 +80,10 @@ class Operator(scipy.sparse.linalg.LinearOperator):
         members = (x for x in self._parts if x is not None)
         return set[Array]().union(*({x} if isinstance(x, Array) else x.arrays() for x in members))
 
+    def bytes_read(self) -> int:
+        """Bytes that each product reads from a disk."""
+        return sum(part.bytes_read() for part in self._parts if isinstance(part, Operator))
+
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         """Queue ``out = a (A x) + b y + c x``, or with A^T. `out` is never `x`."""
         self._bound(x, out, epilogue, transpose)()

@@ -15,8 +15,9 @@ from ltcl.device.vectors import rounded
 from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, spread
-from ltcl.operators.csr import CSR, Pattern, RowBlocks
+from ltcl.operators.csr import CSR, Pattern
 from ltcl.operators.dense import Dense
+from ltcl.operators.parts import Streamed, on_devices, over_devices, row_blocks, stays_on_disk, stored_rows
 
 _DIGITS = 16.0  # times the largest entry of a column of T: up to such an F, S keeps 6 digits of the column
 
@@ -27,7 +28,8 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
     Parameters
     ----------
     matrices : sequence of (N, N) array, csr_array, Operator or LinearOperator
-        T of each channel, checked. Of S diag(F) that S is taken as it is.
+        T of each channel, checked. Of S diag(F) that S is taken as it is. Where they are mapped arrays or the
+        rows of a store that do not fit the device or the host, each product reads them.
     F : (channels, N)
         First bounces; 0 where a projector pixel is masked, whose column of R is then 0.
 
@@ -38,12 +40,13 @@ def interreflections(matrices: Sequence[Any], F: np.ndarray, device: Device) -> 
         where no pixel is masked: if T is symmetric (reciprocity, patches of equal area), so is F^-1 T F^-1.
     """
     systems, pattern = [], None
+    on_disk = device.agreed(stays_on_disk(matrices, device))
     for matrix, f in zip(matrices, F, strict=True):
         S = made_with(matrix)
         if S is not None and np.array_equal(matrix.d, f):
             systems.append(S)
             continue
-        R = _interreflection(matrix, f, device, pattern)
+        R = _interreflection(Streamed(device, matrix) if on_disk else matrix, f, device, pattern)
         pattern = R.pattern if isinstance(R, CSR) else None
         system = IdentityPlus(R, weights=1.0 / f if np.all(f > 0) else None)
         if S is not None and S.error_bound:  # norms change by max(d / f) / min(d / f) at most
@@ -84,19 +87,20 @@ def nbytes(systems: Sequence[IdentityPlus]) -> int:
 def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Pattern | None) -> Operator:
     """R = T F^-1 - I, computed in float64 and rounded once."""
     lit = F > 0
-    if isinstance(matrix, (np.ndarray, scipy.sparse.csr_array)) or hasattr(matrix, "row_blocks"):
-        _check_first_bounce(matrix, F)
+    entries = matrix.matrix if isinstance(matrix, Streamed) else matrix
+    if isinstance(entries, (np.ndarray, scipy.sparse.csr_array)) or hasattr(entries, "row_blocks"):
+        _check_first_bounce(entries, F)
     # Divided, not multiplied by 1 / F: x / x is 1 to the bit, so that F = diag(T) leaves R no diagonal.
     divisor = np.where(lit, F, np.inf)
     if isinstance(matrix, np.ndarray):
-        R = Dense(device, _dense_R(matrix, divisor, lit))
+        make = lambda on, own: Dense(on, _dense_R(matrix[own], divisor, lit, own.start))  # noqa: E731
+        R: Any = over_devices(device, len(F), make)
         R.exact = matrix, divisor, lit
         return R
     if isinstance(matrix, scipy.sparse.csr_array):
-        return CSR(device, _sparse_R(matrix, divisor, lit), pattern)
+        return on_devices(device, _sparse_R(matrix, divisor, lit), pattern)
     if hasattr(matrix, "row_blocks"):
-        rows = lambda: ((k, _sparse_R(block, divisor, lit, k)) for k, block in matrix.row_blocks())  # noqa: E731
-        return RowBlocks(device, matrix.shape, rows, matrix.nnz + len(F))
+        return stored_rows(device, matrix, lambda k, block: _sparse_R(block, divisor, lit, k), more=len(F))
     operator = matrix if isinstance(matrix, Operator) else Host(device, matrix)
     return ScaledColumns(operator, 1.0 / divisor, 1.0 if lit.all() else lit)
 
@@ -108,7 +112,7 @@ def _check_first_bounce(T: Any, F: np.ndarray) -> None:
     if not lost.any():
         return
     largest = diagonal
-    for _, block in T.row_blocks() if hasattr(T, "row_blocks") else [(0, T)]:
+    for _, block in row_blocks(T):
         columns = abs(block).max(axis=0)
         largest = np.maximum(largest, columns.toarray() if scipy.sparse.issparse(columns) else columns)
     lost &= _DIGITS * largest < F
@@ -120,14 +124,14 @@ def _check_first_bounce(T: Any, F: np.ndarray) -> None:
         )
 
 
-def _dense_R(T: np.ndarray, divisor: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    n = len(divisor)
-    checks.fits_host(f"R of {n} x {n}", 4 * n * n)
-    R, rows = np.empty((n, n), np.float32), max(1, (1 << 24) // (8 * n))  # float64 only a block at a time
-    for start in range(0, n, rows):
+def _dense_R(T: np.ndarray, divisor: np.ndarray, lit: np.ndarray, first: int = 0) -> np.ndarray:
+    """Rows from `first` on, of the same of T."""
+    checks.fits_host(f"R of {T.shape[0]} x {T.shape[1]}", 4 * T.size)
+    R, rows = np.empty(T.shape, np.float32), max(1, (1 << 24) // (8 * len(lit)))  # float64 a block at a time
+    for start in range(0, len(T), rows):
         block = T[start : start + rows] / divisor
         here = np.arange(len(block))
-        block[here, start + here] -= lit[start : start + rows]
+        block[here, first + start + here] -= lit[first + start + here]
         R[start : start + rows] = rounded(block, np.float32)
     return R
 

@@ -175,9 +175,11 @@ def readable(S: Operator, method: str) -> Rows:
     """The rows of S; operators that do not give them are refused, naming `method`."""
     shift, scale, M = (1.0, S.sign, S.R) if isinstance(S, IdentityPlus) else (0.0, 1.0, S)
     if not isinstance(M, CSR | Dense):
+        where = getattr(getattr(M, "A", M), "where", "")  # of Parts, whose columns may be scaled
+        problem = f"but they are {where}" if where else f"which {type(M).__name__} does not allow"
         raise InputError(
-            f"method={method!r} reads S row by row, which {type(M).__name__} does not allow; give a dense or "
-            "sparse matrix, or use method='chebyshev'"
+            f"method={method!r} reads S row by row, {problem}; give a dense or sparse matrix on one device, "
+            "or use method='chebyshev'"
         )
     return Rows(M, shift, scale)
 

@@ -52,15 +52,52 @@ class Variant:
         return (rows * group if self.shared else rows), group, kernel.device.local(width * group)
 
 
-class RowOperator(Operator):
+class ReadableRows(Operator):
+    """An operator whose entries the host can read. Subclasses give `blocks`."""
+
+    # (first row, rows on the host): float64 arrays or csr_arrays (rows, N) of what it stands for.
+    blocks: Callable[[], Iterator[tuple[int, Any]]]
+
+    def diagonal(self) -> np.ndarray:
+        """The main diagonal, (min(M, N),) float64."""
+        diagonal = np.zeros(min(self.shape))
+        for first, rows in self.blocks():
+            here = rows.diagonal(first)
+            diagonal[first : first + len(here)] = here
+        return diagonal
+
+    def norms(self) -> Norms:
+        """Norms of what it stands for, in float64."""
+        columns, inf, squares, lowest = self.sums()
+        return Norms(float(columns.max(initial=0.0)), inf, squares**0.5, lowest)
+
+    def sums(self) -> tuple[np.ndarray, float, float, float]:
+        """Of |A_ij| in each column, (N,), and the largest of a row; of squares; and the lowest entry or 0."""
+        columns, inf, squares, lowest = np.zeros(self.shape[1]), 0.0, 0.0, 0.0
+        for _, rows in self.blocks():
+            values = rows.data if scipy.sparse.issparse(rows) else rows
+            squares += float(np.vdot(values, values))
+            lowest = min(lowest, float(values.min(initial=0.0)))
+            sizes = abs(rows)
+            columns += sizes.sum(axis=0)
+            inf = max(inf, float(sizes.sum(axis=1).max(initial=0.0)))
+        return columns, inf, squares, lowest
+
+    def _dense(self) -> np.ndarray:
+        dense = np.empty(self.shape)
+        for first, rows in self.blocks():
+            here = rows.toarray() if scipy.sparse.issparse(rows) else rows
+            dense[first : first + len(here)] = here
+        return dense
+
+
+class RowOperator(ReadableRows):
     """An operator stored as slabs of rows. Subclasses set `file`, `defines`, `slabs`, and give `blocks`."""
 
     file: str  # stem of the kernel file
     defines: dict[str, Any]
     unit = 1.0  # of the numbers in the slabs
     slabs: list[Slab]
-    # (first row, rows on the host): float64 arrays or csr_arrays (rows, N) of what it stands for.
-    blocks: Callable[[], Iterator[tuple[int, Any]]]
     _transposed_rows: Callable[[], RowOperator]
 
     def __init__(self, device: Device, shape: tuple[int, int]) -> None:
@@ -75,33 +112,6 @@ class RowOperator(Operator):
         """Of all slabs, and of the transpose once it was asked for."""
         arrays = {x for slab in self.slabs for x in slab.arguments if isinstance(x, Array)}
         return arrays if self._transposed is None else arrays | self._transposed.arrays()
-
-    def diagonal(self) -> np.ndarray:
-        """The main diagonal, (min(M, N),) float64."""
-        diagonal = np.zeros(min(self.shape))
-        for first, rows in self.blocks():
-            here = rows.diagonal(first)
-            diagonal[first : first + len(here)] = here
-        return diagonal
-
-    def norms(self) -> Norms:
-        """Norms of what it stands for, in float64."""
-        columns, inf, squares, lowest = np.zeros(self.shape[1]), 0.0, 0.0, 0.0
-        for _, rows in self.blocks():
-            values = rows.data if scipy.sparse.issparse(rows) else rows
-            squares += float(np.vdot(values, values))
-            lowest = min(lowest, float(values.min(initial=0.0)))
-            sizes = abs(rows)
-            columns += sizes.sum(axis=0)
-            inf = max(inf, float(sizes.sum(axis=1).max(initial=0.0)))
-        return Norms(float(columns.max(initial=0.0)), inf, squares**0.5, lowest)
-
-    def _dense(self) -> np.ndarray:
-        dense = np.empty(self.shape)
-        for first, rows in self.blocks():
-            here = rows.toarray() if scipy.sparse.issparse(rows) else rows
-            dense[first : first + len(here)] = here
-        return dense
 
     def transposed_copy(self) -> RowOperator:
         """A^T in rows of its own, made at the first call and kept."""

@@ -174,6 +174,7 @@ def plan(S: Operator, rtol: float, columns: int, refines: bool = False) -> Itera
         candidates.append(_candidate(S, columns, Direct()))
     bandwidth, flops = _bandwidth(S.device), _flops()
     candidates.sort(key=lambda candidate: candidate.seconds(bandwidth, flops))
+    candidates = S.device.agreed(candidates)
     first, ranking = candidates[0].method, f"fastest first: {', '.join(map(str, candidates))}"
     reasons = f"{ranking}; {surveyed}{' made before' if made_before else ''}"
     yield first, reasons, 0 if made_before else len(surveyed.residuals) - 1
@@ -205,7 +206,7 @@ def _candidate(S: Operator, columns: int, method: Any, products: float = 0) -> _
         return _Candidate(method, 0, nbytes, 0.0, factorize + 4.0 * n * n * columns)
     moved, launches, waits = _STEPS[method.name]
     passes = math.ceil(columns / _AT_ONCE)
-    nbytes = S.nbytes * passes + 4.0 * n * columns * moved
+    nbytes = S.nbytes * passes + S.bytes_read() + 4.0 * n * columns * moved
     launch, wait = _overheads(S.device)
     overhead = passes * launches * launch + waits * wait
     return _Candidate(method, products, products * nbytes, products * overhead)

@@ -23,6 +23,7 @@ from ltcl import checks
 from ltcl.errors import MemoryLimitError
 from ltcl.operators import CSR, Dense, Host, IdentityPlus, Operator, RowBlocks, ScaledColumns, Tiles
 from ltcl.operators.base import Transposed
+from ltcl.operators.parts import MultiDevice, Streamed
 
 Product = Callable[[np.ndarray], np.ndarray]  # (N, k) float64 -> (M, k) float64
 EPS = 2.0**-23
@@ -42,7 +43,8 @@ factors: weakref.WeakKeyDictionary[Operator, _Factors] = weakref.WeakKeyDictiona
 def _numbers(S: Operator, read: bool = False) -> tuple[Any, Any, Any] | None:
     """(A, d, e) with S = A diag(d) + diag(e), as they were given; None where only the device has them.
 
-    A is an array, a csr_array, or a Host; d and e are numbers or (N,). Blocks of a store are read on demand.
+    A is an array, a csr_array, a Host or Streamed; d and e are numbers or (N,). Blocks of a store are read
+    on demand.
     """
     if isinstance(S, IdentityPlus | ScaledColumns):
         if (inner := _numbers(S.R if isinstance(S, IdentityPlus) else S.A, read)) is None:
@@ -51,17 +53,17 @@ def _numbers(S: Operator, read: bool = False) -> tuple[Any, Any, Any] | None:
         if isinstance(S, IdentityPlus):
             return A, S.sign * d, S.sign * e + 1.0
         return A, d * S.d, e * S.d - S.shift
-    if isinstance(S, Dense) and S.exact is not None:
+    if isinstance(S, Dense | MultiDevice) and S.exact is not None:
         A, d, e = S.exact
         return (A, 1.0 / d, 0.0 - e) if np.all(np.abs(d) > 1e-300) else None
-    if isinstance(S, Dense) or (read and isinstance(S, RowBlocks)):
+    if isinstance(S, Dense) or (read and isinstance(S, RowBlocks | MultiDevice)):
         A = S.to_dense()
     elif isinstance(S, CSR) and not isinstance(S, RowBlocks):
         A = scipy.sparse.csr_array((S.data, S.pattern.indices, S.pattern.indptr), shape=S.shape)
     elif isinstance(S, Tiles):
         A = S.matrix()
     else:
-        A = S if isinstance(S, Host) else None
+        A = S if isinstance(S, Host | Streamed) else None
     return None if A is None else (A, 1.0, 0.0)
 
 
@@ -74,7 +76,7 @@ def product(S: Operator) -> Product | None:
     if numbers is None:
         return None
     A, d, e = numbers
-    multiply = A.product if isinstance(A, Host) else A.__matmul__
+    multiply = A.product if isinstance(A, Host | Streamed) else A.__matmul__
     if is_small(S) and A is not S:
         _known[S] = numbers
     d, e = np.reshape(d, (-1, 1)), np.reshape(e, (-1, 1))
@@ -91,6 +93,7 @@ def dense(S: Operator) -> tuple[np.ndarray, bool]:
     if (numbers := _numbers(S, read=True)) is None:
         return S.to_dense(), False
     A, d, e = numbers
+    A: Any = A.to_dense() if isinstance(A, Streamed) else A
     A = A.product(np.eye(n)) if isinstance(A, Host) else A.toarray() if scipy.sparse.issparse(A) else A
     matrix = np.multiply(A, d, dtype=np.float64)
     matrix[np.diag_indices(n)] += e
@@ -99,7 +102,7 @@ def dense(S: Operator) -> tuple[np.ndarray, bool]:
 
 def is_small(S: Operator) -> bool:
     """Whether a float64 product with S is cheap; one with a LinearOperator goes through the host anyway."""
-    return S.nbytes <= _SMALL
+    return S.nbytes + S.bytes_read() <= _SMALL
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ import scipy.sparse.linalg
 
 from ltcl import checks, layout
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError, MemoryLimitError
+from ltcl.files import read_ahead
 from ltcl.noise import Noise
 
 EXTRAS = ("grid", "camera_grid", "first_bounce", "mixing")
@@ -85,13 +86,15 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
         self._layout = sizes = store.layout
         super().__init__(np.dtype(sizes.dtype), sizes.shape)
         self._read = functools.lru_cache(1)(lambda block: store.block(channel, block).matrix)
-        self.nnz = sum(block.nnz for _, block in self.row_blocks())
+        self.nnz = sum(self._read(block).nnz for block in range(sizes.blocks()))
+        self._again = functools.partial(store.rows_again, channel)
         self.nbytes = (4 + np.dtype(sizes.dtype).itemsize) * self.nnz + 8 * (self.shape[0] + sizes.blocks())
 
     def row_blocks(self) -> Iterator[tuple[int, scipy.sparse.csr_array]]:
         """Each block with its first row."""
-        for block in range(self._layout.blocks()):
-            yield self._layout.span(block)[0], self._read(block)
+        blocks = range(self._layout.blocks())
+        for block, rows in zip(blocks, read_ahead(self._again, blocks), strict=True):
+            yield self._layout.span(block)[0], rows
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1, (stop - start, N)."""
