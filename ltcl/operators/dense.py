@@ -46,10 +46,8 @@ class Dense(RowOperator):
         super().__init__(device, host.shape)
         device.require(4 * host.size, f"a dense matrix {host.shape}")
         self.defines = {"STRIP": 256 if device.is_cpu else 1}
-        rows, width = host.shape
-        cuts = cut(device, np.full(rows, 4 * max(width, 1)), "the dense matrix")
         self._ones: Array | None = None
-        self.slabs = [Slab(a, b - a, (width, device.upload(host[a:b]))) for a, b in cuts]
+        self.slabs = slabs(device, host)
 
     def blocks(self) -> Iterator[tuple[int, np.ndarray]]:
         """Slab by slab, as they lie on the device."""
@@ -88,3 +86,10 @@ class Dense(RowOperator):
                 kernel = self.kernel("dense_rmatvec", 1, 1)
                 kernel((out.size, 1), (64, 1), *place, self._ones, out, out, out.size, sums)
             epilogue = Epilogue(a, 1.0, out)  # the following slabs add to what the first has written
+
+
+def slabs(device: Device, host: np.ndarray, first: int = 0) -> list[Slab]:
+    """Rows of a matrix from `first` on, uploaded."""
+    rows, width = host.shape
+    cuts = cut(device, np.full(rows, 4 * max(width, 1)), "the dense matrix")
+    return [Slab(first + a, b - a, (width, device.upload(host[a:b]))) for a, b in cuts]

@@ -26,8 +26,8 @@ from ltcl.errors import FileError, MemoryLimitError
 from ltcl.files import read_ahead
 from ltcl.operators.base import Epilogue, Operator
 from ltcl.operators.csr import CSR, Pattern, RowBlocks
-from ltcl.operators.dense import Dense
-from ltcl.operators.rows import ReadableRows, RowOperator, Slab, cut
+from ltcl.operators.dense import Dense, slabs
+from ltcl.operators.rows import ReadableRows, RowOperator
 
 logger = logging.getLogger(__name__)
 _READ = 1 << 22  # bytes of rows in one reading: what caches hold, while a disk is busy for long
@@ -54,32 +54,6 @@ class Parts(Operator):
             vectors.axpy(c, x, out)
 
 
-class _DenseSlab(Dense):
-    """Those rows of a dense matrix that are on the device."""
-
-    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
-        super().__init__(device, np.zeros((0, shape[1])))
-        self.shape = shape
-
-    def load(self, first: int, rows: np.ndarray) -> None:
-        self.slabs = []  # makes room
-        cuts = cut(self.device, np.full(len(rows), 4 * self.shape[1]), "the dense matrix")
-        upload = self.device.upload
-        self.slabs = [Slab(first + a, b - a, (self.shape[1], upload(rows[a:b]))) for a, b in cuts]
-
-
-class _SparseSlab(CSR):
-    """Those rows of a sparse matrix that are on the device."""
-
-    def __init__(self, device: Device, shape: tuple[int, int]) -> None:
-        RowOperator.__init__(self, device, shape)
-        self.slabs = []
-
-    def load(self, first: int, rows: Any) -> None:
-        self.slabs = []
-        self.slabs = Pattern.of(self.device, rows).with_values(rows.data, first)
-
-
 class Streamed(Parts, ReadableRows):
     """A matrix (M, N) on a disk, read at each product; host and device hold a few slabs of its rows.
 
@@ -103,8 +77,10 @@ class Streamed(Parts, ReadableRows):
 
     def __init__(self, device: Device, matrix: Any) -> None:
         super().__init__(device, matrix.shape)
-        self.matrix, self._dense_rows = matrix, isinstance(matrix, np.ndarray)
-        self._slab = (_DenseSlab if self._dense_rows else _SparseSlab)(device, matrix.shape)
+        none, self.matrix = (0, matrix.shape[1]), matrix
+        dense = isinstance(matrix, np.ndarray)
+        self._slab = Dense(device, np.zeros(none)) if dense else CSR(device, scipy.sparse.csr_array(none))
+        self._slab.shape = matrix.shape  # of which it has those rows that are on the device
 
     def arrays(self) -> set[Array]:
         """Of the slab that was used last."""
@@ -118,10 +94,6 @@ class Streamed(Parts, ReadableRows):
         """(first row, rows) in float64, read once."""
         for first, rows in row_blocks(self.matrix):
             yield first, rows.astype(np.float64)
-
-    def diagonal(self) -> np.ndarray:
-        """The main diagonal, (min(M, N),) float64."""
-        return np.asarray(self.matrix.diagonal(), np.float64)
 
     def product(self, x: np.ndarray, transpose: bool = False) -> np.ndarray:
         """A x or A^T x on the host, of x (N, k) float64, with the numbers of the file."""
@@ -137,11 +109,16 @@ class Streamed(Parts, ReadableRows):
         return self.product(x.get().reshape(x.shape[0], -1).astype(np.float64), transpose).reshape(shape)
 
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        if transpose and not self._dense_rows:  # sparse rows would have to be sorted by columns first
+        dense = isinstance(self._slab, Dense)
+        if transpose and not dense:  # sparse rows would have to be sorted by columns first
             super()._product(x, out, epilogue, True)
             return
         for first, rows in row_blocks(self.matrix):
-            self._slab.load(first, rows)
+            self._slab.slabs = []  # makes room
+            if dense:
+                self._slab.slabs = slabs(self.device, rows, first)
+            else:
+                self._slab.slabs = Pattern.of(self.device, rows).with_values(rows.data, first)
             self._slab._bound(x, out, epilogue, transpose)()
             if transpose:  # the following slabs add to what the first has written
                 epilogue = Epilogue(epilogue.a, 1.0, out)
@@ -229,14 +206,9 @@ def _trial(device: Device) -> float:
     return tuning.seconds(device, name, A.bind(device.empty(n), device.empty(n)))
 
 
-def is_on_disk(matrix: Any) -> bool:
-    """Whether its rows may stay there: an array that is mapped, or the rows of a store."""
-    return hasattr(matrix, "row_blocks") or isinstance(_root(matrix), np.memmap)
-
-
 def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
     """Whether all `matrices` are on a disk, and their R in float32 would not fit the device or the host."""
-    if not all(map(is_on_disk, matrices)):
+    if not all(hasattr(T, "row_blocks") or isinstance(_root(T), np.memmap) for T in matrices):
         return False
     dense = [4 * T.size for T in matrices if isinstance(T, np.ndarray)]
     entries = sum(dense) + sum(8 * T.nnz for T in matrices if not isinstance(T, np.ndarray))
