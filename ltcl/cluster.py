@@ -199,11 +199,15 @@ class _Crew:
                 if not each.workers & self.ready:  # all of them have gone, and Dask must not choose others
                     self.submit(each)
             try:
-                self.dask.wait(task.future, timeout=_PERIOD)
+                with self.client.as_current():
+                    self.dask.wait(task.future, timeout=_PERIOD)
                 answer = task.future.result(timeout=patience)
-            except TimeoutError:  # not done, or large, or on a worker that has died: then Dask does it again
-                patience *= 2
-            except (self.dask.CancelledError, self.dask.KilledWorker):
+            except (OSError, self.dask.CancelledError, self.dask.KilledWorker) as error:
+                if task.future.status == "error" and not isinstance(error, self.dask.KilledWorker):
+                    raise  # of the function
+                if isinstance(error, TimeoutError):  # not done; or large, or on a worker that has died
+                    patience *= 2.0 if task.future.status == "finished" else 1.0
+                    continue
                 self.looked = -math.inf
                 self.look()  # which raises where it was the scheduler
                 self.submit(task)
