@@ -44,7 +44,7 @@ _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1200, "images": 500, "batch": 500, "cli": 2125, "scenes": 2710}
+_OTHERS = {"acquisition": 6310, "store": 1200, "images": 500, "batch": 500, "cli": 2000, "scenes": 2710}
 _BENCHES = (
     "_boxes _coefficients _corner _harness _peers claims csr dense4k launches products relax "
     "resolution131k solve video walk"

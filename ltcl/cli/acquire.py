@@ -1,40 +1,182 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl acquire`: plan, run and report of a folder with an acquisition.toml; `ltcl show`: its patterns."""
+"""Scans: `ltcl simulate` makes a folder for one; `ltcl acquire` plans, runs, reports; `ltcl show`."""
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import typer
 
 from ltcl import checks, store
-from ltcl.cli import options, transports
+from ltcl.cli import options, pictures
 from ltcl.cli.command import WAITING, Answer, Context, command, percent, table
-from ltcl.cli.options import option
+from ltcl.cli.options import argument, option, pixels
 from ltcl.device import open_device
 from ltcl.errors import AcquisitionError, FileError, InputError, PhotographMissing, ScanRefused
+from ltcl.report import versions
+from ltcl.store import Record, formats
 from ltcl.verdict import verdict
 
 if TYPE_CHECKING:
     from ltcl.acquisition import Project
 
+_SCENES = ("dihedral", "trihedral", "box")
+
+
+def _albedo(text: str) -> tuple[float, ...]:
+    with suppress(ValueError):
+        albedo = tuple(float(value) for value in text.split(","))
+        if len(albedo) in (1, 3):
+            return albedo
+    raise typer.BadParameter(f"{text!r} is no albedo; write one number, or red,green,blue")
+
+
+_SCENE = "dihedral, trihedral, box; a transport file; or mitsuba: and one of these or an XML file of Mitsuba."
+_AMBIENT = "Light of the room, where a lit white wall has 1. Default: 0.01; mitsuba has its own."
+_Strategy = Literal["auto", "adaptive", "pixel", "block", "hadamard"]
+_ALBEDO_HELP = "Of the walls: A or R,G,B. Default: 0.7."
+_Curve = Literal["linear", "srgb", "gamma2.2", "film"]
+_GRID_HELP = "Projector pixels: of mitsuba (24x32), or where a file lacks them."
+_CAMERA_HELP = "Camera pixels, if other ones: Gray code then measures which is which."
+
+
+def _rig_options(
+    size: Annotated[int | None, option("Patches along a wall of a scene. Default: 16.", min=2)] = None,
+    grid: Annotated[tuple | None, pixels(_GRID_HELP)] = None,
+    camera_grid: Annotated[tuple | None, pixels(_CAMERA_HELP)] = None,
+    albedo: Annotated[Any, option(_ALBEDO_HELP, parser=_albedo, metavar="ALBEDO")] = None,
+    response: Annotated[_Curve, option("Of the camera, light to code.")] = "srgb",
+    projector_response: Annotated[_Curve, option("Of the projector, code to light.")] = "srgb",
+    bits: Annotated[int, option("Of the photographs.", min=8, max=16)] = 12,
+    ambient: Annotated[float | None, option(_AMBIENT, min=0.0)] = None,
+    strategy: Annotated[_Strategy, option("How 'ltcl acquire' is to scan.")] = "auto",
+    seed: Annotated[int, option("Of the noise.", min=0)] = 0,
+) -> None:
+    """Of the scene and the rig before it."""
+
+
+@command(_rig_options)
+def simulate(
+    context: Context, scene: Annotated[str, argument("SCENE", _SCENE, parser=None)], out: options.Out
+) -> Answer:
+    """Make a folder in which 'ltcl acquire' photographs SCENE, without a camera.
+
+    Writes acquisition.toml, with what else it could say in comments, and truth.npz, the transport that is to
+    be measured (not of mitsuba).
+    """
+    from ltcl.acquisition import Project
+
+    if (out / "transport.zarr").exists():
+        raise InputError(f"{out}: holds a transport.zarr that was acquired; choose another folder")
+    if (out / "acquisition.toml").exists() and not (out / "simulate.json").exists():
+        raise InputError(f"{out}: holds an acquisition.toml of somebody else; choose another folder")
+    asked = {name: value for name, value in context.options.items() if name != "out"}
+    text = {"command": "simulate", "versions": versions(), "scene": scene, "options": asked}
+    with pictures.fill(out, text) as folder:
+        context.progress("scene")
+        rig = _rig(folder, scene, asked)
+        rig |= {name: asked[name] for name in ("response", "projector_response", "bits", "seed")}
+        aligned = asked["camera_grid"] is None and not scene.endswith(".xml")
+        settings = {"geometry": "aligned" if aligned else "graycode", "strategy": asked["strategy"]}
+        tables = {
+            name: "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in keys.items())
+            for name, keys in (("rig", rig), ("acquire", settings))
+        }
+        (folder / "acquisition.toml").write_text(_TOML.format(**tables), "utf-8")
+        with Project.open(folder).rig() as opened:  # refuses what cannot be photographed
+            text |= {"projector_grid": opened.projector_grid, "channels": opened.channels}
+    size = "{} x {} projector pixels".format(*text["projector_grid"])
+    lines = [f"{out}: {scene}, {size}, {text['channels']} channel(s)"]
+    lines += [f"what it takes: ltcl acquire plan {out}", f"to do it:      ltcl acquire run {out}"]
+    return Answer({"folder": out, **text}, lines)
+
+
+def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
+    """The table of a rig that Mitsuba renders, or of one around a transport, which goes into the folder."""
+    from ltcl import scenes
+    from ltcl.acquisition import camera_map
+
+    source = scene.removeprefix("mitsuba:")
+    is_rendered, is_named = source != scene, source in _SCENES
+    refused = {"size": is_rendered or not is_named, "grid": is_named and not is_rendered}
+    refused |= {"albedo": not is_named, "ambient": is_rendered}
+    for name, is_refused in refused.items():
+        if is_refused and asked[name] is not None:
+            raise InputError(f"--{name} is {asked[name]}, but {scene} takes no --{name}")
+    albedo = asked["albedo"] or (0.7,)
+    is_grey = len(albedo) == 1
+    rig: dict[str, Any] = {} if asked["camera_grid"] is None else {"camera_grid": asked["camera_grid"]}
+    if is_rendered:
+        rig |= {"kind": "mitsuba", "projector_grid": asked["grid"] or (24, 32)}
+        rig |= {"scene": source if is_named else str(Path(source).resolve())}
+        paint = {"channels": len(albedo), "albedo": albedo[0] if is_grey else albedo}
+        return rig | (paint if is_named else {})
+    if is_named:
+        walls = albedo[0] if is_grey else np.array([albedo])
+        sides = {"sides": 5} if scene == "box" else {}
+        built = getattr(scenes, scene)(asked["size"] or 16, albedo=walls, **sides)
+        record: Any = Record(built.matrices(), grid=built.grid)
+    else:
+        record = _file(scene, asked["grid"])
+    formats.write(folder / "truth.npz", record)
+    rig |= {"kind": "virtual", "transport": "truth.npz"}
+    rig |= {"ambient": 0.01 if asked["ambient"] is None else asked["ambient"]}
+    if asked["camera_grid"]:  # a camera in the projector's place
+        rig |= {"camera_map": "camera.npz"}
+        (H, W), (h, w) = asked["camera_grid"], record.camera_grid or record.grid
+        seen = camera_map(lambda u, v: ((u + 0.5) * w / W - 0.5, (v + 0.5) * h / H - 0.5), (H, W), (h, w))
+        formats.write(folder / "camera.npz", Record((seen,), grid=(h, w), camera_grid=(H, W)))
+    return rig
+
+
+def _file(scene: str, grid: tuple[int, int] | None) -> Any:
+    """A record with a grid, or the arrays of a compressed transport."""
+    if not Path(scene).suffix and not Path(scene).exists():
+        known = ", ".join(_SCENES)
+        raise InputError(f"SCENE is {scene!r}; it must be {known}, mitsuba:NAME or a transport file")
+    record = formats.read(Path(scene))
+    if record.grid is None and grid is None:
+        raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
+    if isinstance(record, Record) and grid is not None:
+        return dataclasses.replace(record, grid=checks.grid("--grid", grid, record.shape[1]))
+    return record
+
+
+_TOML = """\
+# What 'ltcl acquire' photographs in this folder, and how. The keys of [rig] are the arguments of
+# ltcl.acquisition.VirtualRig, MitsubaRig, FolderRig or LiveRig, those of [acquire] the arguments of
+# ltcl.acquire; "none" stands for None. Once photographs are taken, [acquire] must stay as it is.
+
+[rig]
+{rig}# gain = 10000.0           # electrons at full scale; "none": no photon noise
+# exposures = [0.1, 0.2]   # seconds that the camera offers; left out: any
+
+[acquire]
+{acquire}# geometry: "graycode" measures which projector pixel a camera pixel sees, "aligned": the same one
+# strategy: "auto", "adaptive", "pixel", "block" or "hadamard"; 'ltcl acquire plan' compares them
+# exposures = [0.5, 8.0]   # seconds of the photographs of each pattern; left out: chosen
+# response = "linear"      # of the camera where it is known; left out: measured
+
+# Other rigs: kind = "folder" with projector_grid = [48, 64] (height, width), worked by hand, with patterns
+# and photographs in this folder; or kind = "live", a camera on a cable before a display of this computer
+# (extras camera and projector), with [rig.camera] kind = "opencv" or "gphoto2", source = 0 and [rig.display]
+# grid = [48, 64], index = 1.
+"""
+
+
 _TAKE = "Folder with the camera's own files: copied, in the order of their numbers, to what is missing."
 _Overhead = Annotated[float, option("Seconds of each photograph beyond its exposure.", min=0.0)]
 _ARRIVAL = "Next pattern when its photograph is in the folder of the acquisition."
 
-app = typer.Typer(
-    help="Photograph a scene under patterns, and make its transport of the photographs, in "
-    "DIR/transport.zarr. DIR has an acquisition.toml, which says what photographs, and how.",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="markdown",
-)
+_HELP = """Photograph a scene under patterns, and make its transport of the photographs, in
+DIR/transport.zarr. DIR has an acquisition.toml, which says what photographs, and how."""
+app = typer.Typer(help=_HELP, no_args_is_help=True)
 
 
 @app.command()
@@ -45,20 +187,24 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     Noise and light are as measured once DIR/transport.zarr has its calibration, before that they are guessed.
     No camera is opened.
     """
-    from ltcl.acquisition import Project
+    from ltcl.acquisition import Calibration, Project
     from ltcl.acquisition.calibrate import photographs
-    from ltcl.acquisition.scanning.plan import choose, plans
+    from ltcl.acquisition.scanning.plan import choose, measured, plans
 
     project = Project.open(folder)
     settings, facts = project.outlook()
-    facts = facts if project.state == "new" else _measured(project)
+    if is_measured := project.state != "new":
+        calibration = Calibration.of(project.store)
+        channels = 1 if calibration.white.value.ndim == 2 else 3
+        facts = {"grid": calibration.resampling.grid, "channels": channels, "light": measured(calibration)}
+        facts |= {"exposures": calibration.exposures, "noise": calibration.noise}
     kind: dict[str, Any] = {"aligned": settings.geometry == "aligned", "by_hand": project.kind == "folder"}
     count = photographs(facts["grid"], channels=facts["channels"], frames=settings.frames, **kind)
     asked: dict[str, Any] = {name: getattr(settings, name) for name in ("block", "order", "threshold")}
     with project.naming("acquire"):
         strategies = plans(**facts, **asked, overhead=overhead, calibration=count)
     best, why = choose(strategies)
-    data = {"folder": folder, "rig": project.kind, "measured": project.state != "new"}
+    data = {"folder": folder, "rig": project.kind, "measured": is_measured}
     data |= {"asked_for": settings.strategy, "auto": best, "why": why}
     data |= {name: facts[name] for name in ("exposures", "noise", "light", "channels")}
     data["plans"] = {name: dataclasses.asdict(each) for name, each in strategies.items()}
@@ -69,7 +215,7 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
         rows.append((name, *counts, *sizes, percent(each.error, 2)))
     columns = ("strategy", "pixels", "patterns", "photographs", "time", "disk at most", "error of T p")
     times = ", ".join(f"{t:.3g}" for t in facts["exposures"])
-    source = "measured" if data["measured"] else "guessed; the calibration will measure them"
+    source = "measured" if is_measured else "guessed; the calibration will measure them"
     advice = "" if settings.strategy == "auto" else f"acquisition.toml asks for {settings.strategy}; "
     lines = [
         f"{folder}: {project.kind} rig, {facts['channels']} channel(s)",
@@ -79,17 +225,6 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
         f"{advice}auto takes {best}: {why}",
     ]
     return Answer(data, lines)
-
-
-def _measured(project: Project) -> dict[str, Any]:
-    """What decides on the plans, by the calibration."""
-    from ltcl.acquisition import Calibration
-    from ltcl.acquisition.scanning.plan import measured
-
-    calibration = Calibration.of(project.store)
-    channels = 1 if calibration.white.value.ndim == 2 else 3
-    facts = {"grid": calibration.resampling.grid, "channels": channels, "light": measured(calibration)}
-    return facts | {"exposures": calibration.exposures, "noise": calibration.noise}
 
 
 @app.command("finalize", hidden=True)
@@ -110,69 +245,59 @@ def run(
     With a folder rig a person takes the photographs. Where they are missing, prints which pattern to show
     next, for how long to expose and the name to save it by, and ends with exit code 3.
     """
-    from ltcl.acquisition import Project, acquire
+    from ltcl.acquisition import Project, acquire, finalize
 
     project = Project.open(folder)
-    options.writable_folder(project.store)
+    options.writable(project.store, project.store)
     opened = open_device(device)  # before the photographs, not after them
     if take is not None and project.kind != "folder":
         raise InputError(f"--take is given, but the rig of {folder} is {project.kind}, not folder")
     if take is not None and not take.is_dir():
         raise FileError(f"{take}: is no folder; --take needs the one with the camera's files")
-    if _is_complete(project):
-        return _report(context, project, opened)
+    if project.kind == "live" and project.state != "new":
+        with suppress(AcquisitionError):  # photographs are missing
+            finalize(project.store)
+        if project.state == "final":  # no camera or display has to be there
+            return _report(context, project, opened)
     settings = {"store": project.store, "device": opened, **project.settings}
-    with _advising(project), project.rig() as rig:
-        if take is not None:
-            rig.take([path for path in take.iterdir() if path.is_file() and not path.name.startswith(".")])
-        try:
-            with project.naming("acquire"):
-                acquire(rig, progress=context.progress, **settings)
-        except PhotographMissing as error:  # the normal way of a folder scan
-            missing, shot = rig.missing(), error.shot._asdict()
-            data = {"folder": folder, "next": shot, "missing": missing, "exit_code": WAITING}
-            lines = [
-                f"next: {error}",
-                f"{len(missing)} photograph(s) are missing; {folder}/shots.csv lists them",
-                f"'ltcl show {folder}' shows their patterns; then: ltcl acquire run {folder}",
-            ]
-            return Answer(data, lines, WAITING)
+    try:
+        with project.rig() as rig:
+            if take is not None:
+                rig.take(
+                    [each for each in take.iterdir() if each.is_file() and not each.name.startswith(".")]
+                )
+            try:
+                with project.naming("acquire"):
+                    acquire(rig, progress=context.progress, **settings)
+            except PhotographMissing as error:  # the normal way of a folder scan
+                missing, shot = rig.missing(), error.shot._asdict()
+                data = {"folder": folder, "next": shot, "missing": missing, "exit_code": WAITING}
+                lines = [
+                    f"next: {error}",
+                    f"{len(missing)} photograph(s) are missing; {folder}/shots.csv lists them",
+                    f"'ltcl show {folder}' shows their patterns; then: ltcl acquire run {folder}",
+                ]
+                return Answer(data, lines, WAITING)
+    except (AcquisitionError, KeyboardInterrupt) as error:
+        error.args = (f"{str(error) or 'interrupted'}; {_advice(project, error)}",)
+        raise
     return _report(context, project, opened)
 
 
-def _is_complete(project: Project) -> bool:
-    """Whether a live rig has taken all photographs: then no camera or display has to be there."""
-    from ltcl.acquisition import finalize
-
-    with suppress(AcquisitionError):
-        if project.kind == "live" and project.state != "new":
-            finalize(project.store)
-            return True
-    return False
-
-
-@contextmanager
-def _advising(project: Project) -> Iterator[None]:
-    """Add to what ends an acquisition early what is kept, and how it goes on."""
+def _advice(project: Project, error: BaseException) -> str:
+    """What is kept of an acquisition that ends early, and how it goes on."""
     from ltcl.acquisition.session import calibration_photographs
 
-    try:
-        yield
-    except (AcquisitionError, KeyboardInterrupt) as error:
-        again = f"'ltcl acquire run {project.folder}' goes on"
-        if isinstance(error, ScanRefused):
-            advice = f"remove {project.store} to begin again"
-        elif project.state == "begun":
-            advice = f"what was photographed before is kept in {project.store}; {again}"
-        elif project.kind == "folder" and isinstance(error, KeyboardInterrupt):
-            advice = again
-        elif project.kind == "folder":
-            advice = f"take wrong photographs in {project.folder}/photographs again; then {again}"
-        else:
-            count = calibration_photographs(project.store)
-            advice = f"{count} photographs of the calibration are kept; {again}"
-        error.args = (f"{str(error) or 'interrupted'}; {advice}",)
-        raise
+    again = f"'ltcl acquire run {project.folder}' goes on"
+    if isinstance(error, ScanRefused):
+        return f"remove {project.store} to begin again"
+    if project.state == "begun":
+        return f"what was photographed before is kept in {project.store}; {again}"
+    if project.kind != "folder":
+        return f"{calibration_photographs(project.store)} photographs of the calibration are kept; {again}"
+    if isinstance(error, KeyboardInterrupt):
+        return again
+    return f"take wrong photographs in {project.folder}/photographs again; then {again}"
 
 
 @app.command()
@@ -203,7 +328,7 @@ def _report(context: Context, project: Project, device: Any) -> Answer:
             data["error"] = errors = Setup.of(project.store).relative_error(rig, T)
         each = ", ".join(f"{error:.2%}" for error in errors)
         lines.append(f"relative error of T p, for patterns p that were not scanned: {each}")
-    end = transports.verdicts({str(project.store): judged})
+    end = options.verdicts({str(project.store): judged})
     return Answer(data, [*lines, f"transport in {project.store}", *end])
 
 

@@ -37,10 +37,7 @@ EXIT_CODES = (
 _NOTE = 25  # level of a note, between INFO and WARNING
 _PERIOD = 300.0  # seconds of the past from which the time left is estimated
 _logger = logging.getLogger(__name__)
-
-
-class UsageError(Exception):
-    """The command line cannot be understood."""
+UsageError: Any = typer.BadParameter.__base__  # typer exports those below it only
 
 
 @dataclass(frozen=True)
@@ -54,10 +51,10 @@ class Context:
 
 @dataclass(frozen=True)
 class Answer:
-    """Result of a command: `data` for --json; `lines`, texts and tables, are the same for people."""
+    """Result of a command: `data` for --json; `lines` are the same for people."""
 
     data: Any
-    lines: Sequence[str | Table | None]
+    lines: Sequence[str | None]
     exit_code: int = 0
 
 
@@ -92,12 +89,13 @@ def command(*groups: Callable[..., None]) -> Callable[[Callable[..., Answer]], C
                         context = Context(function.__name__, options, progress)
                         answer = function(context, **{name: values[name] for name in own})
                     for line in [report.dumps(answer.data)] if json else answer.lines:
-                        _print(line)
+                        if line is not None:
+                            typer.echo(line)
                     code = answer.exit_code
                 except BrokenPipeError:  # nobody reads stdout any more: typer ends quietly
                     raise
                 except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - each becomes a line and a code
-                    code = fail(error, json, verbose)
+                    code = fail(error, json, verbose)["exit_code"]
             raise typer.Exit(code)
 
         vars(run)["__signature__"] = inspect.Signature(parameters)
@@ -107,16 +105,8 @@ def command(*groups: Callable[..., None]) -> Callable[[Callable[..., Answer]], C
     return decorate
 
 
-def fail(error: BaseException, json: bool, verbose: bool = False) -> int:
-    """Print an error as one line, and as JSON; returns the exit code."""
-    document = print_error(error, verbose)
-    if json:
-        typer.echo(report.dumps(document))
-    return document["exit_code"]
-
-
-def print_error(error: BaseException, verbose: bool = False) -> dict[str, Any]:
-    """One line on stderr; returns message, type and exit code, for --json."""
+def fail(error: BaseException, json: bool = False, verbose: bool = False) -> dict[str, Any]:
+    """Print an error as one line on stderr, and as JSON on stdout: message, type and exit code, returned."""
     code, kind, message = FAILED, type(error).__name__, " ".join(str(error).split())
     if isinstance(error, KeyboardInterrupt):
         code, message = INTERRUPTED, message or "interrupted"
@@ -129,7 +119,10 @@ def print_error(error: BaseException, verbose: bool = False) -> dict[str, Any]:
         if verbose:
             typer.echo("".join(traceback.format_exception(error)), err=True)
     typer.echo(f"ltcl: error: {message}", err=True)
-    return {"error": message, "type": kind, "exit_code": code}
+    document = {"error": message, "type": kind, "exit_code": code}
+    if json:
+        typer.echo(report.dumps(document))
+    return document
 
 
 def note(text: str) -> None:
@@ -159,7 +152,7 @@ def _log_to_stderr(quiet: bool, verbose: bool) -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> Table:
+def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
     """A table, numbers right-aligned; nothing is cut off in a narrow terminal."""
     cells = [[_cell(value) for value in row] for row in rows]
     frame = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
@@ -168,7 +161,9 @@ def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> Table:
         frame.add_column(name, justify="right" if right else "left", no_wrap=True)
     for row in cells:
         frame.add_row(*map(Text, row))
-    return frame
+    with (console := Console(width=10_000)).capture() as capture:
+        console.print(frame)
+    return "\n".join(row.rstrip() for row in capture.get().splitlines())
 
 
 def _cell(value: Any) -> str:
@@ -176,15 +171,6 @@ def _cell(value: Any) -> str:
         return f"{value:.4g}"
     unknown = value is None or (isinstance(value, float) and not value > 0)
     return "-" if unknown else "diverges" if isinstance(value, float) else str(value)
-
-
-def _print(line: str | Table | None) -> None:
-    if isinstance(line, Table):
-        with (console := Console(width=10_000)).capture() as capture:
-            console.print(line)
-        line = "\n".join(row.rstrip() for row in capture.get().splitlines())
-    if line is not None:
-        typer.echo(line)
 
 
 def percent(share: float | None, digits: int = 3) -> str | None:
@@ -200,20 +186,15 @@ class Progress(rich.progress.Progress):
 
     def __init__(self, quiet: bool = False) -> None:
         console = Console(stderr=True)
+        hidden = quiet or not console.is_terminal
+        columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(bar_width=24)
+        times = TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("left")
         super().__init__(
-            SpinnerColumn(),
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=24),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("left"),
-            console=console,
-            transient=True,
-            disable=quiet or not console.is_terminal,
-            speed_estimate_period=_PERIOD,
+            *columns, *times, console=console, transient=True, disable=hidden, speed_estimate_period=_PERIOD
         )
         self._item = self._step = ""
         self.done: float = 0
+        self._solves = 0  # of this item that have begun
         self.add_task("", total=None)
 
     def __call__(self, step: str, done: float = 0, total: float | None = None, *, detail: str = "") -> None:
@@ -230,20 +211,18 @@ class Progress(rich.progress.Progress):
         """All items, with their names before the steps that follow."""
         for number, item in enumerate(items, 1):
             count = f"{number}/{len(items)} " if len(items) > 1 else ""
-            self._item, self._step = f"{count}{item}: ", ""
+            self._item, self._step, self._solves = f"{count}{item}: ", "", 0
             yield item
         self._item = ""
 
     def solve(self, rtol: float, solves: int) -> Callable[[int, float], None]:
-        """A `callback(iteration, residual)` that shows the digits gained towards `rtol` in so many solves."""
-        begun = 0
+        """A `callback(iteration, residual)`: digits gained towards `rtol` in so many solves of an item."""
 
         def callback(iteration: int, residual: float) -> None:
-            nonlocal begun
-            begun += iteration == 0
+            self._solves += iteration == 0
             gained = math.log(residual) / math.log(rtol) if 0 < residual < 1 and 0 < rtol < 1 else 0.0
             shown = "" if math.isnan(residual) else f", relative residual {residual:.1e}"
-            done = min(begun - 1 + min(gained, 1.0), solves)
+            done = min(self._solves - 1 + min(gained, 1.0), solves)
             self("solving", done, solves, detail=f": iteration {iteration}{shown}")
 
         return callback

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl compensate`: the patterns under which a scene looks like given pictures, or like a film."""
+"""Pictures and a transport: `ltcl compensate`, also of a film, `ltcl separate` and `ltcl relight`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from ltcl import report
-from ltcl.cli import options, pictures, transports
+from ltcl import checks, compensation, relighting, report, separation
+from ltcl.cli import options, pictures
 from ltcl.cli.command import Answer, Context, command, note, percent, table
 from ltcl.cli.options import argument, file, option, writable_file
-from ltcl.compensation import Compensation
 from ltcl.errors import InputError, LtclError
 from ltcl.transport import Transport
 
@@ -32,20 +31,17 @@ def _gain(text: str) -> float | str:
 
 
 _GAIN = "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
-_LOSS = "Error that --gain auto may cost. Default: as little as possible."
-_CLAMP = "Clamp what exceeds that light, without making up for it."
 _BACKGROUND = "Picture of the light that stays. Default: as measured, else none."
 _VIDEO = "Also a video of the patterns: .mkv or .avi, lossless; or .mp4, which changes their codes."
 _FPS = "Frames a second of that video. Default: as the source, else 25."
 _FORMAT = "png: 16 bits (default); exr: the light as it is."
 _FILM: dict[str, Any] = {"rich_help_panel": "Options of frames: a folder or a video"}
-_MORE: dict[str, Any] = {"min": 1, **_FILM}
 
 
 def _film_options(
-    batch: Annotated[int | None, option("Frames solved at once. Default: 8.", **_MORE)] = None,
+    batch: Annotated[int | None, option("Frames solved at once. Default: 8.", min=1, **_FILM)] = None,
     resume: Annotated[bool, option("Go on where the last run into DIR ended.", "--resume", **_FILM)] = False,
-    frames: Annotated[int | None, option("Only the first N frames.", metavar="N", **_MORE)] = None,
+    frames: Annotated[int | None, option("Only the first N frames.", metavar="N", min=1, **_FILM)] = None,
     video: Annotated[Path | None, file(_VIDEO, callback=writable_file, **_FILM)] = None,
     fps: Annotated[float | None, option(_FPS, **_FILM)] = None,
     format: Annotated[Literal["png", "exr"] | None, option(_FORMAT, **_FILM)] = None,
@@ -57,23 +53,17 @@ def _film_options(
 _FRAMES = tuple(inspect.signature(_film_options).parameters)
 
 
-@command(
-    options.file_options,
-    options.transport_options,
-    options.solve_options,
-    options.picture_options,
-    _film_options,
-)
+@command(*options.TASK, _film_options)
 def compensate(
     context: Context,
     transport: options.Matrix,
     picture: Annotated[list[Path], argument("PICTURE...", "Pictures; or one folder or one video of frames.")],
     out: options.Out,
     gain: Annotated[str | None, option(_GAIN, parser=_gain, metavar="FACTOR")] = None,
-    loss: Annotated[float | None, option(_LOSS)] = None,
+    loss: Annotated[float | None, option("Error that --gain auto may cost. Default: the least.")] = None,
     low: Annotated[float, option("Darkest light of the projector.")] = 0.0,
     high: Annotated[float, option("Brightest light of the projector.")] = 1.0,
-    clamp: Annotated[bool, option(_CLAMP, "--clamp")] = False,
+    clamp: Annotated[bool, option("Clamp what exceeds that, without making up for it.", "--clamp")] = False,
     background: Annotated[Path | None, file(_BACKGROUND)] = None,
     calibration: Annotated[Path | None, file("The store of 'ltcl acquire' behind TRANSPORT.")] = None,
     weights: Annotated[Path | None, file("Picture of how much the error at each pixel counts.")] = None,
@@ -92,35 +82,31 @@ def compensate(
     gain for all; Ctrl-C keeps what is done, for --resume.
     """
     from ltcl.acquisition import Setup
-    from ltcl.compensation import RTOL
 
     film = _film(picture, context.options)
-    measured = calibration or (transport if transports.is_measured(transport) else None)
+    measured = calibration or (transport if options.is_measured(transport) else None)
     setup = Setup.of(measured) if measured else None
-    T = transports.load(context, transport)
+    T = options.load(context, transport)
     if setup is not None and (setup.grid, setup.channels) != (T.grid, T.channels):
         sizes = f"{setup.grid} and {setup.channels} channel(s); TRANSPORT has {T.grid} and {T.channels}"
         raise InputError(f"{calibration}: is of {sizes}")
     if setup is not None and not 0.0 <= low < high <= 1.0:
         limits = "from 0 to 1, the black and the white of the projector that 'ltcl acquire' measured"
         raise InputError(f"--low is {low:g} and --high is {high:g}; they must be {limits}")
-
-    def read(file: Path) -> np.ndarray:
-        return pictures.read(context, file, T.camera_grid, "the camera", upright=False)
-
-    settings = transports.solving(context, T, RTOL) | {"loss": loss, "clamp": clamp, "bounds": (low, high)}
+    settings = options.solving(context, T, compensation.RTOL)
+    settings |= {"loss": loss, "clamp": clamp, "bounds": (low, high)}
     settings["gain"] = gain if gain is not None else 1.0 if setup is None else "auto"
-    settings |= {"weights": weights and read(weights), "background": background and read(background)}
-    resolved = {"rtol": settings["rtol"], "gain": settings["gain"]}
-    notes = [transports.caveat("errors are", T, context.options["exact"])]
+    for name, path in (("weights", weights), ("background", background)):
+        settings[name] = path and pictures.read(context, path, T.camera_grid, "the camera", upright=False)
+    text = options.heading(context, transport, T, rtol=settings["rtol"], gain=settings["gain"])
+    text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
+    notes = [options.caveat("errors are", T, context.options["exact"])]
     notes += ["masked pixels do not count in errors"] * bool(weights is None and T.masked.any())
     if setup is not None:
         notes.append("pattern .png holds the codes of the measured projector: show it pixel for pixel")
     if setup is not None and background is None:
-        settings["background"], resolved["background"] = setup.ambient, "measured"
+        settings["background"], text["options"]["background"] = setup.ambient, "measured"
         notes.append("the background is the ambient light that was measured")
-    text = transports.heading(context, transport, T, **resolved)
-    text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
     if film is None:
         lines = _compensate_pictures(context, T, picture, out, text, settings, setup)
     else:
@@ -146,29 +132,25 @@ def _compensate_pictures(
     context: Context, T: Transport, paths: list[Path], out: Path, text: Any, settings: Any, setup: Any
 ) -> list[Any]:
     """Patterns of all pictures into a folder with their contact sheet; the lines of the answer."""
-    from ltcl.compensation import compensate
-
     desired = pictures.read_all(context, paths, T.camera_grid, "the camera")
-    files = dict(zip(desired, paths, strict=True))
     text["exposure"] = factor = pictures.exposure(*desired.values())
     text["pictures"], sheet, rows = [], [], []
+    high, noisy = max(settings["bounds"][1], 0.0) or 1.0, options.shows_noise(T, settings)
     with pictures.fill(out, text) as folder:
-        for name in context.progress.each(list(desired)):
+        for name, path in zip(context.progress.each(list(desired)), paths, strict=True):
             try:
-                callback = transports.callback(context, T, settings)
-                result = compensate(T, desired[name], callback=callback, **settings)
+                result = compensation.compensate(T, desired[name], **settings)
             except LtclError as error:
-                error.args = (f"{error} (compensating {files[name]})",)
+                error.args = (f"{error} (compensating {path})",)
                 raise
-            white, noisy = max(settings["bounds"][1], 0.0) or 1.0, transports.shows_noise(T, settings)
-            written, panels = _write(folder / name, desired[name], result, factor, white, setup, noisy)
+            written, panels = _write(folder / name, desired[name], result, factor, high, setup, noisy)
             sheet.append(panels)
             facts = {key: getattr(result, key) for key in _RESULTS}
             lack, solves = result.out_of_reach, {"channels": result.solution, "limited": result.limited}
             facts |= {"too_dark": float(np.mean(lack > 0)), "too_bright": float(np.mean(lack < 0))}
             facts |= {key: report.solution(each) for key, each in solves.items()}
-            text["pictures"].append({"file": str(files[name]), **facts, **written})
-            rows.append(_row(files[name], facts, f"{name}_pattern.png"))
+            text["pictures"].append({"file": str(path), **facts, **written})
+            rows.append(_row(path, facts, f"{name}_pattern.png"))
         pictures.contact_sheet(sheet[:_SHEET]).save(folder / "compensate.png")
     columns = ("picture", "method", "products", "gain", "clipped", "error", "pattern")
     where = f"\npatterns, appearances and what is out of reach as .exr and .png in {out}"
@@ -176,13 +158,7 @@ def _compensate_pictures(
 
 
 def _write(
-    place: Path,
-    desired: np.ndarray,
-    result: Compensation,
-    factor: float,
-    white: float,
-    setup: Any,
-    noisy: bool,
+    stem: Path, desired: np.ndarray, result: Any, factor: float, high: float, setup: Any, noisy: bool
 ) -> tuple[dict[str, Any], list[Any]]:
     """Files of one picture, and its row of the contact sheet.
 
@@ -191,22 +167,23 @@ def _write(
     """
     from ltcl import images
 
-    folder, name, scale = place.parent, place.name, factor / result.gain
-    seen, pattern = pictures.shades(result.appearance, scale), result.pattern
-    missing = pictures.mark(seen, result.out_of_reach * scale)
+    folder, name, pattern = stem.parent, stem.name, result.pattern
+    units = {"pattern": 1 / high, "appearance": factor / result.gain}
+    seen = pictures.shades(result.appearance, units["appearance"])
+    missing = pictures.mark(seen, result.out_of_reach * units["appearance"])
     panels = {
-        "desired": pictures.panel(pictures.shades(desired, factor), f"{name}, desired"),
-        "pattern": pictures.panel(pictures.shades(pattern, 1 / white), f"{name}, pattern"),
+        "desired": pictures.panel(desired, f"{name}, desired", factor),
+        "pattern": pictures.panel(pattern, f"{name}, pattern", units["pattern"]),
         "appearance": pictures.panel(seen, f"{name}, as predicted, error {100 * result.error:.2g} %"),
         "out_of_reach": pictures.panel(missing, "out of reach: orange too dark, blue too bright"),
     }
     images.write(folder / f"{name}_pattern.exr", pattern)
-    codes, encoding = (pattern / white, "srgb") if setup is None else (setup.codes(pattern), "linear")
+    codes, encoding = (pattern / high, "srgb") if setup is None else (setup.codes(pattern), "linear")
     images.write(folder / f"{name}_pattern.png", codes, encoding=encoding)
     written: dict[str, Any] = {"pattern": {suffix: f"{name}_pattern.{suffix}" for suffix in ("exr", "png")}}
     for key in ("appearance", "out_of_reach"):
         written[key] = pictures.write(folder, f"{name}_{key}", getattr(result, key), panels[key])
-    for key, unit in {"pattern": 1 / white, "appearance": scale}.items() if noisy else ():
+    for key, unit in units.items() if noisy else ():
         deviation = pictures.deviation(folder, f"{name}_{key}", getattr(result.std, key), unit)
         written[key]["std"], panels[f"{key}_std"] = deviation
     return written, list(panels.values())
@@ -233,7 +210,7 @@ def _compensate_frames(
     from ltcl.batch import compensate_frames
 
     asked = {name: context.options[name] for name in (*_FRAMES, "resize", "encoding")} | settings
-    arguments = {name: value for name, value in asked.items() if value is not None}
+    arguments = {name: value for name, value in asked.items() if value is not None and name != "callback"}
     try:
         result = compensate_frames(T, film, out, progress=context.progress, **arguments)
     except KeyboardInterrupt:
@@ -254,3 +231,104 @@ def _compensate_frames(
     row = (len(records), result.solved, pace, result.gain, *frames)
     also = "" if result.video is None else f", as a video in {result.video}"
     return [table(columns, [row]), f"\npatterns and frames.json in {out}{also}"]
+
+
+@command(*options.TASK)
+def separate(
+    context: Context,
+    transport: options.Matrix,
+    picture: options.Pictures,
+    out: options.Out,
+    bounces: Annotated[int, option("Indirect bounces to separate.", min=0)] = 4,
+) -> Answer:
+    """Split PICTURE, taken of the scene under projector light, into direct light and bounces.
+
+    Writes direct, indirect, bounce_1, bounce_2, ... and the rest exactly as .exr (measured ones may be a
+    little negative), and for the eye as .png, all at one exposure, which separate.json names; and
+    separate.png with all of them. Several pictures get a folder each. Standard deviations by the noise of
+    TRANSPORT, where that is known, are direct_std, bounce_1_std, ... and in separate.png.
+    """
+    T = options.load(context, transport)
+    settings = options.solving(context, T, separation.RTOL, bounces + 1)
+    images = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
+    noisy, factor = options.shows_noise(T, settings), pictures.exposure(*images.values())
+    text = options.heading(context, transport, T, rtol=settings["rtol"])
+    text["exposure"], text["pictures"], sheet, rows, errors = factor, [], [], [], []
+    with pictures.fill(out, text) as folder:
+        for name, path in zip(context.progress.each(list(images)), picture, strict=True):
+            result = separation.separate(T, images[name], bounces, **settings)
+            numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
+            light = {"direct": result.direct, "indirect": result.indirect, **numbered, "rest": result.rest}
+            solved = dict(zip(["direct", *numbered], result.solutions, strict=True))
+            std = dict(zip(solved, [result.std.direct, *result.std.bounces], strict=True)) if noisy else {}
+            panels, deviations, parts = [pictures.panel(images[name], name, factor)], [], []
+            for part, picture_of in light.items():
+                panels.append(pictures.panel(picture_of, part, factor))
+                place = f"{name}/{part}" if len(images) > 1 else part
+                facts: dict[str, Any] = {
+                    "part": part,
+                    **pictures.write(folder, place, picture_of, panels[-1]),
+                }
+                facts["share"], facts["lowest"] = _share(picture_of, images[name]), float(picture_of.min())
+                facts["channels"] = solves = report.solution(solved[part]) if part in solved else []
+                if part in std:
+                    facts["std"], shown = pictures.deviation(folder, place, std[part], factor)
+                    deviations.append(shown)
+                parts.append(facts)
+                errors += [solve["error"] for solve in solves if solve["error"] is not None]
+                residual = max((each["residual"] for each in solves if each["error"] is None), default=None)
+                products = sum(each["products"] for each in solves) or None
+                rows.append((path.name, part, percent(facts["share"], 4), products, residual))
+            entry = {"file": str(path), "transport_error": result.transport_error, "parts": parts}
+            text["pictures"].append(entry)
+            sheet += [panels[:3], panels[3:], pictures.amplified(light, factor), deviations]
+        pictures.contact_sheet([row for row in sheet if row]).save(folder / "separate.png")
+    lines: list[Any] = [table(("picture", "part", "share of light", "products", "residual"), rows)]
+    lines.append(f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}")
+    if errors:
+        worst = 100 * float(checks.upwards(max(errors)))
+        lines.append(f"the relative error of each part by the inverse is at most {worst:.2g} %")
+    lines.append(options.caveat("all of this is", T, context.options["exact"]))
+    return Answer({"folder": out, **text}, lines)
+
+
+def _share(light: np.ndarray, picture: np.ndarray) -> float | None:
+    """Of the light of a picture, over pixels and three colours."""
+    sums = [float(np.sum(each, dtype=np.float64)) * (1 if each.ndim == 3 else 3) for each in (light, picture)]
+    return sums[0] / sums[1] if sums[1] else None
+
+
+@command(options.file_options, options.picture_options)
+def relight(
+    context: Context,
+    transport: options.Matrix,
+    pattern: Annotated[list[Path], argument("PATTERN...", "Pictures of patterns.")],
+    out: options.Out,
+    on_dark: options.OnDark = "mask",
+    device: options.Device = None,
+) -> Answer:
+    """Show what the camera will see when PATTERN is projected.
+
+    With a TRANSPORT of 'ltcl acquire' a PATTERN of integers, as .png, holds the codes for its projector, and
+    the result is what the pattern adds to the ambient light.
+
+    Writes pictures exactly as .exr, and for the eye as .png at one exposure, which relight.json names.
+    """
+    from ltcl.acquisition import Setup
+
+    T = options.load(context, transport, dark_note=False)
+    setup = Setup.of(transport) if options.is_measured(transport) else None
+    patterns = pictures.read_all(context, pattern, T.grid, "the projector", setup)
+    light = {name: relighting.relight(T, each) for name, each in patterns.items()}
+    factor, text = pictures.exposure(*light.values()), options.heading(context, transport, T)
+    text["exposure"], text["pictures"], rows = factor, [], []
+    with pictures.fill(out, text) as folder:
+        for (name, picture), path in zip(light.items(), pattern, strict=True):
+            panel = pictures.panel(picture, f"{path.name}, relit", factor)
+            entry = {"file": str(path), "brightest": float(picture.max())}
+            entry |= pictures.write(folder, f"{name}_relit", picture, panel)
+            text["pictures"].append(entry)
+            rows.append((path.name, entry["brightest"], entry["exr"]))
+    lines = [table(("pattern", "brightest in picture", "picture"), rows)]
+    lines += [f"\npictures as .exr and .png in {out}", options.caveat("they are", T)]
+    return Answer({"folder": out, **text}, lines)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl devices` and `ltcl doctor`: what OpenCL offers here; everything ltcl needs, tried one by one.
+"""`ltcl devices`, `doctor` and `demo`: what OpenCL offers here; all that ltcl needs, tried; its main result.
 
 Drivers are tried in child processes first, since some crash the process that uses them; kernels by calls that
 launch all of them, whose results NumPy must agree with.
@@ -16,13 +16,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from operator import matmul
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ltcl import checks, report
 from ltcl.cli import options
-from ltcl.cli.command import FAILED, Answer, Context, command, note, table
+from ltcl.cli.command import FAILED, Answer, Context, command, note, percent, table
 from ltcl.device import Device, discovery, open_device
 from ltcl.device.tuning import make_folder
 from ltcl.errors import DeviceError
@@ -53,12 +53,10 @@ def devices(context: Context) -> Answer:
         if not present:
             raise
         note(str(error) if name is None else f"LTCL_DEVICE={name} matches none of these")
-    data, rows = [], []
-    for device in present:
-        facts = {fact: getattr(device, fact) for fact in _FACTS}
-        data.append(facts | {"chosen": device is chosen})
-        *names, memory, largest = facts.values()
-        rows.append(("->" if device is chosen else "", *names, checks.size(memory), checks.size(largest)))
+    data = [{name: getattr(each, name) for name in _FACTS} | {"chosen": each is chosen} for each in present]
+    rows = []
+    for *names, memory, largest, is_chosen in map(dict.values, data):
+        rows.append(("->" if is_chosen else "", *names, checks.size(memory), checks.size(largest)))
     columns = ("", "index", "name", "kind", "driver", "units", "memory", "largest buffer")
     return Answer(data, [table(columns, rows)])
 
@@ -107,26 +105,21 @@ def _drivers() -> str:
     bundled = importlib.metadata.distribution("pyopencl").locate_file("pyopencl/.libs")  # of its wheel
     folders = (vendors, Path(str(bundled)))
     files = [vendors] if vendors.is_file() else sorted({f for place in folders for f in place.glob("*.icd")})
-    crashing = [file for file in files if not _survives(file)]
+    paths, crashing = os.pathsep.join(filter(None, sys.path)), []
+    for file in files:  # a Python error is no crash
+        environment = {**os.environ, "PYTHONPATH": paths, "OCL_ICD_VENDORS": str(file)}
+        words: dict[str, Any] = {"env": environment, "capture_output": True, "timeout": SECONDS}
+        try:  # our own script with our own interpreter
+            child = subprocess.run([sys.executable, "-c", TRIAL], check=False, **words)  # noqa: S603
+            crashing += [] if child.returncode in (0, 1) else [file]
+        except subprocess.TimeoutExpired:
+            crashing.append(file)
     if crashing:
         working = ", ".join(str(file) for file in files if file not in crashing) or "none"
         raise DeviceError(f"crash when they are used: {', '.join(map(str, crashing))}; working: {working}")
     present = discovery.list_devices()
     names = ", ".join(sorted({device.driver for device in present})) or "none"
     return f"{names} ({len(present)} device(s), {len(files)} driver file(s))"
-
-
-def _survives(driver: Path) -> bool:
-    """Whether a child process that uses this driver alone comes to its end; a Python error is one, too."""
-    paths = os.pathsep.join(filter(None, sys.path))
-    environment = {**os.environ, "PYTHONPATH": paths, "OCL_ICD_VENDORS": str(driver)}
-    try:
-        child = subprocess.run(  # noqa: S603 - our own script with our own interpreter
-            [sys.executable, "-c", TRIAL], env=environment, capture_output=True, timeout=SECONDS, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return False
-    return child.returncode in (0, 1)
 
 
 def _calls(device: Device) -> Iterator[tuple[str, Callable[[], Any], np.ndarray]]:
@@ -160,3 +153,29 @@ def _agreement(call: Callable[[], Any], truth: np.ndarray, limit: float) -> str:
     if not error < limit:
         raise DeviceError(f"differs from NumPy by {error:.1e}; it must be below {limit:g}")
     return f"agrees with NumPy to {error:.1e}"
+
+
+_LOOKS = {"uncompensated": "projected as it is", "colours_only": "wall colours undone, bounces left"}
+
+
+@command()
+def demo(
+    context: Context,
+    out: options.Out = Path("ltcl-demo"),
+    size: Annotated[int, options.option("Patches along a wall; the projector: 3 N^2 pixels.", min=4)] = 36,
+    device: options.Device = None,
+) -> Answer:
+    """Compensate a picture in a coloured room corner: no hardware, no download, half a minute.
+
+    Fills DIR with what is desired, what the walls would make of it, the pattern, the compensated result, the
+    bounces of light, a convergence plot, a report and a contact sheet of all that.
+    """
+    opened = open_device(device)
+    from ltcl import demo  # imports OpenCV and matplotlib
+
+    steps, show = demo.STEPS, context.progress
+    done = demo.run(out, size, device=opened, progress=lambda step: show(step, steps.index(step), len(steps)))
+    data = {"folder": done.folder, "files": done.files, **done.report}
+    errors = [(_LOOKS.get(look, look), percent(error)) for look, error in data["errors"].items()]
+    where = f"\n{len(done.files)} files in {out}; look at {out / 'contact_sheet.png'}"
+    return Answer(data, [table(("what the viewer sees", "error"), errors), where])

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl info` and `ltcl convert`: transport files described and in another format."""
+"""`ltcl info` and `analyze` describe transports; `compress`, `denoise`, `invert`, `convert` make others."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import typer
 
-from ltcl import checks, first_bounce
-from ltcl.cli import options, pictures, transports
-from ltcl.cli.command import FAILED, Answer, Context, command, note, print_error, table
+from ltcl import analysis, checks, compression, denoising, first_bounce, store
+from ltcl.cli import options, pictures
+from ltcl.cli.command import FAILED, Answer, Context, command, fail, note, percent, table
+from ltcl.cli.options import option
 from ltcl.errors import InputError, LtclError
 from ltcl.noise import estimate
 from ltcl.store import BlockStore, Parts, Record, formats
@@ -19,7 +24,10 @@ from ltcl.store.record import about
 from ltcl.transport import Transport
 from ltcl.verdict import Verdict, verdict
 
+_COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
 _JUDGED = 1 << 28  # bytes of a transport at most
+_UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "ki": 1024, "mi": 1024**2, "gi": 1024**3}
+_interval = "{:.4g} .. {:.4g}".format
 
 
 @command()
@@ -48,44 +56,12 @@ def info(
             entries.append(facts | {"verdict": judged})
             rows.append(_row(facts))
         except LtclError as error:
-            entries.append({"file": str(file), **print_error(error)})
+            entries.append({"file": str(file), **fail(error)})
     if show_dark is not None and lights:
         pictures.write_first_bounces(show_dark, lights)
     columns = ("file", "shape", "channels", "grid", "camera grid", "stored", "entries", "memory")
     lines = [table((*columns, "first bounce", "dark pixels"), rows)] if rows else []
-    return Answer(entries, lines + transports.verdicts(verdicts), FAILED if len(rows) < len(files) else 0)
-
-
-@command(options.file_options)
-def convert(
-    context: Context,
-    source: Annotated[Path, options.argument("IN", options.FORMATS)],
-    target: Annotated[Path, options.argument("OUT", "The new file.", callback=options.writable_file)],
-) -> Answer:
-    """Write a transport in another format; OUT is replaced whole or not at all. Needs no device."""
-    formats.find(target)  # refused before a long read
-    context.progress(f"reading {source}")
-    record = formats.read(source, variable=context.options["variable"])
-    with about(source):
-        pixels = {"grid": record.shape[1], "camera_grid": record.shape[0]}
-        sizes = {name: context.options[name] for name in pixels if context.options[name]}
-        sizes = {name: checks.grid(name, size, pixels[name]) for name, size in sizes.items()}
-        if isinstance(record, Record):
-            record = dataclasses.replace(record, **sizes)
-        elif any(size != record.grid for size in sizes.values()):
-            (h, w), size = record.grid, next(iter(sizes.values()))
-            raise InputError(f"grid is {size}; this transport is compressed on {h} x {w}")
-        facts, _ = _describe(target, record)  # refuses what could not be loaded again
-    context.progress(f"writing {target}")
-    formats.write(target, record)
-    transports.note_lost(source, target)
-    if target.suffix.lower() == ".npy" or record.grid is None:
-        text = "x".join(map(str, record.grid or "HW"))
-        note(f"{target}: does not contain the grid; give --grid {text} wherever you use it")
-    elif record.shape[0] != record.shape[1] and record.camera_grid is None:
-        note(f"{target}: does not contain the camera's grid; give --camera-grid HxW, or to relight")
-    size = checks.size(transports.on_disk(target))
-    return Answer({"source": source, **facts}, [f"{target}: {facts['stored']}, {size} on disk"])
+    return Answer(entries, lines + options.verdicts(verdicts), FAILED if len(rows) < len(files) else 0)
 
 
 def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.ndarray | None]:
@@ -155,12 +131,212 @@ def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
 
 def _row(entry: dict[str, Any]) -> tuple:
     """Of the table; a camera has its grid where it is not that of the projector."""
-    sizes = {}
-    for name in ("shape", "grid", "camera_grid"):
-        sizes[name] = "{} x {}".format(*entry[name]) if entry[name] else "unknown"
+    grids = entry["shape"], entry["grid"], entry["camera_grid"]
+    shape, grid, camera_grid = ("{} x {}".format(*size) if size else "unknown" for size in grids)
     if entry["camera_grid"] in (None, entry["grid"]) and entry["shape"][0] == entry["shape"][1]:
-        sizes["camera_grid"] = "the same"
-    first = entry["first_bounce"] and "{:.4g} .. {:.4g}".format(*entry["first_bounce"])
+        camera_grid = "the same"
     stored, size = f"{entry['stored']} {entry['dtype']}", checks.size(entry["nbytes"])
-    facts = (sizes["shape"], entry["channels"], sizes["grid"], sizes["camera_grid"], stored)
-    return (entry["file"], *facts, entry["entries"], size, first, entry["dark_pixels"])
+    facts = (shape, entry["channels"], grid, camera_grid, stored, entry["entries"], size)
+    first = entry["first_bounce"] and _interval(*entry["first_bounce"])
+    return (entry["file"], *facts, first, entry["dark_pixels"])
+
+
+def _plot(path: Path | None) -> Path | None:
+    if path is not None and path.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise typer.BadParameter(f"{path} must be a .png, .svg or .pdf")
+    return options.writable_file(path)
+
+
+_PLOT = "Draw bounds on rho(R) and the forecast: .png, .svg or .pdf."
+
+
+@command(*options.TRANSPORT)
+def analyze(
+    context: Context,
+    files: options.Matrices,
+    rtol: Annotated[float, option("Relative residual at which a solve ends.")] = 1e-2,
+    show_dark: options.ShowDark = None,
+    plot: Annotated[Path | None, options.file(_PLOT, callback=_plot)] = None,
+) -> Answer:
+    """Spectrum of R, products each method needs to the tolerance, and whether T is physically possible."""
+    analyses, entries, spectra, forecasts, lights, verdicts = {}, [], [], [], {}, {}
+    for file in context.progress.each(files):
+        T = options.load(context, file)
+        lights[file.name] = T.first_bounce, T.grid
+        context.progress("analyzing")
+        analyses[file.name] = facts = analysis.analyze(T, rtol=rtol)
+        verdicts[str(file)] = facts.verdict
+        entries.append({"file": str(file), "device": T.device.name, **facts.to_dict()})
+        for colour, channel in zip(_COLOURS[T.channels], facts.channels, strict=True):
+            label = {"file": str(file), "channel": colour}
+            spectra.append(label | _spectrum(channel))
+            forecasts.append(label | channel.products)
+    if plot is not None:
+        from ltcl import plots
+
+        plots.save(plots.analysis(analyses), plot)
+    if show_dark is not None:
+        pictures.write_first_bounces(show_dark, lights)
+    lines = [
+        "Spectrum of R, bounds on that of S, and checks of the measurement",
+        table([*spectra[0]], [row.values() for row in spectra]),
+        "  negative light: in one bounce between parts of the picture; should be 0",
+        "  light passed on: share of each pixel's light, by one bounce; must be at least 0 and below 1",
+        f"\nProducts with S to a relative residual of {rtol:g}, two more by sweeps; -: no forecast",
+        table([*forecasts[0]], [row.values() for row in forecasts]),
+        *options.verdicts(verdicts),
+    ]
+    return Answer(entries, lines)
+
+
+def _spectrum(channel: analysis.ChannelAnalysis) -> dict[str, Any]:
+    energy, first = channel.energy, channel.first_bounce
+    return {
+        "rho(R)": channel.spectral_radius,
+        "certificate": channel.spectral_radius_certificate,
+        "rho(R) within": _interval(*channel.spectral_radius_bounds),
+        "albedo": channel.albedo,
+        "S within": _interval(*channel.bounds),
+        "first bounce": _interval(first[0], first[-1]),
+        "reciprocity defect": channel.reciprocity_defect,
+        "negative light": percent(channel.negative_bounce),
+        "light passed on": _interval(energy.bounce_lowest, energy.bounce_highest),
+    }
+
+
+def _bytes(text: str) -> int:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmg]?i?)b?\s*", text, re.IGNORECASE)
+    count = int(float(match[1]) * _UNITS.get(match[2].lower(), 0)) if match else 0
+    if count < 1:
+        raise typer.BadParameter(f"{text!r} is no size; write bytes, or for instance 50MB or 1.5GiB")
+    return count
+
+
+def _rtol(text: str) -> float | str:
+    return text if text == "noise" else float(text)
+
+
+_BUDGET = "Bytes that the numbers of R may take, such as 50MB."
+_Norm = Annotated[Literal["pictures", "worst"], option("Whose error: of pictures, or any light.")]
+_BASIS = "pixels or a wavelet (haar, db2, ...; compress: 'db2 rows', too); more than once: the best of them."
+_RTOL = "Relative error that solutions may have; compress: or noise, which keeps what stands out of it."
+
+
+def _accuracy_options(
+    rtol: Annotated[Any, option(_RTOL, parser=_rtol, metavar="FLOAT")] = 1e-2,
+    basis: Annotated[list[str] | None, option(_BASIS)] = None,
+) -> None:
+    """How accurate the solutions are, and in which basis R is written."""
+
+
+@command(*options.TRANSPORT, _accuracy_options)
+def compress(
+    context: Context,
+    file: options.Matrix,
+    out: Annotated[Path, options.out("The compressed transport: .npz or .zarr.")],
+    budget: Annotated[int | None, option(_BUDGET, parser=_bytes, metavar="SIZE")] = None,
+    norm: _Norm = "pictures",
+) -> Answer:
+    """Write R in a basis where it is sparse; basis, threshold and precision are chosen by measurement."""
+    rtol, basis = context.options["rtol"], context.options["basis"] or None
+
+    def make(T: Transport, progress: Any) -> Transport:
+        if T.is_compressed and T.error:
+            error = f"with an error of {T.error:.2g}"
+            raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
+        return compression.compress(T, rtol, budget, norm=norm, basis=basis, progress=progress)
+
+    _, C, data = _transform(context, file, out, make)
+    facts: Any = C.compression
+    data |= {"bytes": facts.uncompressed, "bytes_compressed": C.nbytes}
+    data |= {"bytes_on_disk": options.on_disk(out), "solution_error": C.error}
+    data |= {"error_bound": C.error_bound, "compression": facts}
+    before, after, disk = (checks.size(data[f"bytes{name}"]) for name in ("", "_compressed", "_on_disk"))
+    columns = ("channel", "basis", "core", "numbers a row", "bytes", "error of R, 2-norm")
+    rows = []
+    for colour, channel in zip(_COLOURS[C.channels], facts.channels, strict=True):
+        core = f"{channel.format} 1 x {channel.width} {channel.precision}"
+        rows.append((colour, channel.basis, core, channel.kept, checks.size(channel.nbytes), channel.error))
+    within = f"solutions within {checks.upwards(C.error)}, {disk} on disk, in {facts.seconds:.3g} s"
+    within += f", or {checks.upwards(C.error_bound)} for light that is no picture" * (norm == "pictures")
+    line = f"\n{out}: {before} to {after} with the first bounce, {within}"
+    return Answer(data, [table(columns, rows), line])
+
+
+@command(*options.TRANSPORT)
+def denoise(
+    context: Context,
+    file: options.Matrix,
+    out: Annotated[Path, options.out("The transport with less noise: .npz or .zarr.")],
+) -> Answer:
+    """Write TRANSPORT with less noise: reciprocal pairs averaged, wavelet coefficients shrunk."""
+    T, result, data = _transform(context, file, out, denoising.denoise)
+    noise = {"before": T.noise.floor.tolist(), "after": result.noise.floor.tolist()}
+    data["noise"] = {"source": T.noise.source, **noise}
+    rows = zip(_COLOURS[T.channels], *noise.values(), strict=True)
+    return Answer(data, [table(("channel", "noise of an entry", "that left, in pictures"), rows), f"\n{out}"])
+
+
+@command(*options.TRANSPORT, _accuracy_options)
+def invert(
+    context: Context, file: options.Matrix, out: Annotated[Path, options.out("The inverse: .npz.")]
+) -> Answer:
+    """Find A = I - S^-1, one physical bounce, so that each further picture costs one product."""
+    basis = context.options["basis"] or compression.INVERSE_NAMES
+    make = partial(compression.invert, rtol=context.options["rtol"], basis=basis)
+    _, inverse, data = _transform(context, file, out, make, is_inverse=True)
+    data |= {"bytes": inverse.nbytes, "bytes_on_disk": out.stat().st_size}
+    data |= {"errors": inverse.errors, "confidence": inverse.confidence}
+    sizes = f"{checks.size(data['bytes'])}, {checks.size(data['bytes_on_disk'])} on disk"
+    return Answer(data, [f"{out}: solutions within {checks.upwards(inverse.error)}, {sizes}"])
+
+
+def _transform(
+    context: Context, file: Path, out: Path, make: Callable[..., Any], is_inverse: bool = False
+) -> tuple[Transport, Any, dict[str, Any]]:
+    """T, what is made of it and written to `out`, and the beginning of the report.
+
+    The place is checked before a long computation.
+    """
+    formats.find(out, inverse=is_inverse)
+    if not is_inverse and out.suffix.lower() not in (".npz", ".zarr"):
+        raise InputError(f"--out is {out}; a {context.name}ed transport must be a .npz or a .zarr")
+    if out.exists() and file.exists() and out.samefile(file):
+        raise InputError(f"--out is {out}, which is TRANSPORT itself; it must be another file")
+    T = options.load(context, file)
+    result = make(T, progress=partial(context.progress, total=1.0))
+    (store.save_inverse if is_inverse else store.save)(out, result)
+    if not is_inverse:
+        options.note_lost(file, out)
+    return T, result, options.heading(context, file, T) | {"out": out}
+
+
+@command(options.file_options)
+def convert(
+    context: Context,
+    source: Annotated[Path, options.argument("IN", options.FORMATS)],
+    target: Annotated[Path, options.argument("OUT", "The new file.", callback=options.writable_file)],
+) -> Answer:
+    """Write a transport in another format; OUT is replaced whole or not at all. Needs no device."""
+    formats.find(target)  # refused before a long read
+    context.progress(f"reading {source}")
+    record = formats.read(source, variable=context.options["variable"])
+    with about(source):
+        pixels = zip(("grid", "camera_grid"), record.shape[::-1], strict=True)
+        sizes = {name: checks.grid(name, size, n) for name, n in pixels if (size := context.options[name])}
+        if isinstance(record, Record):
+            record = dataclasses.replace(record, **sizes)
+        elif any(size != record.grid for size in sizes.values()):
+            (h, w), size = record.grid, next(iter(sizes.values()))
+            raise InputError(f"grid is {size}; this transport is compressed on {h} x {w}")
+        facts, _ = _describe(target, record)  # refuses what could not be loaded again
+    context.progress(f"writing {target}")
+    formats.write(target, record)
+    options.note_lost(source, target)
+    if target.suffix.lower() == ".npy" or record.grid is None:
+        text = "x".join(map(str, record.grid or "HW"))
+        note(f"{target}: does not contain the grid; give --grid {text} wherever you use it")
+    elif record.shape[0] != record.shape[1] and record.camera_grid is None:
+        note(f"{target}: does not contain the camera's grid; give --camera-grid HxW, or to relight")
+    size = checks.size(options.on_disk(target))
+    return Answer({"source": source, **facts}, [f"{target}: {facts['stored']}, {size} on disk"])

@@ -6,25 +6,18 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from ltcl import __version__
 from ltcl.cli.acquire import app as acquire
-from ltcl.cli.acquire import show
-from ltcl.cli.analyze import analyze
+from ltcl.cli.acquire import show, simulate
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
-from ltcl.cli.compensate import compensate
-from ltcl.cli.compress import compress, invert
-from ltcl.cli.denoise import denoise
-from ltcl.cli.doctor import devices, doctor
-from ltcl.cli.files import convert, info
-from ltcl.cli.separate import relight, separate
-from ltcl.cli.simulate import demo, simulate
+from ltcl.cli.compensate import compensate, relight, separate
+from ltcl.cli.doctor import demo, devices, doctor
+from ltcl.cli.files import analyze, compress, convert, denoise, info, invert
 from ltcl.errors import LtclError
-
-_UsageError: Any = typer.BadParameter.__base__  # typer exports those below it only
 
 app = typer.Typer(
     name="ltcl",
@@ -56,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
     try:
         return app(args=words, prog_name="ltcl", standalone_mode=False) or 0
-    except _UsageError as error:
+    except UsageError as error:
         message = error.format_message().rstrip(".")
         if not message:  # help was shown
             return USAGE
@@ -64,9 +57,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         value = next((value for name, value in pairwise(words) if name in options), "")
         message += "" if value in message else f"; it is {value}"
         path = error.ctx.command_path if error.ctx else "ltcl"
-        return fail(UsageError(f"{message}; see '{path} --help'"), "--json" in words)
+        return fail(UsageError(f"{message}; see '{path} --help'"), "--json" in words)["exit_code"]
     except (LtclError, KeyboardInterrupt) as error:  # before a command began
-        return fail(error, "--json" in words)
+        return fail(error, "--json" in words)["exit_code"]
     except SystemExit as end:  # of a pipe that was closed
         return end.code if isinstance(end.code, int) else 1
 

@@ -1,19 +1,34 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Options and arguments that several commands share, each defined once; output places are tested at once."""
+"""Options that several commands share, each defined once, and what they ask for.
+
+Groups of options have their function here: `load` the transport that a command works with, `solving` how, and
+`heading` what its report says of both. Output places are tested before any work.
+"""
 
 from __future__ import annotations
 
 import os
 import re
 import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import typer
 
-from ltcl.errors import FileError
+from ltcl import checks, report, store
+from ltcl.cli.command import Context, note, table
+from ltcl.device import open_device
+from ltcl.errors import FileError, InputError
 from ltcl.first_bounce import DARK
-from ltcl.solvers.solve import METHODS
+from ltcl.solvers.solve import METHODS, SAMPLED
+from ltcl.transport import Transport, default_rtol, resolve_reference
+from ltcl.verdict import Verdict
+
+_ROUNDING = 1e-5  # of float32, in a picture
 
 
 def grid(text: str) -> tuple[int, int]:
@@ -31,18 +46,8 @@ def path(text: str) -> Path:
     return Path(text)
 
 
-def writable_folder(place: Path | None) -> Path | None:
-    """Refuse, before any work, a folder that results cannot be written to."""
-    return place and _writable(place, place)
-
-
-def writable_file(place: Path | None) -> Path | None:
-    """Refuse, before any work, a file that cannot be written."""
-    return place and _writable(place, place.parent)
-
-
-def _writable(place: Path, folder: Path) -> Path:
-    """`place`, if a nameless file can be made in the lowest folder above it that exists."""
+def writable(place: Path, folder: Path) -> Path:
+    """`place`, in `folder`; refused before any work if no file can be made in what exists of the folder."""
     try:
         above = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
         with tempfile.TemporaryFile(dir=above):
@@ -52,7 +57,12 @@ def _writable(place: Path, folder: Path) -> Path:
         raise FileError(f"{place}: cannot be written: {reason}") from None
 
 
-def _method(name: str) -> str:
+def writable_file(place: Path | None) -> Path | None:
+    """The same of a file."""
+    return place and writable(place, place.parent)
+
+
+def _known(name: str) -> str:
     if name not in METHODS:
         raise typer.BadParameter(f"{name!r} is no method; choose one of {', '.join(METHODS)}")
     return name
@@ -69,9 +79,8 @@ def option(help: str, *names: str, **settings: Any) -> Any:
     return typer.Option(*names, help=help, **settings)
 
 
-def file(help: str, *names: str, metavar: str = "FILE", **settings: Any) -> Any:
-    """An option that is a path."""
-    return typer.Option(*names, parser=path, metavar=metavar, help=help, **settings)
+file = partial(option, parser=path, metavar="FILE")  # that is a path
+pixels = partial(option, parser=grid, metavar="HxW")  # that is a grid
 
 
 def out(help: str, callback: Any = writable_file, metavar: str = "FILE") -> Any:
@@ -81,9 +90,6 @@ def out(help: str, callback: Any = writable_file, metavar: str = "FILE") -> Any:
 
 FORMATS = "Light transport: .npz, .npy, .mtx, .mat or .zarr; with the extra hdf5 also .h5, and .mat of v7.3."
 _DEVICE = "gpu, cpu, an index of 'ltcl devices', or part of a name. Default: LTCL_DEVICE, else the best."
-_GRID, _CAMERA = "Projector pixels, if the file lacks them.", "Camera pixels, if other ones."
-_METHOD = f"One of {', '.join(METHODS)}."
-_INVERSE = "From 'ltcl invert': each picture takes one product and no solve."
 _SEED = "Of monte_carlo and hybrid: the same numbers."
 _ENCODING = "Of pictures; auto: integers sRGB, floats linear."
 _RTOL = "Relative residual that ends a solve. Default: 0.01 (separate: 0.001), or the error of T where more."
@@ -97,7 +103,7 @@ _DARK = "Direct light below DARK times its median is dark, too; 0 leaves it lit.
 Matrix = Annotated[Path, argument("TRANSPORT", FORMATS)]
 Matrices = Annotated[list[Path], argument("FILE...", FORMATS)]
 Pictures = Annotated[list[Path], argument("PICTURE...", "Pictures: .png, .jpg, .tif, .bmp or .exr.")]
-Out = Annotated[Path, out("Folder for the results; filled only on success.", writable_folder, "DIR")]
+Out = Annotated[Path, out("Folder for the results; filled only on success.", lambda p: writable(p, p), "DIR")]
 Acquisition = Annotated[Path, argument("DIR", "Folder with an acquisition.toml; 'ltcl simulate' makes one.")]
 Device = Annotated[str | None, option(_DEVICE)]
 OnDark = Annotated[Literal["mask", "raise"], option(_ON_DARK)]
@@ -106,8 +112,8 @@ Variable = Annotated[str | None, option("Name of the matrix in a .mat, .h5 or .n
 
 
 def file_options(
-    grid: Annotated[tuple | None, option(_GRID, parser=grid, metavar="HxW")] = None,
-    camera_grid: Annotated[tuple | None, option(_CAMERA, parser=grid, metavar="HxW")] = None,
+    grid: Annotated[tuple | None, pixels("Projector pixels, if the file lacks them.")] = None,
+    camera_grid: Annotated[tuple | None, pixels("Camera pixels, if other ones.")] = None,
     variable: Variable = None,
 ) -> None:
     """What a transport file may not contain."""
@@ -124,9 +130,9 @@ def transport_options(
 
 
 def solve_options(
-    method: Annotated[str, option(_METHOD, callback=_method, metavar="NAME")] = "auto",
+    method: Annotated[str, option(f"One of {', '.join(METHODS)}.", callback=_known, metavar="NAME")] = "auto",
     rtol: Annotated[float | None, option(_RTOL)] = None,
-    inverse: Annotated[Path | None, file(_INVERSE)] = None,
+    inverse: Annotated[Path | None, file("From 'ltcl invert': one product a picture and no solve.")] = None,
     exact: Annotated[Path | None, file(_EXACT)] = None,
     samples: Annotated[int | None, option(_SAMPLES, min=1, max=2**32 - 1)] = None,
     seed: Annotated[int | None, option(_SEED, min=0, max=2**64 - 1)] = None,
@@ -139,3 +145,109 @@ def picture_options(
     encoding: Annotated[Literal["auto", "srgb", "linear"], option(_ENCODING)] = "auto",
 ) -> None:
     """How pictures are read."""
+
+
+TRANSPORT = (file_options, transport_options)
+TASK = (*TRANSPORT, solve_options, picture_options)
+
+
+def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
+    """Open the device, then load: a mistyped device does not wait for a large file."""
+    device = open_device(context.options["device"])
+    context.progress(f"reading {path}")
+    names = ("variable", "grid", "camera_grid", "first_bounce", "on_dark", "dark")
+    settings = {name: context.options[name] for name in names if context.options.get(name) is not None}
+    if noise := context.options.get("noise"):
+        context.progress(f"reading {noise}")
+        second = {name: settings[name] for name in names[:3] if name in settings}
+        settings["noise"] = store.load(noise, device=device, **second)
+    T = store.load(path, device=device, **settings)
+    if (dark := int(T.masked.sum())) and dark_note and not T.dark:  # which was logged
+        note(f"{path}: {dark} of {T.shape[1]} projector pixels give no direct light; they stay unlit")
+    return T
+
+
+def is_measured(path: Path) -> bool:
+    """Whether `ltcl.acquire` made this store; whoever loads a damaged one says what is wrong."""
+    with suppress(InputError):
+        return path.is_dir() and "strategy" in store.BlockStore.open(path).attributes
+    return False
+
+
+def note_lost(source: Path, target: Path) -> None:
+    """Say what a copy of a measured transport does not keep."""
+    if is_measured(source):
+        note(f"{target}: does not keep how the projector was measured; use compensate --calibration {source}")
+
+
+def solving(context: Context, T: Transport, rtol: float, solves: int = 1) -> dict[str, Any]:
+    """Arguments of a task of tolerance `rtol` by default, from `solve_options`.
+
+    Its progress is that of so many solves of all channels, of a method that samples one for all.
+    """
+    asked = context.options
+    inverse = asked["inverse"] and store.load_inverse(asked["inverse"], device=T.device)
+    exact = asked["exact"] and _load_exact(asked["exact"], T, asked["variable"])
+    rtol = default_rtol(rtol, T, exact, inverse) if asked["rtol"] is None else asked["rtol"]
+    settings = {"method": asked["method"], "rtol": rtol, "inverse": inverse, "exact": exact}
+    settings |= {name: asked[name] for name in ("samples", "seed") if asked[name] is not None}
+    solves *= 1 if asked["method"] in SAMPLED else T.channels
+    return settings | {"callback": context.progress.solve(rtol, solves)}
+
+
+def shows_noise(T: Transport, settings: dict[str, Any]) -> bool:
+    """Whether its results have standard deviations: noise of T was measured, or T shows its entries."""
+    judged = settings["exact"] or T
+    return not judged.is_compressed or judged.measured_noise is not None
+
+
+def _load_exact(path: Path, T: Transport, variable: str | None) -> Transport:
+    """What T was compressed from, with its first bounce; InputError where it is another transport."""
+    on_dark, same = "mask" if T.masked.any() else "raise", {"grid": T.grid, "first_bounce": T.first_bounce}
+    exact = store.load(path, variable=variable, on_dark=on_dark, dark=0.0, device=T.device, **same)
+    resolve_reference(T, exact)  # refuses other colours
+    pattern = np.random.default_rng(0).random((*T.grid, *(3,) * (T.channels == 3)))
+    picture = T @ pattern
+    error = float(np.linalg.norm(picture - exact @ pattern) / np.linalg.norm(picture))
+    if not error <= T.error + _ROUNDING:
+        bound = f"differ by {error:.2g}, more than {checks.upwards(T.error + _ROUNDING)}"
+        text = f"is not what TRANSPORT was compressed from: pictures under a random pattern {bound}"
+        raise InputError(f"{path}: {text}")
+    return exact
+
+
+def verdicts(files: Mapping[str, Verdict]) -> list[str]:
+    """The end of a report: numbers of each file, and what follows from them."""
+    names = dict.fromkeys(name for v in files.values() for name in v.numbers)
+    rows = ([name, *(v.numbers.get(name) for v in files.values())] for name in names)
+    lines = [f"{file}: {v.text}" if files.keys() - {file} else v.text for file, v in files.items()]
+    return ["", table(["verdict", *files], rows), *lines] if names else lines
+
+
+def caveat(what: str, T: Transport, exact: Path | None = None) -> str | None:
+    """A line on the error of a compressed T, which `what` does not include."""
+    if not T.error:
+        return None
+    if exact is not None:
+        return f"{what} of {exact}, by which solutions were corrected"
+    bound = f"{100 * float(checks.upwards(T.error)):.2g} %" + " for pictures" * (T.error < T.error_bound)
+    return f"{what} of the compressed transport, whose own relative error is at most {bound}"
+
+
+def heading(context: Context, path: Path, T: Transport, **options: Any) -> dict[str, Any]:
+    """The beginning of every report: the command, versions, device, transport, and options as resolved."""
+    names = ("shape", "channels", "grid", "camera_grid", "error")
+    facts = {"masked": int(T.masked.sum()), "compressed": T.is_compressed}
+    return {
+        "command": context.name,
+        "versions": report.versions(),
+        "device": report.device(T.device),
+        "transport": {"file": path, **{name: getattr(T, name) for name in names}, **facts},
+        "options": {name: value for name, value in context.options.items() if name != "out"} | options,
+    }
+
+
+def on_disk(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())

@@ -52,9 +52,8 @@ def read(
     """
     from ltcl import images
 
-    encoding, is_code = context.options["encoding"], False
-    if setup is not None and encoding == "auto":
-        is_code = images.read_codes(path).dtype.kind == "u"
+    encoding = context.options["encoding"]
+    is_code = setup is not None and encoding == "auto" and images.read_codes(path).dtype.kind == "u"
     picture = images.read(path, encoding="linear" if is_code else encoding, upright=upright)
     if picture.shape[:2] != grid and context.options["resize"]:
         picture = images.resize(picture, grid)
@@ -113,16 +112,17 @@ def mark(codes: np.ndarray, missing: np.ndarray) -> np.ndarray:
     return (1 - share) * grey + share * np.where(missing > 0, _ORANGE, _BLUE)
 
 
-def panel(codes: np.ndarray, label: str) -> Any:
-    """sRGB values (h, w, 3) in [0, 1] as a picture of Pillow: enlarged, with its label above."""
+def panel(picture: np.ndarray, label: str, factor: float | None = None) -> Any:
+    """A linear picture times `factor`, or sRGB values, as one of Pillow: enlarged, with its label above."""
     from PIL import Image, ImageDraw, ImageFont
 
+    codes = picture if factor is None else shades(picture, factor)
     side = -(-_WIDTH // codes.shape[1])
     large = np.rint(255 * codes).astype(np.uint8).repeat(side, axis=0).repeat(side, axis=1)
     sheet = Image.new("RGB", (large.shape[1], large.shape[0] + 2 * _TEXT), _PAPER)
     sheet.paste(Image.fromarray(large), (0, 2 * _TEXT))
-    font = ImageFont.load_default(_TEXT)
-    ImageDraw.Draw(sheet).text((_MARGIN, _TEXT // 2), label, fill=_INK, font=font)
+    place, font = (_MARGIN, _TEXT // 2), ImageFont.load_default(_TEXT)
+    ImageDraw.Draw(sheet).text(place, label, fill=_INK, font=font)
     return sheet
 
 
@@ -165,4 +165,4 @@ def amplified(components: Mapping[str, np.ndarray], factor: float) -> list[Any]:
 
 def _brightened(picture: np.ndarray, factor: float, name: str) -> tuple[int, Any]:
     times = 2 ** int(np.log2(max(exposure(picture) / factor, 1.0)))
-    return times, panel(shades(picture, factor * times), f"{name}, {times} times as bright")
+    return times, panel(picture, f"{name}, {times} times as bright", factor * times)
