@@ -111,6 +111,8 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
     default they are as many as there are GPUs, or one. ClusterError where nothing answers.
     """
     dask = _distributed()
+    from dask import config
+
     with contextlib.ExitStack() as stack:
         if cluster == "local":
             same = device or os.environ.get("LTCL_DEVICE")
@@ -119,10 +121,12 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
             cores = {} if gpus else {"POCL_MAX_PTHREAD_COUNT": str(max(1, (os.cpu_count() or 1) // count))}
             names = gpus or [same or open_device().description.index]
             local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
-            one = {**local, "nthreads": 1, "memory_limit": 0}
+            one = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL}
             nannies = [{**one, "env": {**cores, "LTCL_DEVICE": names[k % len(names)]}} for k in range(count)]
             specification = {k: {"cls": dask.Nanny, "options": nanny} for k, nanny in enumerate(nannies)}
             scheduler = {"cls": dask.Scheduler, "options": local}
+            # Else a worker that takes 15 s to start again, on a busy machine, is given up.
+            stack.enter_context(config.set({"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}))
             address = dask.SpecCluster(specification, scheduler, silence_logs=logging.CRITICAL)
             stack.enter_context(address)
         elif workers is not None:

@@ -20,6 +20,7 @@ from distributed import Client, LocalCluster
 import ltcl
 from ltcl import images
 from ltcl.batch import compensate_frames
+from ltcl.cli.main import main
 from ltcl.cluster import stream
 from ltcl.errors import BatchError, ClusterError, FileError, InputError, InputTypeError
 from tests.problems import lambertian
@@ -264,3 +265,49 @@ def test_scenes_one_task_each_and_those_that_fail_are_named(request, film, tmp_p
     assert calls == [("scenes", number, 4) for number in (1, 2, 3, 4)]
     assert error.value.results[::2] == [pytest.approx(SCENE.F.sum(), rel=0.2)] * 2
     assert all(isinstance(each, FileError) for each in error.value.results[1::2])
+
+
+def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_path, capsys):
+    desired = tmp_path / "desired.png"
+    images.write(desired, np.full(GRID, 0.2))
+    for name in ("a", "b"):
+        shutil.copy(film / "T.npz", tmp_path / f"{name}.npz")
+    (tmp_path / "c.npz").write_bytes(b"no transport")
+    address, out = client.scheduler.address, tmp_path / "out"
+    scenes = ["compensate", "--transports", str(tmp_path / "*.npz"), str(desired), "--out", str(out)]
+    assert main([*scenes, "--cluster", address]) == 1
+    assert "1 of 3 scenes failed" in capsys.readouterr().err
+    assert main(["compensate", str(tmp_path / "a.npz"), str(desired), "--out", str(tmp_path / "one")]) == 0
+    for name in ("a", "b"):
+        for picture in tmp_path.glob("one/*.exr"):
+            assert (out / name / picture.name).read_bytes() == picture.read_bytes()
+    frames = ["compensate", str(film / "T.npz"), str(film / "in"), "--rtol", "0.01", "--batch", "4"]
+    frames += ["--appearance", "--out", str(tmp_path / "frames")]
+    assert main([*frames, "--cluster", "local", "--workers", "1", "--frames", "4"]) == 0
+    assert main([*frames, "--cluster", address, "--resume"]) == 0
+    patterns = {name: data for name, data in everything(film / "serial").items() if "json" not in name}
+    assert everything(tmp_path / "frames").items() >= patterns.items()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--cluster", "127.0.0.1:9"], "no scheduler answers"),
+        (["--workers", "2"], "--workers is 2"),
+        (["--cluster", "127.0.0.1:9", "--workers", "2"], "workers is 2"),
+    ],
+)
+def test_a_cluster_that_is_none_is_refused_in_one_line(film, tmp_path, capsys, options, text):
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        frames = [
+            "compensate",
+            str(film / "T.npz"),
+            str(film / "in"),
+            "--out",
+            str(tmp_path / "out"),
+            *options,
+        ]
+        assert main(frames) == 1
+    error = capsys.readouterr().err
+    assert (text in error, error.count("\n")) == (True, 1), error
+    assert not (tmp_path / "out").exists()
