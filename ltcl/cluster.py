@@ -266,7 +266,7 @@ class _Crew:
 
         reference = self.function.reference() if hasattr(self.function, "reference") else None
         forms = filter(None, (reference, self.function))
-        return [(_introduction(), __version__), *((_join, self.token, form) for form in forms)]
+        return [(_version_check(), __version__), (describe,), *((_join, self.token, form) for form in forms)]
 
     def _ask(self, address: str, questions: list[tuple[Any, ...]]) -> None:
         self.asked[address] = self._send([address], *questions[0]), questions[1:]
@@ -312,19 +312,17 @@ class _Crew:
 # What runs on workers
 
 
-def _introduction() -> Callable[[str], Any]:
-    """Name and GPU of a worker. A local function is sent as code: there may be another ltcl, or none."""
+def _version_check() -> Callable[[str], Any]:
+    """A local function is sent as code: a worker may have another ltcl, or none."""
 
-    def introduce(version: str) -> Any:
+    def check(version: str) -> bool | str:
         try:
-            from ltcl import __version__, cluster
+            from ltcl import __version__
         except ImportError as error:
             return f"it cannot import ltcl: {error}"
-        if __version__ != version:
-            return f"it has ltcl {__version__}, and the client {version}"
-        return cluster.describe()
+        return __version__ != version and f"it has ltcl {__version__}, and the client {version}"
 
-    return introduce
+    return check
 
 
 def describe() -> tuple[str, str | None]:

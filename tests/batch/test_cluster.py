@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import signal
@@ -30,12 +31,20 @@ WORKERS |= {"scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0
 
 
 @pytest.fixture(scope="module")
-def client(private_cache) -> Iterator[Client]:
+def cluster(private_cache) -> Iterator[Client]:
     """Of two workers, each with the device that ltcl opens by default, and what tests remember."""
     slowly = dask.config.set({"distributed.deploy.lost-worker-timeout": "120s"})  # on a busy machine
     environment = {"LTCL_CACHE": str(private_cache)}
     with slowly, LocalCluster(**WORKERS, env=environment) as cluster, Client(cluster) as client:
         yield client
+
+
+@pytest.fixture
+def client(cluster) -> Client:
+    """Both workers, those that an earlier test killed, too."""
+    cluster.wait_for_workers(2)
+    cluster.run(lambda: ltcl.open_device().name)
+    return cluster
 
 
 def pids(client: Client, *workers: str) -> list[int]:
@@ -125,6 +134,26 @@ def test_a_worker_without_device_is_named_and_takes_no_work(client, caplog, sele
     lines = [record.getMessage() for record in caplog.records if first in record.getMessage()]
     assert len(lines) == 1
     assert text in lines[0]
+
+
+def test_one_worker_for_each_gpu_unless_asked_for_more(client, caplog):
+    def claim(gpu: bool) -> None:
+        module: Any = importlib.import_module("ltcl.cluster")
+        module.original = getattr(module, "original", module.describe)
+        module.describe = (lambda: ("A GPU", "host, bus 1")) if gpu else module.original
+
+    def slow(_: int) -> int:
+        time.sleep(0.05)
+        return os.getpid()
+
+    client.run(claim, True)
+    try:
+        used = {*stream(client, slow, range(20))}
+        shared = {*stream(client, slow, range(20), share_gpu=True)}
+    finally:
+        client.run(claim, False)
+    assert (len(used), len(shared)) == (1, 2)
+    assert caplog.text.count("A GPU is the GPU of worker tcp://") == 1
 
 
 def test_another_version_takes_no_work_and_without_workers_nothing_is_done(client, caplog):
