@@ -42,6 +42,18 @@ class DeviceError(LtclError, RuntimeError):
     """An OpenCL device is missing, or failed; the message says what to do."""
 
 
+class ClusterError(LtclError, RuntimeError):
+    """A cluster does not answer, was lost, or has no worker that can take part."""
+
+
+class BatchError(LtclError, RuntimeError):
+    """Some of many scenes failed. `results` has all, in order, with errors in their places."""
+
+    def __init__(self, message: str, results: Any = ()) -> None:
+        super().__init__(message)
+        self.results = list(results)
+
+
 class AcquisitionError(LtclError, RuntimeError):
     """A photograph is missing, stale or unusable, or the rig failed; the message says which and why."""
 

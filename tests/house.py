@@ -23,7 +23,7 @@ from ltcl.cli.main import main as main_of_ltcl
 from ltcl.device import Device
 
 ROOT = Path(__file__).resolve().parents[1]
-CORE = 13_240
+CORE = 13_620
 
 _TASKS = [f"ltcl/{name}" for name in ("compensation", "separation.py", "relighting.py", "analysis.py")]
 _NOISE = ["ltcl/noise", *(f"ltcl/{name}.py" for name in ("uncertainty", "denoising", "verdict"))]
@@ -37,14 +37,16 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "compensation, separation, relighting, analysis": (1370, _TASKS),
     # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
     "noise": (1380, _NOISE),
-    "transport and the rest": (1390, ["ltcl/*.py"]),
+    # What frames, scenes and compression over a cluster share: of the 900 lines for all past one machine.
+    "cluster": (360, ["ltcl/cluster.py"]),
+    "transport and the rest": (1410, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
 _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1200, "images": 500, "batch": 500, "cli": 2000, "scenes": 2710}
+_OTHERS = {"acquisition": 6310, "store": 1210, "images": 500, "batch": 715, "cli": 2015, "scenes": 2710}
 _BENCHES = (
     "_boxes _coefficients _corner _harness _peers claims csr dense4k launches products relax "
     "resolution131k solve video walk"
@@ -62,7 +64,7 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),
     "tests of these": (
-        9000,
+        9220,
         [*(f"tests/{name}" for name in _OTHERS), "tests/test_plots.py"],
     ),
 }

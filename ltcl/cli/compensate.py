@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import dataclasses
+import glob
 import inspect
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -13,9 +17,11 @@ import typer
 
 from ltcl import checks, compensation, relighting, report, separation
 from ltcl.cli import options, pictures
-from ltcl.cli.command import Answer, Context, command, note, percent, table
+from ltcl.cli.command import Answer, Context, Progress, UsageError, command, note, percent, table
 from ltcl.cli.options import argument, file, option, writable_file
-from ltcl.errors import InputError, LtclError
+from ltcl.cluster import connect
+from ltcl.errors import BatchError, InputError, LtclError
+from ltcl.files import fill_folder
 from ltcl.transport import Transport
 
 _MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
@@ -51,14 +57,30 @@ def _film_options(
 
 
 _FRAMES = tuple(inspect.signature(_film_options).parameters)
+_CLUSTER = (
+    "local: processes here, one for each GPU; or the ADDRESS of a Dask scheduler. For frames and scenes."
+)
+_SCENES = (
+    "Of each of these in the place of TRANSPORT: a pattern such as 'scans/*.zarr'. DIR gets a folder each."
+)
 
 
-@command(*options.TASK, _film_options)
+def _cluster_options(
+    cluster: Annotated[str | None, option(_CLUSTER, metavar="local|ADDRESS")] = None,
+    workers: Annotated[int | None, option("Processes of --cluster local.", metavar="N", min=1)] = None,
+    transports: Annotated[str | None, option(_SCENES, metavar="PATTERN")] = None,
+) -> None:
+    """Of `ltcl.cluster` and `ltcl.batch.map`."""
+
+
+@command(*options.TASK, _film_options, _cluster_options)
 def compensate(
     context: Context,
     transport: options.Matrix,
-    picture: Annotated[list[Path], argument("PICTURE...", "Pictures; or one folder or one video of frames.")],
     out: options.Out,
+    picture: Annotated[
+        list[Path] | None, argument("PICTURE...", "Pictures; or one folder or one video of frames.")
+    ] = None,
     gain: Annotated[str | None, option(_GAIN, parser=_gain, metavar="FACTOR")] = None,
     loss: Annotated[float | None, option("Error that --gain auto may cost. Default: the least.")] = None,
     low: Annotated[float, option("Darkest light of the projector.")] = 0.0,
@@ -82,10 +104,18 @@ def compensate(
     The ambient light of a TRANSPORT of 'ltcl acquire' is the background, and the gain is auto.
 
     Of a folder or a video of frames, writes the numbered patterns and frames.json batch by batch, with one
-    gain for all; Ctrl-C keeps what is done, for --resume.
+    gain for all; Ctrl-C keeps what is done, for --resume. With --cluster workers solve, and do --transports;
+    docs/cluster.md shows how.
     """
     from ltcl.acquisition import Setup
 
+    picture = picture or []
+    if context.options["transports"] is not None:
+        own = {"gain": gain, "loss": loss, "low": low, "high": high, "clamp": clamp, "background": background}
+        own |= {"calibration": calibration, "weights": weights}
+        return _compensate_scenes(context, [transport, *picture], out, own)
+    if not picture:
+        raise UsageError("Missing argument 'PICTURE...'.")
     film = _film(picture, context.options)
     if mpi and film is not None:
         raise InputError(
@@ -129,7 +159,7 @@ def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
     if films and len(paths) > 1:
         text = f"holds frames, and there are {len(paths) - 1} more inputs; it must be the only one"
         raise InputError(f"{films[0]}: {text}")
-    for name in _FRAMES:
+    for name in (*_FRAMES, "cluster", "workers"):
         if not films and asked[name] not in (None, False):
             raise InputError(f"--{name} is given, but {paths[0]} is a picture; it is for a folder or a video")
     return films[0] if films else None
@@ -219,7 +249,8 @@ def _compensate_frames(
     asked = {name: context.options[name] for name in (*_FRAMES, "resize", "encoding")} | settings
     arguments = {name: value for name, value in asked.items() if value is not None and name != "callback"}
     try:
-        result = compensate_frames(T, film, out, progress=context.progress, **arguments)
+        with _cluster(context) as client:
+            result = compensate_frames(T, film, out, progress=context.progress, client=client, **arguments)
     except KeyboardInterrupt:
         count = f"{context.progress.done:.0f} frame(s) are done and stay in {out}"
         raise KeyboardInterrupt(f"interrupted; {count}; --resume goes on from there") from None
@@ -238,6 +269,57 @@ def _compensate_frames(
     row = (len(records), result.solved, pace, result.gain, *frames)
     also = "" if result.video is None else f", as a video in {result.video}"
     return [table(columns, [row]), f"\npatterns and frames.json in {out}{also}"]
+
+
+def _cluster(context: Context) -> AbstractContextManager[Any]:
+    """The client that was asked for, or None."""
+    cluster, workers, device = (context.options[name] for name in ("cluster", "workers", "device"))
+    if cluster is None and workers is not None:
+        raise InputError(f"--workers is {workers}, but there is no --cluster; it is for --cluster local")
+    return nullcontext() if cluster is None else connect(cluster, workers, device)
+
+
+def _compensate_scenes(context: Context, paths: list[Path], out: Path, own: dict[str, Any]) -> Answer:
+    """The pictures on each of many scenes, one task each; at the end those that failed are named."""
+    from ltcl.batch import map as of_each
+
+    pattern = context.options["transports"]
+    scenes = {Path(name).stem: Path(name) for name in sorted(glob.glob(pattern))}
+    if len(scenes) < max(1, len(glob.glob(pattern))):
+        raise InputError(f"--transports is {pattern}: it must mean files or folders of different names")
+    here = dict.fromkeys(("transports", "workers", *(["device"] * bool(context.options["cluster"]))))
+    task = partial(_compensate_scene, context.options | here | {"cluster": None}, paths, own)
+    failed = None
+    with _cluster(context) as client:
+        try:
+            results = of_each(task, scenes.values(), client=client, progress=context.progress)
+        except BatchError as error:
+            results, failed = error.results, error
+    data: dict[str, Any] = {"folder": out, "scenes": []}
+    for name, result in zip(scenes, results, strict=True):
+        if not isinstance(result, LtclError):
+            facts, files = result
+            data["scenes"].append(facts | {"folder": out / name})
+            with fill_folder(out / name) as folder:
+                for file, content in files.items():
+                    (folder / file).write_bytes(content)
+    if failed is not None:
+        raise failed
+    rows = [
+        (n, f["pictures"][0]["gain"], percent(max(p["error"] for p in f["pictures"])))
+        for n, f in zip(scenes, data["scenes"], strict=True)
+    ]
+    return Answer(data, [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"])
+
+
+def _compensate_scene(
+    asked: dict[str, Any], paths: list[Path], own: dict[str, Any], scene: Path
+) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """What the command says of one scene, and the files that it writes."""
+    with TemporaryDirectory() as folder, Progress(quiet=True) as progress:
+        context, place = Context("compensate", asked, progress), Path(folder) / "scene"
+        answer = inspect.unwrap(compensate)(context, transport=scene, picture=paths, out=place, **own)
+        return report.plain(answer.data), {file.name: file.read_bytes() for file in place.iterdir()}
 
 
 @command(*options.TASK)

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Work on a cluster of two processes: in order, whatever is killed, and with the bytes of a serial run."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import dask.config
+import numpy as np
+import pytest
+from distributed import Client, LocalCluster
+
+import ltcl
+from ltcl import images
+from ltcl.batch import compensate_frames
+from ltcl.cli.main import main
+from ltcl.cluster import stream
+from ltcl.errors import BatchError, ClusterError, FileError, InputError, InputTypeError
+from tests.problems import lambertian
+
+WORKERS: dict[str, Any] = {"n_workers": 2, "threads_per_worker": 1, "host": "127.0.0.1", "silence_logs": 50}
+WORKERS |= {"scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0.0.1:0"}}
+
+
+@pytest.fixture(scope="module")
+def cluster(private_cache) -> Iterator[Client]:
+    """Of two workers, each with the device that ltcl opens by default, and what tests remember."""
+    slowly = dask.config.set({"distributed.deploy.lost-worker-timeout": "120s"})  # on a busy machine
+    environment = {"LTCL_CACHE": str(private_cache)}
+    with slowly, LocalCluster(**WORKERS, env=environment) as cluster, Client(cluster) as client:
+        yield client
+
+
+@pytest.fixture
+def client(cluster) -> Client:
+    """Both workers, those that an earlier test killed, too."""
+    cluster.wait_for_workers(2)
+    cluster.run(lambda: ltcl.open_device().name)
+    return cluster
+
+
+def pids(client: Client, *workers: str) -> list[int]:
+    """Processes of these workers, or of all."""
+    answers: Any = client.run(os.getpid, workers=[*workers] or None)
+    return [*answers.values()]
+
+
+def kill(client: Client) -> None:
+    """End a worker as the kernel does when memory is short."""
+    os.kill(pids(client)[0], signal.SIGKILL)
+
+
+def test_results_come_in_order_and_items_are_taken_as_results_are(client):
+    taken = []
+
+    def items() -> Iterator[int]:
+        for number in range(40):
+            taken.append(number)
+            yield number
+
+    def slow(number: int) -> int:
+        time.sleep(0.05 if number % 5 == 0 else 0.0)
+        return number * number
+
+    for done, result in enumerate(stream(client, slow, items(), window=3)):
+        assert result == done * done
+        assert len(taken) <= done + 1 + 2 * 3
+    assert len(taken) == 40
+    for _ in range(50):  # nothing stays on the scheduler
+        time.sleep(0.1 if client.futures else 0.0)
+    assert not client.futures
+
+
+def test_an_error_is_raised_at_the_place_of_its_item(client):
+    def fails(number: int) -> int:
+        if number == 7:
+            raise InputError("number is 7")
+        return number
+
+    results = stream(client, fails, range(20))
+    assert [next(results) for _ in range(7)] == [*range(7)]
+    with pytest.raises(InputError, match="number is 7"):
+        next(results)
+
+
+def test_what_was_killed_is_done_by_others_and_joins_again(client):
+    def slow(number: int) -> tuple[int, int]:
+        time.sleep(0.05)
+        return number, os.getpid()
+
+    results = []
+    for result in stream(client, slow, range(100)):
+        results.append(result)
+        if len(results) in (5, 10, 15):
+            kill(client)
+    assert [number for number, _ in results] == [*range(100)]
+    assert len({pid for _, pid in results}) >= 3  # of two
+
+
+@pytest.mark.parametrize(("select", "text"), [("abacus", "device is 'abacus'"), ("", "no OpenCL device")])
+def test_a_worker_without_device_is_named_and_takes_no_work(client, caplog, select, text):
+    first, second = client.nthreads()
+
+    def hide() -> None:
+        import pyopencl
+
+        if select:
+            os.environ["LTCL_DEVICE"] = select
+        else:
+            module: Any = pyopencl
+            module.platforms, module.get_platforms = module.get_platforms, list
+
+    def show() -> None:
+        import pyopencl
+
+        os.environ.pop("LTCL_DEVICE", None)
+        module: Any = pyopencl
+        module.get_platforms = getattr(module, "platforms", module.get_platforms)
+
+    client.run(hide, workers=[first])
+    try:
+        used = {*stream(client, lambda _: os.getpid(), range(20))}
+    finally:
+        client.run(show, workers=[first])
+    assert used == {*pids(client, second)}
+    lines = [record.getMessage() for record in caplog.records if first in record.getMessage()]
+    assert len(lines) == 1
+    assert text in lines[0]
+
+
+def test_one_worker_for_each_gpu_unless_asked_for_more(client, caplog):
+    def claim(gpu: bool) -> None:
+        module: Any = importlib.import_module("ltcl.cluster")
+        module.original = getattr(module, "original", module.describe)
+        module.describe = (lambda: ("A GPU", "host, bus 1")) if gpu else module.original
+
+    def slow(_: int) -> int:
+        time.sleep(0.05)
+        return os.getpid()
+
+    client.run(claim, True)
+    try:
+        used = {*stream(client, slow, range(20))}
+        shared = {*stream(client, slow, range(20), share_gpu=True)}
+    finally:
+        client.run(claim, False)
+    assert (len(used), len(shared)) == (1, 2)
+    assert caplog.text.count("A GPU is the GPU of worker tcp://") == 1
+
+
+def test_another_version_takes_no_work_and_without_workers_nothing_is_done(client, caplog):
+    def rename(version: str) -> None:
+        ltcl.__version__ = version
+
+    client.run(rename, "0.0.9")
+    try:
+        with pytest.raises(ClusterError, match=r"no worker is left at tcp.* 2 "):
+            list(stream(client, abs, range(3)))
+    finally:
+        client.run(rename, ltcl.__version__)
+    assert f"has ltcl 0.0.9, and the client {ltcl.__version__}" in caplog.text
+    assert list(stream(client, abs, range(3))) == [0, 1, 2]
+
+
+def test_what_is_no_client_or_cannot_be_sent_is_refused(client):
+    wrong: Any = 3
+    with pytest.raises(InputTypeError, match="client is a int"):
+        list(stream(wrong, abs, [1]))
+    lock = threading.Lock()
+    with pytest.raises(InputTypeError, match=r"sent.*lock"):
+        list(stream(client, lambda _: lock, [1]))
+
+
+GRID = (20, 30)  # 600 pixels, more than are factorized
+FRAMES = 33
+SCENE = lambertian(600, 0.6, seed=80)
+random = np.random.default_rng(81)
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory, device) -> Path:
+    """Its frames, T, and what one process makes of both."""
+    folder = tmp_path_factory.mktemp("film")
+    ltcl.save(folder / "T.npz", ltcl.Transport(SCENE.T, GRID))
+    for number in range(FRAMES):
+        light = random.uniform(0.2, 0.6, SCENE.T.shape[1])
+        images.write(folder / "in" / f"f{number}.exr", (SCENE.T @ light).reshape(GRID))
+    T = ltcl.load(folder / "T.npz", device=device)
+    compensate_frames(T, folder / "in", folder / "serial", batch=4, appearance=True)
+    return folder
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+@pytest.mark.parametrize("seen", [True, False], ids=["file that workers see", "sent"])
+def test_frames_have_the_bytes_of_a_serial_run(client, film, device, tmp_path, seen):
+    T = ltcl.load(film / "T.npz", device=device)
+    T = T if seen else ltcl.Transport(SCENE.T, GRID, device=device)
+    calls = []
+    common: dict[str, Any] = {"batch": 4, "appearance": True, "client": client, "resume": True}
+    compensate_frames(T, film / "in", tmp_path, frames=8, **common)
+    done = compensate_frames(T, film / "in", tmp_path, progress=lambda *now: calls.append(now), **common)
+    assert everything(tmp_path) == everything(film / "serial")
+    assert done.solved == FRAMES - 8
+    assert [(step, total) for step, _, total in calls] == [("frames", FRAMES)] * len(calls)
+    assert [count for _, count, _ in calls] == [8, 12, 16, 20, 24, 28, 32, 33]
+
+
+def test_killed_workers_leave_every_frame_once_and_whole(client, film, tmp_path):
+    T, counts = ltcl.load(film / "T.npz"), []
+
+    def progress(step: str, done: int, total: int | None) -> None:
+        counts.append(done)
+        if len(counts) in (2, 4, 6):
+            kill(client)
+
+    done = compensate_frames(
+        T, film / "in", tmp_path, batch=4, appearance=True, client=client, progress=progress
+    )
+    assert everything(tmp_path) == everything(film / "serial")
+    assert (done.solved, counts) == (FRAMES, [*range(0, FRAMES, 4), FRAMES])
+
+
+def test_another_T_in_the_file_of_a_worker_is_refused(client, film, tmp_path, caplog):
+    path = tmp_path / "T.npz"
+    shutil.copy(film / "T.npz", path)
+    T = ltcl.load(path)
+    ltcl.save(path, ltcl.Transport(2 * SCENE.T, GRID))
+    with pytest.raises(ClusterError, match=r"no worker is left .*2 "):
+        compensate_frames(T, film / "in", tmp_path / "out", client=client)
+    assert caplog.text.count("another T") == 2
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("on_cluster", [False, True])
+def test_broken_frames_are_left_out_and_named(request, film, device, tmp_path, on_cluster):
+    client = request.getfixturevalue("client") if on_cluster else None
+    folder = shutil.copytree(film / "in", tmp_path / "in")
+    images.write(folder / "f2.exr", np.ones((3, 4)))
+    (folder / "f7.exr").write_bytes(b"no picture")
+    T = ltcl.load(film / "T.npz", device=device)
+    common: dict[str, Any] = {"batch": 4, "frames": 12, "client": client, "appearance": True}
+    with pytest.raises(FileError, match=r"(?s)3 \(.*3 x 4.*8 \(.*f7\.exr.*10 frame.*resume"):
+        compensate_frames(T, folder, tmp_path / "out", **common)
+    for number in (3, 8):
+        shutil.copy(film / "in" / f"f{number - 1}.exr", folder)
+        assert not (tmp_path / f"out/pattern_{number:06}.png").exists()
+    assert compensate_frames(T, folder, tmp_path / "out", resume=True, **common).solved == 2
+    same = compensate_frames(T, film / "in", tmp_path / "whole", **common)
+    for record in same.records:
+        name = f"pattern_{record.number:06}.png"
+        np.testing.assert_allclose(
+            images.read(tmp_path / "out" / name), images.read(tmp_path / "whole" / name), atol=0.02
+        )
+
+
+def test_a_lost_scheduler_is_one_line_and_the_next_run_goes_on(film, device, tmp_path):
+    T = ltcl.load(film / "T.npz", device=device)
+    here = {**WORKERS, "n_workers": 1, "processes": False, "protocol": "tcp://"}
+    with LocalCluster(**here) as cluster, Client(cluster) as other:
+
+        def progress(step: str, done: int, total: int | None) -> None:
+            if done == 8:
+                cluster.close()
+
+        common: dict[str, Any] = {"batch": 4, "appearance": True}
+        with pytest.raises(ClusterError, match=r"scheduler at .* lost.*8 frame.*resume=True") as error:
+            compensate_frames(T, film / "in", tmp_path, client=other, progress=progress, **common)
+        assert "\n" not in str(error.value)
+    compensate_frames(T, film / "in", tmp_path, resume=True, **common)
+    assert everything(tmp_path) == everything(film / "serial")
+
+
+@pytest.mark.parametrize("on_cluster", [False, True])
+def test_scenes_one_task_each_and_those_that_fail_are_named(request, film, tmp_path, on_cluster):
+    client = request.getfixturevalue("client") if on_cluster else None
+    paths, calls = [film / "T.npz", tmp_path / "none.npz", film / "T.npz", tmp_path / "nor.npz"], []
+
+    def light(path: Path) -> float:
+        return float(ltcl.load(path).first_bounce.sum())
+
+    with pytest.raises(BatchError, match=r"2 of 4 .*none\.npz: .*nor\.npz: ") as error:
+        ltcl.batch.map(light, paths, client=client, progress=lambda *now: calls.append(now))
+    assert calls == [("scenes", number, 4) for number in (1, 2, 3, 4)]
+    assert error.value.results[::2] == [pytest.approx(SCENE.F.sum(), rel=0.2)] * 2
+    assert all(isinstance(each, FileError) for each in error.value.results[1::2])
+
+
+def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_path, capsys):
+    desired = tmp_path / "desired.png"
+    images.write(desired, np.full(GRID, 0.2))
+    for name in ("a", "b"):
+        shutil.copy(film / "T.npz", tmp_path / f"{name}.npz")
+    (tmp_path / "c.npz").write_bytes(b"no transport")
+    address, out = client.scheduler.address, tmp_path / "out"
+    scenes = ["compensate", "--transports", str(tmp_path / "*.npz"), str(desired), "--out", str(out)]
+    assert main([*scenes, "--cluster", address]) == 1
+    assert "1 of 3 scenes failed" in capsys.readouterr().err
+    assert main(["compensate", str(tmp_path / "a.npz"), str(desired), "--out", str(tmp_path / "one")]) == 0
+    for name in ("a", "b"):
+        for picture in tmp_path.glob("one/*.exr"):
+            assert (out / name / picture.name).read_bytes() == picture.read_bytes()
+    frames = ["compensate", str(film / "T.npz"), str(film / "in"), "--rtol", "0.01", "--batch", "4"]
+    frames += ["--appearance", "--out", str(tmp_path / "frames")]
+    assert main([*frames, "--cluster", "local", "--workers", "1", "--frames", "4"]) == 0
+    assert main([*frames, "--cluster", address, "--resume"]) == 0
+    patterns = {name: data for name, data in everything(film / "serial").items() if "json" not in name}
+    assert everything(tmp_path / "frames").items() >= patterns.items()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--cluster", "127.0.0.1:9"], "no scheduler answers"),
+        (["--workers", "2"], "--workers is 2"),
+        (["--cluster", "127.0.0.1:9", "--workers", "2"], "workers is 2"),
+    ],
+)
+def test_a_cluster_that_is_none_is_refused_in_one_line(film, tmp_path, capsys, options, text):
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        frames = [
+            "compensate",
+            str(film / "T.npz"),
+            str(film / "in"),
+            "--out",
+            str(tmp_path / "out"),
+            *options,
+        ]
+        assert main(frames) == 1
+    error = capsys.readouterr().err
+    assert (text in error, error.count("\n")) == (True, 1), error
+    assert not (tmp_path / "out").exists()
