@@ -42,6 +42,10 @@ class DeviceError(LtclError, RuntimeError):
     """An OpenCL device is missing, or failed; the message says what to do."""
 
 
+class ClusterError(LtclError, RuntimeError):
+    """A cluster does not answer, was lost, or has no worker that can take part."""
+
+
 class AcquisitionError(LtclError, RuntimeError):
     """A photograph is missing, stale or unusable, or the rig failed; the message says which and why."""
 

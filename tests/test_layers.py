@@ -26,7 +26,7 @@ LAYERS: list[set[str]] = [
     {"checks"},
     {"files"},
     {"images", "device"},
-    {"operators", "layout"},
+    {"operators", "layout", "cluster"},
     {"theory"},
     {"solvers"},
     {"diagnostics", "first_bounce", "noise"},
