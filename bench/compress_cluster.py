@@ -24,19 +24,19 @@ from ltcl.operators import Wavelet
 from resolution131k import MEMORY, REFERENCE, THRESHOLD
 
 SHARE = 0.6  # of the time of one worker, which two may take
-ONE_CORE = {"POCL_MAX_PTHREAD_COUNT": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+ONE_CORE = {"POCL_MAX_PTHREAD_COUNT": "1"}
 
 
 def compress(given: Options, rows: Bounce, workers: int) -> tuple[Coefficients, float]:
     """The numbers of A, and seconds they took."""
-    transform, host = Analysis(Wavelet(given.device, rows.grid, "db2")), "127.0.0.1"
+    W, host = Analysis(Wavelet(given.device, rows.grid, "db2")), "127.0.0.1"
     with LocalCluster(workers, 1, host=host, dashboard_address=f"{host}:0", env=ONE_CORE) as cluster:
         client = Client(cluster)
         for core, address in enumerate(client.scheduler_info()["workers"]):
             client.run(os.sched_setaffinity, 0, {core}, workers=[address])
         start = time.perf_counter()
         blocks = source("A", rows, MEMORY, client)
-        A = coefficients(blocks, transform, transform, THRESHOLD, first=THRESHOLD / 4)
+        A = coefficients(blocks, W, W, THRESHOLD, first=THRESHOLD / 4)
         spent = time.perf_counter() - start
     note(f"{workers} workers: {spent:.3g} s")
     return A, spent
@@ -49,8 +49,7 @@ def main() -> None:
     for name in ("indptr", "indices", "data"):
         np.testing.assert_array_equal(getattr(one.core, name), getattr(two.core, name))
     facts: dict[str, Any] = {
-        "pixels": rows.shape[0],
-        "A, numbers a row": one.core.nnz / rows.shape[0],
+        "pixels, numbers a row": f"{rows.shape[0]}, {one.core.nnz / rows.shape[0]:.4g}",
         "share of the time": fast / slow,
         "peak memory of this process, MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }

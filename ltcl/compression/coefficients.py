@@ -36,6 +36,7 @@ _PIECE = 1 << 22  # numbers counted at once
 PIXELS, ROWS = "pixels", " rows"
 INVERSE_NAMES = ("db2", "haar", "db4", PIXELS)  # compared where none is named, in this order
 _SIGNS = 32  # pictures of random signs
+_own_device = functools.cache(open_device)  # of a worker, which keeps it
 
 
 def basis_names(names: Any, *, for_inverse: bool = False) -> list[str]:
@@ -50,10 +51,8 @@ def basis_names(names: Any, *, for_inverse: bool = False) -> list[str]:
             if name != PIXELS:
                 filters(name.removesuffix(ROWS))
         except InputError as error:
-            raise InputError(
-                f"basis is {name!r}; it must be pixels, or an orthonormal wavelet such as haar, db2 or db4, "
-                "with ' rows' behind it for rows alone"
-            ) from error
+            known = "pixels, or an orthonormal wavelet such as haar, db2 or db4, with ' rows' for rows alone"
+            raise InputError(f"basis is {name!r}; it must be {known}") from error
     return list(names)
 
 
@@ -126,9 +125,6 @@ class Analysis:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _analysis, (self.W and self.W.to_arrays(), self.weights)
-
-
-_own_device = functools.cache(open_device)  # of a worker, which keeps it
 
 
 def _analysis(arrays: Any, weights: np.ndarray | None) -> Analysis:

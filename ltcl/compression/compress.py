@@ -38,8 +38,7 @@ from ltcl.transport import Transport, require
 
 Note = Callable[[str, float], object]
 _GATHER = 0.7  # of what is allowed: Frobenius norm of what need not even be looked at
-_MORE = 4  # times the numbers kept on the window, which the whole may need
-_TRIES = 8
+_MORE, _TRIES = 4, 8  # times the numbers kept on the window, which the whole may need; thresholds
 _AIM, _CLOSE, _GROWTH = 0.96, 0.92, 8.0  # of the tolerance, tried next; enough; no step grows by more
 _ROUNDING = {"worst": 0.05, "pictures": 0.3}  # of what is allowed, for rounding the core
 _GUESS = 64  # pictures by which bases are compared
@@ -209,11 +208,10 @@ def compress(
         C, channels = compress_inputs(inputs, names, goal, fresh_starts("compress"), note)
     needed = sum(channel.nbytes for channel in channels)
     if budget is not None and needed > budget:
-        raise InputError(
-            f"budget is {budget} bytes, but rtol {rtol} needs {needed} ({checks.size(needed)}); "
-            f"give a budget of at least {needed} bytes, or a larger rtol"
-        )
-    window, spent = window_of(inputs.grid), time.perf_counter() - began
+        advice = f"give a budget of at least {needed} bytes, or a larger rtol"
+        what = f"budget is {budget} bytes, but rtol {rtol} needs {needed} ({checks.size(needed)})"
+        raise InputError(f"{what}; {advice}")
+    window, spent = window_of(C.grid), time.perf_counter() - began
     C.compression = Compression(rtol, norm, budget, inputs.nbytes, window, spent, channels)
     return C
 
@@ -234,7 +232,6 @@ def validate_rtol(rtol: Any, least: float) -> float:
     """`rtol`, refused before any work where a product in float32 already rounds by as much."""
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
     if rtol <= least:
-        least_text = checks.upwards(least)
         message = f"rtol is {rtol:g}; it must be above {checks.upwards(least)}, which float32 rounds"
         raise ToleranceError(message)
     return rtol
@@ -253,18 +250,14 @@ def compress_inputs(
     """R of every channel in the best of the bases `names`, and what is reported of each."""
     colours = ("red: ", "green: ", "blue: ") if len(inputs.problems) == 3 else ("",)
     matrices, reports, draws = [], [], fresh_starts("pictures", 1.0 - losses.PICTURES)
-    for number, (problem, F) in enumerate(zip(inputs.problems, inputs.F, strict=True)):
-
-        def note(text: str, share: float, number: int = number) -> None:
-            progress(colours[number] + text, (number + share) / len(colours))
-
+    for number, problem in enumerate(inputs.problems):
+        note = lambda text, share, c=number: progress(colours[c] + text, (c + share) / len(colours))  # noqa: E731
         best, trials = _compare(problem, names, goal, note)
         fit = _whole(problem, best, goal, starts, draws, note)
-        matrices.append(ScaledColumns(fit.system(problem), F))
+        matrices.append(ScaledColumns(fit.system(problem), problem.F))
         reports.append(fit.report(trials))
         note("done", 1.0)
-    C = Transport(matrices, inputs.grid, first_bounce=inputs.F, dark=0.0, **inputs.settings)
-    return C, tuple(reports)
+    return Transport(matrices, dark=0.0, **inputs.settings), tuple(reports)
 
 
 @dataclass(frozen=True)
@@ -313,7 +306,7 @@ class _Fit:
 
     def trial(self) -> Trial:
         """What the report says of it as one of several."""
-        core, per_row = self.R.core, self.numbers.core.nnz / self.numbers.core.shape[0]
+        core, per_row = self.R.core, self.numbers.core.nnz / (len(self.numbers.core.indptr) - 1)
         error = self.norm.upper if self.norm else None
         return Trial(self.bases.name, "tiles", core.width, core.precision, per_row, self.nbytes, error)
 
@@ -335,10 +328,9 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Search:
-    """The way to R~ of a channel, or of its window.
+    """The way to R~ of a channel, confirmed by fresh `starts` of norms and `draws` of pictures.
 
-    Fresh `starts` of norms and `draws` of pictures confirm what is handed out; on the window, without them, a
-    guess of ||S~^-1|| is believed, and few pictures suffice.
+    On the window, without them, a guess of ||S~^-1|| is believed, and few pictures suffice.
     """
 
     problem: Problem
@@ -389,7 +381,7 @@ class _Search:
                 best = fit if best is None or fit.nbytes < best.nbytes else best
                 if share >= _CLOSE or not numbers.core.nnz:
                     break
-            elif R.core.precision == "float32" and least - numbers.dropped * inverse > rtol:
+            elif fit.R.core.precision == "float32" and least - numbers.dropped * inverse > rtol:
                 break  # by rounding alone
             elif numbers.core.nnz < candidates.core.nnz:
                 high, misses = drop, misses + 1
@@ -446,8 +438,7 @@ def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> 
     window, trials, fits, refusals, fewest = problem.window(), [], [], [], math.inf
     inverse, pixels = _DIFFUSE if goal.norm == "pictures" else None, window.R.shape[0]
     for number, name in enumerate(names):
-        at = 0.5 * number / len(names)
-        search = _Search(window, goal, lambda text, at=at: note(f"trying {text}", at))
+        search = _Search(window, goal, lambda text, k=number: note(f"trying {text}", 0.5 * k / len(names)))
         search.note(name)
         bases = search.bases(name)
         if math.isnan(goal.rtol):
@@ -481,7 +472,7 @@ def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> 
 
 def _whole(problem: Problem, best: _Fit, goal: Goal, starts: Starts, draws: Starts, note: Note) -> _Fit:
     """All of R in the bases that are best on the window, confirmed by norms and pictures."""
-    pixels, N, by_noise = best.numbers.core.shape[0], problem.R.shape[0], math.isnan(goal.rtol)
+    pixels, N, by_noise = len(best.numbers.core.indptr) - 1, problem.R.shape[0], math.isnan(goal.rtol)
     at, fit, candidates = 0.5 if by_noise else 0.9, best, best.candidates
     search = _Search(problem, goal, lambda text: note(text, at), starts, draws)
     bases = search.bases(best.bases.name) if pixels < N else best.bases

@@ -2,8 +2,7 @@
 """`invert`: A = I - S^-1 of a transport, once, so that every further frame costs one product.
 
 R is taken in a basis that both sides share: as it is, or compressed. A is found from its coefficients, as
-coefficients again, in few bytes. Errors add up: x_R being what R~ gives, e the error of that, and g that of
-an inverse of S~ = I + R~, or of a further compression,
+coefficients again. With x_R of R~, e its error, and g that of an inverse of S~ = I + R~ or of a compression,
 
     ||x~ - x|| <= ||x~ - x_R|| + ||x_R - x|| <= g ||x_R|| + e ||x|| <= (g (1 + e) + e) ||x||,
 
@@ -133,9 +132,7 @@ def invert(
     return Inverse(bounces, errors, T.grid, T.first_bounce, T.mixing, confidence=confidence)
 
 
-def _in_one_basis(
-    T: Transport, rtol: float, names: list[str], progress: Note
-) -> tuple[Sequence[IdentityPlus], int]:
+def _in_one_basis(T: Transport, rtol: float, names: list[str], note: Note) -> tuple[tuple[Any, ...], int]:
     """S of every channel, whose R are numbers in one basis, and how many compressions are behind them."""
     compressions = 1 if T.error else 0
     if (T.is_compressed or names == ["pixels"]) and all(_has_coefficients(S.R) for S in T.systems):
@@ -143,25 +140,22 @@ def _in_one_basis(
     share = _FOR_R * (rtol - T.error) / (1.0 + T.error)
     starts = fresh_starts("rewrite" if T.error else "compress")
     try:
-        systems = compress_inputs(of_transport(T), names, Goal("worst", share), starts, progress)[0].systems
+        systems = compress_inputs(of_transport(T), names, Goal("worst", share), starts, note)[0].systems
     except ToleranceError as error:
         raise ToleranceError(str(error), T.error + error.least * (1.0 + T.error) / _FOR_R) from None
     before = [S.solution_error for S in T.systems] if T.is_compressed else [0.0] * T.channels
     errors = [e + S.solution_error * (1.0 + e) for e, S in zip(before, systems, strict=True)]
     systems = [IdentityPlus(S.R, solution_error=e) for e, S in zip(errors, systems, strict=True)]
-    return systems, compressions + 1
+    return tuple(systems), compressions + 1
 
 
-def _has_coefficients(R: Operator) -> bool:
+def _has_coefficients(R: Any) -> bool:
     """Whether R is numbers in pixels, or in one isometric basis on both sides."""
-    if isinstance(R, Compressed) and (R.two_sided or (R.out is None and R.into is None)):
-        R = R.core
-    return isinstance(R, (CSR, Tiles, Dense))
+    between = isinstance(R, Compressed) and (R.two_sided or R.out is R.into is None)
+    return isinstance(R.core if between else R, (CSR, Tiles, Dense))
 
 
-def _bounce(
-    S: IdentityPlus, rtol: float, starts: Starts, progress: Callable[[str], object]
-) -> tuple[Operator, float]:
+def _bounce(S: IdentityPlus, rtol: float, starts: Starts, progress: Callable) -> tuple[Operator, float]:
     """A of one channel, and the relative error of solutions with it."""
     R, W = (S.R.core, S.R.out) if isinstance(S.R, Compressed) else (S.R, None)
     C: Any = R.matrix() if isinstance(R, (CSR, Tiles)) else R.to_dense()

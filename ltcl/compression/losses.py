@@ -18,7 +18,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -88,11 +88,9 @@ def solve_columns(S: IdentityPlus, X: np.ndarray, rtol: float = _RTOL) -> np.nda
     try:
         return np.asarray(solve(S, X, "gmres", rtol=rtol, maxiter=_MAXITER).x, np.float64)
     except ConvergenceError as error:
-        raise ConvergenceError(
-            "S is singular, or nearly so: a solve for the norm of its inverse left "
-            f"{error.solution.residual:.2g} of a light; check the first bounce",
-            error.solution,
-        ) from None
+        left = f"a solve for the norm of its inverse left {error.solution.residual:.2g} of a light"
+        message = f"S is singular, or nearly so: {left}; check the first bounce"
+        raise ConvergenceError(message, error.solution) from None
 
 
 def estimate_norm(A: Any, start: np.ndarray | None = None) -> tuple[float, np.ndarray]:
@@ -153,7 +151,7 @@ def typical_light(problem: Problem, count: int) -> np.ndarray:
 
 def draw(grid: tuple[int, int], count: int, random: np.random.Generator) -> np.ndarray:
     """(N, count) random pictures of linear light up to 1, of each kind in turn."""
-    kinds: tuple[Callable[..., np.ndarray], ...] = (_spectrum, _edges, _strokes, _patch)
+    kinds = (_spectrum, _edges, _strokes, _patch)
     return np.stack([kinds[k // 2 % 4](grid, random).ravel() for k in range(count)], axis=1)
 
 

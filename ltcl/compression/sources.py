@@ -8,7 +8,7 @@ import copy
 import itertools
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,10 +95,8 @@ def source(name: str, matrix: Any, memory: int | None = None, client: Any = None
     if np.size(getattr(matrix, "shape", (0, 0))) != 2:
         raise InputError(f"{name} has shape {matrix.shape}; it must be (M, N)")
     if not hasattr(matrix, "shape") or not any(hasattr(matrix, a) for a in ("__getitem__", "rows", "matvec")):
-        raise InputTypeError(
-            f"{name} is a {type(matrix).__name__}; it must be an array, sparse, an operator, or have "
-            "shape and rows(start, stop)"
-        )
+        kinds = "be an array, sparse, an operator, or have shape and rows(start, stop)"
+        raise InputTypeError(f"{name} is a {type(matrix).__name__}; it must {kinds}")
     matrix = checks.csr(name, matrix) if scipy.sparse.issparse(matrix) else matrix
     columns, there = matrix.shape[1], client is not None and _is_there(client, matrix)
     scheduler = "synchronous" if there else client  # of Dask: a worker does not wait for others
@@ -130,14 +128,15 @@ def source(name: str, matrix: Any, memory: int | None = None, client: Any = None
 
 def _is_there(client: Any, matrix: Any) -> bool:
     """Whether workers can fetch rows: compute them (Dask), read files (zarr), or call `rows`."""
-    import distributed
+    from distributed import futures_of
+    from distributed.protocol.pickle import dumps
 
     if root := getattr(getattr(matrix, "store", None), "root", None):
         return all(client.run(os.path.isdir, str(root)).values())
     if hasattr(matrix, "dask"):
-        return not distributed.futures_of(matrix)
+        return not futures_of(matrix)
     with contextlib.suppress(Exception):  # of whatever it holds that cannot be sent
-        return hasattr(matrix, "rows") and bool(distributed.protocol.serialize(matrix, on_error="raise"))
+        return hasattr(matrix, "rows") and bool(dumps(matrix, buffer_callback=lambda buffer: False))
     return False
 
 
@@ -186,13 +185,11 @@ def window_of(grid: tuple[int, int]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Inputs:
-    """R of every channel, and what else a transport is made of, `settings`; `nbytes` is what T takes."""
+    """R of every channel, keywords of a Transport that is made of it, and the bytes of T."""
 
     problems: list[Problem]
-    F: np.ndarray
-    grid: tuple[int, int]
+    settings: dict[str, Any]
     nbytes: int
-    settings: dict[str, Any] = field(default_factory=dict)
 
 
 def validate_inputs(
@@ -228,7 +225,7 @@ def validate_inputs(
     F, *_ = _first_bounce.mask_dark(F, F <= 0.0, grid, may_mask=False)
     R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
     problems = [Problem(r, Host(device, r), grid, f) for r, f in zip(R, F, strict=True)]
-    return Inputs(problems, F, grid, 4 * F.size * F.shape[1])  # in float32
+    return Inputs(problems, {"grid": grid, "first_bounce": F}, 4 * F.size * n)  # in float32
 
 
 def of_transport(T: Transport, noise: Noise | None = None, **reading: Any) -> Inputs:
@@ -246,8 +243,8 @@ def of_transport(T: Transport, noise: Noise | None = None, **reading: Any) -> In
     problems = [Problem(r, product, T.grid, f) for r, product, f in zip(R, operators, F, strict=True)]
     if noise is not None:
         problems = [replace(p, noise=_noise_of(p, noise, c)) for c, p in enumerate(problems)]
-    settings = {"mixing": T.mixing, "noise": noise or T.measured_noise}
-    return Inputs(problems, F, T.grid, nbytes, settings | {"on_dark": "mask" if T.masked.any() else "raise"})
+    settings = {"grid": T.grid, "first_bounce": F, "mixing": T.mixing, "noise": noise or T.measured_noise}
+    return Inputs(problems, settings | {"on_dark": "mask" if T.masked.any() else "raise"}, nbytes)
 
 
 def _noise_of(problem: Problem, noise: Noise, channel: int) -> np.ndarray:
@@ -264,10 +261,8 @@ def rows_at_once(values: int, memory: int | None = None) -> int:
     room = min(_BLOCK, checks.host_memory() // 4) if memory is None else memory
     count = min(room // (_PER_VALUE * max(values, 1)), _MOST) // COLUMNS * COLUMNS
     if count == 0:
-        raise MemoryLimitError(
-            f"memory is {checks.size(room)}; it must be at least "
-            f"{checks.size(COLUMNS * values * _PER_VALUE)}, for {COLUMNS} rows of {values} numbers"
-        )
+        least = f"{checks.size(COLUMNS * values * _PER_VALUE)}, for {COLUMNS} rows of {values} numbers"
+        raise MemoryLimitError(f"memory is {checks.size(room)}; it must be at least {least}")
     return count
 
 
@@ -280,10 +275,8 @@ def memory_errors(command: str, T: Any) -> Iterator[None]:
         raise
     except MemoryError as error:
         pixels = getattr(T, "shape", (0, 0))[-1]
-        raise MemoryLimitError(
-            f"{command} needs up to {checks.size(8 * pixels**2)} for {pixels} pixels, more than the host "
-            f"gives: {error}"
-        ) from error
+        needed = f"{command} needs up to {checks.size(8 * pixels**2)} for {pixels} pixels"
+        raise MemoryLimitError(f"{needed}, more than the host gives: {error}") from error
 
 
 def cut(count: int, size: int) -> Iterator[tuple[int, int]]:

@@ -72,16 +72,27 @@ HOLDERS = {
     "zarr": in_files,
     "zarr in memory": lambda matrix, path: zarr.array(matrix, chunks=(30, 50)),
     "dask": lambda matrix, path: dask_array.from_array(matrix, chunks=((50, 70, 8), -1)),
-    "rows": lambda matrix, path: Rows(matrix, 1),
+    "dask, persisted": lambda matrix, path: dask_array.from_array(matrix, chunks=((50, 70, 8), 64)),
+    "rows": lambda matrix, path: Rows(matrix),
     "rows that are sent": lambda matrix, path: Unpicklable(matrix, 10_000),
 }
 
 
 @pytest.mark.parametrize("holder", HOLDERS)
-def test_workers_give_the_bits_of_the_serial_compression(holder, client, matrix, tmp_path):
+def test_rows_from_elsewhere_give_the_same_bits(holder, client, matrix, tmp_path):
+    rows = HOLDERS[holder](matrix, tmp_path / "T.zarr")
+    rows = client.persist(rows) if holder == "dask, persisted" else rows
+    serial = coefficients(source("T", matrix, SMALLEST), None, None, drop=0.1).core.toarray()
+    assert 0 < np.count_nonzero(serial) < N * N
+    for own in (client,) if holder in ("rows", "dask, persisted") else (client, None):
+        C = coefficients(source("T", rows, SMALLEST, own), None, None, drop=0.1)
+        np.testing.assert_array_equal(C.core.toarray(), serial)
+
+
+def test_workers_give_the_bits_of_the_serial_compression(client, matrix):
     options: dict[str, Any] = {"grid": GRID, "basis": "db2", "memory": SMALLEST}
     serial = ltcl.compress(matrix, 0.02, **options)
-    C = ltcl.compress(HOLDERS[holder](matrix, tmp_path / "T.zarr"), 0.02, client=client, **options)
+    C = ltcl.compress(HOLDERS["dask"](matrix, None), 0.02, client=client, **options)
     arrays, others = to_arrays(C), to_arrays(serial)
     for name in others.keys() - {"system_0.solution_error", "system_0.error_bound", "system_0.R.error"}:
         np.testing.assert_array_equal(arrays[name], others[name], err_msg=name)
@@ -106,8 +117,8 @@ def test_numbers_of_rows_larger_than_memory_are_those_of_the_serial_ones(
     assert (C.threshold, C.dropped) == (serial.threshold, pytest.approx(serial.dropped, rel=1e-12))
 
 
-def test_colours_and_a_transport_in_memory(client):
-    T = ltcl.scenes.dihedral(4, albedo=(0.8, 0.5, 0.2)).transport()
+def test_a_transport_in_memory(client):
+    T = ltcl.scenes.dihedral(4, albedo=0.8).transport()
     serial, C = (ltcl.compress(T, 0.05, basis="haar", client=each) for each in (None, client))
     np.testing.assert_array_equal(C.to_numpy(), serial.to_numpy())
 
