@@ -223,7 +223,7 @@ class _Crew:
         with contextlib.suppress(OSError):
             there = set(self.client.nthreads()) if self.client.status == "running" else None
         if there is None:
-            raise ClusterError(f"the scheduler at {self.scheduler} was lost")
+            raise self._scheduler_lost()
         self.ready &= there
         self.excluded &= there
         for address in self.asked.keys() - there:
@@ -238,6 +238,9 @@ class _Crew:
         elif (self.excluded and not self.begun) or time.monotonic() > self.seen + _PATIENCE:
             excluded = f"; {len(self.excluded)} take no work, for the reasons above" if self.excluded else ""
             raise ClusterError(f"no worker is left at {self.scheduler}{excluded}")
+
+    def _scheduler_lost(self) -> ClusterError:
+        return ClusterError(f"the scheduler at {self.scheduler} was lost")
 
     def leave(self) -> None:
         """Leave nothing on the scheduler and the workers."""
@@ -287,6 +290,8 @@ class _Crew:
             logger.warning("worker %s takes no work: %s", address, " ".join(answer.split()))
 
     def _send(self, workers: Iterable[str], *call: Any) -> Future:
+        if self.client.status != "running":
+            raise self._scheduler_lost()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large arguments, which `window` bounds
             try:

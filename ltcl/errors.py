@@ -46,6 +46,14 @@ class ClusterError(LtclError, RuntimeError):
     """A cluster does not answer, was lost, or has no worker that can take part."""
 
 
+class BatchError(LtclError, RuntimeError):
+    """Some of many scenes failed. `results` has all, in order, with errors in their places."""
+
+    def __init__(self, message: str, results: Any = ()) -> None:
+        super().__init__(message)
+        self.results = list(results)
+
+
 class AcquisitionError(LtclError, RuntimeError):
     """A photograph is missing, stale or unusable, or the rig failed; the message says which and why."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from typing import Any
 
@@ -28,7 +28,13 @@ logger = logging.getLogger(__name__)
 _SAME = 1e-6  # relative difference of first bounces that float32 does not resolve
 _ROUNDING = 1e-5  # of float32, in the products that show whether an inverse belongs to a transport
 _CANCELLATION = 0.5  # of diag(S) = 1 + diag(R): from here on, I + R has all digits of T F^-1
-_ON_DEVICE = ("device", "systems", "operators", "_inverses")  # attributes that do not leave this process
+_ON_DEVICE = (
+    "device",
+    "systems",
+    "operators",
+    "_inverses",
+    "reload",
+)  # attributes that do not leave this process
 
 
 class Transport:
@@ -113,6 +119,7 @@ class Transport:
             raise InputError(f"camera_grid is None, but matrix has shape {self.shape}; h * w must be {M}")
         self.camera_grid = self.grid if camera_grid is None else checks.grid("camera_grid", camera_grid, M)
         self.compression: Any = None
+        self.reload: Callable[[], Transport] | None = None  # as `ltcl.load` made it
         self.masked: np.ndarray = np.zeros(N, bool)
         self.dark = ""
         self.first_bounce_error: np.ndarray | None = None
@@ -181,7 +188,7 @@ class Transport:
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _inverses=weakref.WeakSet())
+        self.__dict__.update(state, _inverses=weakref.WeakSet(), reload=None)
 
     @cached_property
     def matrices(self) -> tuple[Any, ...]:

@@ -2,36 +2,48 @@
 """`compensate_frames`: patterns for a folder or a video of frames, a batch of right-hand sides at a time.
 
 Every frame gets the same gain: one that followed the frames would make the scene flicker. Batches begin at
-the same frames in every run and share nothing but T: a resumed run gives what an uninterrupted one does, to
-the last bit with a named method; "auto" may know more of S the second time. What is missing from a batch is
-solved alone, to the same tolerance: the rest after `frames=`, or a pattern that was removed.
+the same frames in every run and share nothing but T and a survey of S: a resumed run, or one on a cluster,
+gives what an uninterrupted one does, to the last bit on devices of one kind with one memory of timings. What
+is missing from a batch is solved alone, to the same tolerance: the rest after `frames=`, or a lost pattern.
 """
 
 from __future__ import annotations
 
+import copy
 import inspect
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from itertools import islice, repeat
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ltcl import checks, images, layout
 from ltcl.batch.manifest import NAME, Manifest, OtherRun, Record, curve, identity, locked, setting
+from ltcl.cluster import require as require_client
+from ltcl.cluster import stream
 from ltcl.compensation import compensate, problem
-from ltcl.errors import InputError, InputTypeError, LtclError
-from ltcl.files import as_path
+from ltcl.errors import FileError, InputError, InputTypeError, LtclError
+from ltcl.files import as_path, replace_file
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
 from ltcl.images.pictures import Encoding
+from ltcl.solvers import Inverse
+from ltcl.solvers.auto import SMALL, survey
 from ltcl.transport import Transport, error_note, require, resolve_reference
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 _USUAL_FPS = 25.0
+_NAMED = 5  # broken frames, in an error
 _WRITERS = 4  # threads: files are compressed and flushed side by side
 
 
@@ -89,6 +101,8 @@ def compensate_frames(
     loss: float | None = None,
     progress: Callable[[str, int, int | None], object] | None = None,
     codes: Callable[[np.ndarray], np.ndarray] | None = None,
+    client: Client | None = None,
+    share_gpu: bool = False,
     **options: Any,
 ) -> CompensatedFrames:
     """Find the patterns under which a scene shows the frames of a film.
@@ -120,14 +134,22 @@ def compensate_frames(
     codes : callable(pattern), optional
         Codes of the projector for a pattern of light, such as `ltcl.acquisition.Setup.codes`: .png and video
         then hold these, and not sRGB.
+    client : distributed.Client, optional
+        Of a Dask cluster whose workers solve, as `ltcl.cluster.stream` does it. T is loaded there from the
+        file that `ltcl.load` read here, or sent once. Folder and files are those of a run without it.
+    share_gpu : bool
+        Whether several workers may use one GPU.
     **options
         Of `ltcl.compensate`: bounds, method, rtol, exact, and so on; background and weights are one picture.
 
     Raises
     ------
     FileError, InputError, ConvergenceError
-        As `ltcl.compensate`, `open_frames` and `write_video`; a frame of another size; frames of another run.
-        The frames of all batches before stay done, as after Ctrl-C.
+        As `ltcl.compensate`, `open_frames` and `write_video`; frames of another size or of another run. What
+        was done stays, as after Ctrl-C. One that cannot be read, or is of another size than those before, is
+        left out, and named when all others are done.
+    ClusterError
+        As `ltcl.cluster.stream`.
 
     Examples
     --------
@@ -162,7 +184,13 @@ def compensate_frames(
     described = {name: setting(value) for name, value in settings.items() if name != "callback"}
     described["codes"] = codes and curve(codes, T.grid)
     manifest, white = Manifest(folder / NAME, described, identity(T)), bounds[1] if bounds[1] > 0 else 1.0
-    run = _Run(T, opened, limit, resize, manifest, batch, format, white, appearance, codes, options)
+    results = None
+    if client is not None:
+        require_client(client)
+        options.pop("callback", None)  # it stays in this process
+        results = partial(stream, client, share_gpu=share_gpu)
+    solver = _Solver(T, format, white, appearance, codes, options, manifest.transport)
+    run = _Run(solver, opened, limit, resize, manifest, batch, results)
     with locked(folder):
         manifest.begin(resume)
         for name in (".pattern_*", ".frames-*.json", "appearance/.appearance_*"):  # of killed runs
@@ -174,7 +202,7 @@ def compensate_frames(
                     progress("frames", done, run.count)
             if video is not None:
                 write_video(video, run.patterns(), fps or opened.fps or _USUAL_FPS)
-    records = tuple(manifest.records[number] for number in run.done)
+    records = tuple(manifest.records[number] for number in sorted(run.done))
     error = (options.get("exact") or T).error
     seconds, film = time.perf_counter() - start, None if video is None else as_path(video)
     return CompensatedFrames(folder, film, manifest.gain or 0.0, records, run.solved, seconds, error)
@@ -200,22 +228,116 @@ def _validate(
     return checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
 
 
-@dataclass(eq=False)
-class _Run:
-    """The loop over batches: read ahead, solve, write, record, in this order."""
+class _Task(NamedTuple):
+    """What a worker has to know of a batch."""
+
+    numbers: list[int]
+    pictures: np.ndarray
+    gain: float
+
+
+class _Solved(NamedTuple):
+    """Of the frames of a batch; `files` by their places in the folder, where they are not written yet."""
+
+    errors: list[float]
+    clipped: list[float]
+    files: dict[str, bytes]
+
+
+@dataclass(frozen=True, eq=False)
+class _Solver:
+    """From pictures of a batch to files of patterns: of a run what its workers get, once."""
 
     T: Transport
-    source: Source
-    limit: int | None
-    resize: bool
-    manifest: Manifest
-    size: int
     format: str
     white: float  # light that is white in .png
     appearance: bool
     codes: Callable[[np.ndarray], np.ndarray] | None
     options: dict[str, Any]
-    done: list[int] = field(default_factory=list)  # numbers of frames, of earlier runs, too
+    identity: dict[str, Any]
+    load: Callable[[], Transport] | None = None  # on the way to a worker, in the place of T
+
+    def __call__(self, task: _Task) -> _Solved:
+        """On a worker, which may not see the folder of the run: the files as bytes."""
+        from distributed import get_worker
+
+        with TemporaryDirectory(dir=get_worker().local_directory) as folder:
+            solved = self.write(Path(folder), task)
+            files = [file for file in Path(folder).rglob("*") if file.is_file()]
+            return solved._replace(files={str(f.relative_to(folder)): f.read_bytes() for f in files})
+
+    def reference(self) -> _Solver | None:
+        """A stand-in that finds T in its file, if it has one."""
+        return self.T.reload and replace(self, load=self.T.reload)
+
+    def resolve(self) -> _Solver | None:
+        """On a worker: with T. None where its file cannot be read here; refused where it is another T."""
+        if self.load is None:
+            return self
+        try:
+            T = self.load()
+        except FileError:
+            return None
+        if identity(T) != self.identity:
+            raise InputError("the file of T holds another T there; give all workers the same")
+        return replace(self, T=T, load=None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(vars(self), T=None if self.load else _portable(self.T))
+        return state | {"options": {name: _portable(value) for name, value in self.options.items()}}
+
+    def write(self, folder: Path, task: _Task) -> _Solved:
+        """Solve a batch, its files into a folder. Of "auto", every batch sees the same survey of S."""
+        with _worded(f"frames {task.numbers[0]} to {task.numbers[-1]}: "):
+            if self.options.get("method", "auto") == "auto" and self.T.is_square and self.T.shape[0] > SMALL:
+                for S in self.T.systems:
+                    survey(S)
+            solved = compensate(self.T, task.pictures, gain=task.gain, **self.options)
+        with ThreadPoolExecutor(_WRITERS) as writers:
+            appearances = solved.appearance if self.appearance else solved.pattern  # not written then
+            write = partial(self._write, folder, task.gain)
+            list(writers.map(write, task.numbers, solved.pattern, appearances))
+        return _Solved(solved.frame_errors.tolist(), solved.frame_clipped.tolist(), {})
+
+    def _write(
+        self, folder: Path, gain: float, number: int, pattern: np.ndarray, appearance: np.ndarray
+    ) -> None:
+        """A frame's files; an appearance in a .png is divided by the gain, as the picture asked for."""
+        pairs = ((pattern, self.white), (appearance, gain))
+        for file, (light, white) in zip(self.files(folder, number), pairs, strict=False):
+            if self.format == "exr":
+                images.write(file, light)
+            elif self.codes is not None and light is pattern:
+                images.write(file, self.codes(pattern), bits=16, encoding="linear")
+            else:
+                images.write(file, light / np.float32(white), bits=16)
+
+    def files(self, folder: Path, number: int) -> list[Path]:
+        """Those of a frame: its pattern and, where asked for, its appearance."""
+        names = ["pattern_{:06}.{}", "appearance/appearance_{:06}.{}"][: 1 + self.appearance]
+        return [folder / name.format(number, self.format) for name in names]
+
+
+class _Batch(NamedTuple):
+    frames: list[Frame]
+    digests: list[str]
+    pictures: list[np.ndarray]
+
+
+@dataclass(eq=False)
+class _Run:
+    """The loop over batches: read ahead, solve here or on workers, write, record, in this order."""
+
+    solver: _Solver
+    source: Source
+    limit: int | None
+    resize: bool
+    manifest: Manifest
+    size: int
+    stream: Callable[..., Iterator[_Solved]] | None  # of a cluster
+    read: int = 0  # frames, of the right size
+    done: set[int] = field(default_factory=set)  # numbers of frames, of earlier runs, too
+    broken: dict[int, str] = field(default_factory=dict)  # frames that are left out, and why
     solved: int = 0
 
     @property
@@ -231,98 +353,126 @@ class _Run:
         return done if count else ""
 
     def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
-        """All batches; yields the number of frames done before each that is not done yet, and at the end."""
-        batches = self._batches()
+        """All batches; yields the number of frames done, before the first that is not and after each."""
+        waiting, folder = deque[_Batch](), self.manifest.path.parent
+
+        def tasks(batches: Iterator[_Batch]) -> Iterator[_Task]:
+            for batch in batches:
+                waiting.append(batch)
+                numbers = [frame.number for frame in batch.frames]
+                yield _Task(numbers, _stack(batch.pictures), self._gain(gain, loss, batch.pictures))
+
         with ThreadPoolExecutor(1) as reader:
-            coming = reader.submit(next, batches, None)
-            while (batch := coming.result()) is not None:
-                coming = reader.submit(next, batches, None)
-                numbers, missing, digests, pictures = batch
-                if pictures:
+            batches = _read_ahead(reader, self._batches())
+            first = next(batches, None)
+            yield len(self.done)
+            if first is not None:
+                ordered = tasks(chain([first], batches))
+                here = map(partial(self.solver.write, folder), ordered)
+                for solved in self.stream(self.solver, ordered) if self.stream else here:
+                    self._keep(folder, waiting.popleft(), solved)
                     yield len(self.done)
-                    self._solve(missing, digests, _stack(pictures), self._gain(gain, loss))
-                self.done += numbers
-        yield len(self.done)
+        if self.broken:
+            named = ", ".join(f"{number} ({why})" for number, why in [*sorted(self.broken.items())][:_NAMED])
+            more = f" and {len(self.broken) - _NAMED} more" if len(self.broken) > _NAMED else ""
+            raise FileError(f"{self.source.path}: frames were left out: {named}{more}")
 
     def patterns(self) -> Iterator[np.ndarray]:
         """As they were written, white at 1; codes as the light of which sRGB makes them."""
-        for number in self.done:
-            pattern = images.read(self._files(number)[0])
-            if self.format == "exr":
-                codes = self.codes
-                pattern = images.from_srgb(codes(pattern)) if codes else pattern / np.float32(self.white)
+        for number in sorted(self.done):
+            pattern = images.read(self.solver.files(self.manifest.path.parent, number)[0])
+            if self.solver.format == "exr":
+                codes, white = self.solver.codes, np.float32(self.solver.white)
+                pattern = images.from_srgb(codes(pattern)) if codes else pattern / white
             yield pattern
 
-    def _files(self, number: int) -> list[Path]:
-        """Those of a frame: its pattern and, where asked for, its appearance."""
-        names = ["pattern_{:06}.{}", "appearance/appearance_{:06}.{}"][: 1 + self.appearance]
-        return [self.manifest.path.parent / name.format(number, self.format) for name in names]
-
-    def _batches(self) -> Iterator[tuple[list[int], list[Frame], list[str], list[np.ndarray]]]:
-        """Numbers of the frames; and those that no earlier run has done, with digests and pictures."""
+    def _batches(self) -> Iterator[_Batch]:
+        """The frames that no earlier run has done, with digests and pictures, and without broken ones."""
         frames, folder = islice(self.source, self.limit), self.manifest.path.parent
         while batch := list(islice(frames, self.size)):
-            missing: dict[Frame, str] = {}
+            missing: list[tuple[Frame, str, np.ndarray]] = []
             for frame in batch:
-                digest, record = frame.digest(), self.manifest.records.get(frame.number)
-                if record is not None and record.digest != digest:
-                    advice = f"give the same frames to go on, or another folder than {folder}"
-                    raise OtherRun(f"{self._place(frame)} has changed since its pattern was made; {advice}")
-                if record is None or not all(file.is_file() for file in self._files(frame.number)):
-                    missing[frame] = digest
-            numbers = [frame.number for frame in batch]
-            yield numbers, [*missing], [*missing.values()], [self._picture(frame) for frame in missing]
+                record = self.manifest.records.get(frame.number)
+                with self._left_out(frame):
+                    digest = frame.digest()
+                    if record is not None and record.digest != digest:
+                        advice = f"give the same frames to go on, or another folder than {folder}"
+                        raise OtherRun(
+                            f"{self._place(frame)} has changed since its pattern was made; {advice}"
+                        )
+                    if record and all(file.is_file() for file in self.solver.files(folder, frame.number)):
+                        self.done.add(frame.number)
+                    else:
+                        missing.append((frame, digest, self._picture(frame)))
+            if missing:
+                yield _Batch(*map(list, zip(*missing, strict=True)))
+
+    @contextmanager
+    def _left_out(self, frame: Frame) -> Iterator[None]:
+        """Note that a frame is broken, and go on; not where all seem to be of another size."""
+        try:
+            yield
+        except InputError as error:
+            if isinstance(error, OtherRun) or not (isinstance(error, FileError) or self.read):
+                raise
+            self.broken[frame.number] = str(error)
 
     def _place(self, frame: Frame) -> str:
         return f"{self.source.path}: frame {frame.number} ({frame.name})"
 
     def _picture(self, frame: Frame) -> np.ndarray:
         """The frame on the camera's grid."""
-        picture, (h, w) = frame.picture(), self.T.camera_grid
-        if picture.shape[:2] == (h, w):
-            return picture
-        if self.resize:
-            return images.resize(picture, (h, w))
-        size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
-        raise InputError(f"{self._place(frame)} is {size}; give resize=True to scale all frames")
+        picture, (h, w) = frame.picture(), self.solver.T.camera_grid
+        if picture.shape[:2] != (h, w) and not self.resize:
+            size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
+            raise InputError(f"{self._place(frame)} is {size}; give resize=True to scale all frames")
+        self.read += 1
+        return picture if picture.shape[:2] == (h, w) else images.resize(picture, (h, w))
 
-    def _gain(self, gain: float | str, loss: float | None) -> float:
+    def _gain(self, gain: float | str, loss: float | None, first: list[np.ndarray]) -> float:
         """The one of all frames, found once, of a sample: the first frames where their number is unknown."""
         if self.manifest.gain is None and isinstance(gain, str):
             count = self.count or self.size
             numbers = {*np.rint(np.linspace(1, count, min(self.size, count))).astype(int).tolist()}
-            frames = islice(self.source, max(numbers))
-            sample = _stack([self._picture(frame) for frame in frames if frame.number in numbers])
-            self.manifest.gain = compensate(self.T, sample, gain=gain, loss=loss, **self.options).gain
+            sample = []
+            for frame in islice(self.source, max(numbers)):
+                with self._left_out(frame):
+                    sample += [self._picture(frame)] if frame.number in numbers else []
+            T, options = self.solver.T, self.solver.options
+            self.manifest.gain = compensate(T, _stack(sample or first), gain=gain, loss=loss, **options).gain
         elif self.manifest.gain is None:
             self.manifest.gain = float(gain)
         return self.manifest.gain
 
-    def _solve(self, frames: list[Frame], digests: list[str], pictures: np.ndarray, gain: float) -> None:
+    def _keep(self, folder: Path, batch: _Batch, solved: _Solved) -> None:
         """Patterns of a batch, on the disk, and then their records."""
-        numbers = [frame.number for frame in frames]
-        with _worded(f"frames {numbers[0]} to {numbers[-1]}: "):
-            solved = compensate(self.T, pictures, gain=gain, **self.options)
-        with ThreadPoolExecutor(_WRITERS) as writers:
-            appearances = solved.appearance if self.appearance else solved.pattern  # not written then
-            list(writers.map(self._write, numbers, solved.pattern, appearances, repeat(gain)))
-        results = zip(frames, digests, solved.frame_errors, solved.frame_clipped, strict=True)
-        self.manifest.add(
-            Record(frame.number, frame.name, digest, float(error), float(clipped))
-            for frame, digest, error, clipped in results
-        )
-        self.solved += len(frames)
 
-    def _write(self, number: int, pattern: np.ndarray, appearance: np.ndarray, gain: float) -> None:
-        """A frame's files; an appearance in a .png is divided by the gain, as the picture asked for."""
-        pairs = ((pattern, self.white), (appearance, gain))
-        for file, (light, white) in zip(self._files(number), pairs, strict=False):
-            if self.format == "exr":
-                images.write(file, light)
-            elif self.codes is not None and light is pattern:
-                images.write(file, self.codes(pattern), bits=16, encoding="linear")
-            else:
-                images.write(file, light / np.float32(white), bits=16)
+        def write(file: tuple[str, bytes]) -> None:
+            with replace_file(folder / file[0]) as temporary:
+                temporary.write_bytes(file[1])
+
+        with ThreadPoolExecutor(_WRITERS) as writers:
+            list(writers.map(write, solved.files.items()))
+        rows = zip(batch.frames, batch.digests, solved.errors, solved.clipped, strict=True)
+        self.manifest.add(Record(f.number, f.name, digest, *numbers) for f, digest, *numbers in rows)
+        self.done |= {frame.number for frame in batch.frames}
+        self.solved += len(batch.frames)
+
+
+def _read_ahead(reader: ThreadPoolExecutor, batches: Iterator[_Batch]) -> Iterator[_Batch]:
+    """The next batch is read while the caller works on the one before."""
+    coming = reader.submit(next, batches, None)
+    while (batch := coming.result()) is not None:
+        coming = reader.submit(next, batches, None)
+        yield batch
+
+
+def _portable(value: Any) -> Any:
+    """What lies on a device, without it: each worker has its own."""
+    if isinstance(value, (Transport, Inverse)):
+        value = copy.copy(value)
+        vars(value)["_requested_device" if isinstance(value, Transport) else "_index"] = None
+    return value
 
 
 def _stack(pictures: list[np.ndarray]) -> np.ndarray:

@@ -72,13 +72,18 @@ def load(
     (6, 6)
     """
     content = read(path, variable=variable)
+    again: dict[str, Any] = {"grid": grid, "camera_grid": camera_grid, "first_bounce": first_bounce}
+    again |= {"variable": variable, "on_dark": on_dark, "dark": dark}  # on any device
+    reload = functools.partial(load, os.path.abspath(path), **again)
     with about(path):
         if isinstance(content, Parts):
             if content.format == INVERSE:
                 raise FileError("is an inverse, for ltcl.load_inverse; it must be a transport")
             options: dict[str, Any] = {"first_bounce": first_bounce, "noise": noise, "dark": dark}
             options |= {"grid": grid or camera_grid, "on_dark": on_dark, "device": device}
-            return from_arrays(content.arrays, **options)
+            T = from_arrays(content.arrays, **options)
+            T.reload = reload
+            return T
         M, N = content.shape
         grid = checks.grid("grid", grid or content.grid or _unknown("grid", N, "projector"), N)
         camera_grid = camera_grid or content.camera_grid
@@ -90,7 +95,9 @@ def load(
             first_bounce = content.first_bounce
         T, F = content.matrices, "diagonal" if first_bounce is None else first_bounce
         others: dict[str, Any] = {"mixing": content.mixing, "noise": noise or content.noise, "dark": dark}
-        return Transport(T, grid, F, camera_grid, device, on_dark=on_dark, **others)
+        T = Transport(T, grid, F, camera_grid, device, on_dark=on_dark, **others)
+        T.reload = reload
+        return T
 
 
 def _unknown(name: str, pixels: int, whose: str) -> tuple[int, int]:

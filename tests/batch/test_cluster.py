@@ -4,19 +4,25 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import dask.config
+import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 
 import ltcl
+from ltcl import images
+from ltcl.batch import compensate_frames
 from ltcl.cluster import stream
-from ltcl.errors import ClusterError, InputError, InputTypeError
+from ltcl.errors import BatchError, ClusterError, FileError, InputError, InputTypeError
+from tests.problems import lambertian
 
 WORKERS: dict[str, Any] = {"n_workers": 2, "threads_per_worker": 1, "host": "127.0.0.1", "silence_logs": 50}
 WORKERS |= {"scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0.0.1:0"}}
@@ -141,3 +147,120 @@ def test_what_is_no_client_or_cannot_be_sent_is_refused(client):
     lock = threading.Lock()
     with pytest.raises(InputTypeError, match=r"sent.*lock"):
         list(stream(client, lambda _: lock, [1]))
+
+
+GRID = (20, 30)  # 600 pixels, more than are factorized
+FRAMES = 33
+SCENE = lambertian(600, 0.6, seed=80)
+random = np.random.default_rng(81)
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory, device) -> Path:
+    """Its frames, T, and what one process makes of both."""
+    folder = tmp_path_factory.mktemp("film")
+    ltcl.save(folder / "T.npz", ltcl.Transport(SCENE.T, GRID))
+    for number in range(FRAMES):
+        light = random.uniform(0.2, 0.6, SCENE.T.shape[1])
+        images.write(folder / "in" / f"f{number}.exr", (SCENE.T @ light).reshape(GRID))
+    T = ltcl.load(folder / "T.npz", device=device)
+    compensate_frames(T, folder / "in", folder / "serial", batch=4, appearance=True)
+    return folder
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+@pytest.mark.parametrize("seen", [True, False], ids=["file that workers see", "sent"])
+def test_frames_have_the_bytes_of_a_serial_run(client, film, device, tmp_path, seen):
+    T = ltcl.load(film / "T.npz", device=device)
+    T = T if seen else ltcl.Transport(SCENE.T, GRID, device=device)
+    calls = []
+    common: dict[str, Any] = {"batch": 4, "appearance": True, "client": client, "resume": True}
+    compensate_frames(T, film / "in", tmp_path, frames=8, **common)
+    done = compensate_frames(T, film / "in", tmp_path, progress=lambda *now: calls.append(now), **common)
+    assert everything(tmp_path) == everything(film / "serial")
+    assert done.solved == FRAMES - 8
+    assert [(step, total) for step, _, total in calls] == [("frames", FRAMES)] * len(calls)
+    assert [count for _, count, _ in calls] == [8, 12, 16, 20, 24, 28, 32, 33]
+
+
+def test_killed_workers_leave_every_frame_once_and_whole(client, film, tmp_path):
+    T, counts = ltcl.load(film / "T.npz"), []
+
+    def progress(step: str, done: int, total: int | None) -> None:
+        counts.append(done)
+        if len(counts) in (2, 4, 6):
+            kill(client)
+
+    done = compensate_frames(
+        T, film / "in", tmp_path, batch=4, appearance=True, client=client, progress=progress
+    )
+    assert everything(tmp_path) == everything(film / "serial")
+    assert (done.solved, counts) == (FRAMES, [*range(0, FRAMES, 4), FRAMES])
+
+
+def test_another_T_in_the_file_of_a_worker_is_refused(client, film, tmp_path, caplog):
+    path = tmp_path / "T.npz"
+    shutil.copy(film / "T.npz", path)
+    T = ltcl.load(path)
+    ltcl.save(path, ltcl.Transport(2 * SCENE.T, GRID))
+    with pytest.raises(ClusterError, match=r"no worker is left .*2 "):
+        compensate_frames(T, film / "in", tmp_path / "out", client=client)
+    assert caplog.text.count("another T") == 2
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("on_cluster", [False, True])
+def test_broken_frames_are_left_out_and_named(request, film, device, tmp_path, on_cluster):
+    client = request.getfixturevalue("client") if on_cluster else None
+    folder = shutil.copytree(film / "in", tmp_path / "in")
+    images.write(folder / "f2.exr", np.ones((3, 4)))
+    (folder / "f7.exr").write_bytes(b"no picture")
+    T = ltcl.load(film / "T.npz", device=device)
+    common: dict[str, Any] = {"batch": 4, "frames": 12, "client": client, "appearance": True}
+    with pytest.raises(FileError, match=r"(?s)3 \(.*3 x 4.*8 \(.*f7\.exr.*10 frame.*resume"):
+        compensate_frames(T, folder, tmp_path / "out", **common)
+    for number in (3, 8):
+        shutil.copy(film / "in" / f"f{number - 1}.exr", folder)
+        assert not (tmp_path / f"out/pattern_{number:06}.png").exists()
+    assert compensate_frames(T, folder, tmp_path / "out", resume=True, **common).solved == 2
+    same = compensate_frames(T, film / "in", tmp_path / "whole", **common)
+    for record in same.records:
+        name = f"pattern_{record.number:06}.png"
+        np.testing.assert_allclose(
+            images.read(tmp_path / "out" / name), images.read(tmp_path / "whole" / name), atol=0.02
+        )
+
+
+def test_a_lost_scheduler_is_one_line_and_the_next_run_goes_on(film, device, tmp_path):
+    T = ltcl.load(film / "T.npz", device=device)
+    here = {**WORKERS, "n_workers": 1, "processes": False, "protocol": "tcp://"}
+    with LocalCluster(**here) as cluster, Client(cluster) as other:
+
+        def progress(step: str, done: int, total: int | None) -> None:
+            if done == 8:
+                cluster.close()
+
+        common: dict[str, Any] = {"batch": 4, "appearance": True}
+        with pytest.raises(ClusterError, match=r"scheduler at .* lost.*8 frame.*resume=True") as error:
+            compensate_frames(T, film / "in", tmp_path, client=other, progress=progress, **common)
+        assert "\n" not in str(error.value)
+    compensate_frames(T, film / "in", tmp_path, resume=True, **common)
+    assert everything(tmp_path) == everything(film / "serial")
+
+
+@pytest.mark.parametrize("on_cluster", [False, True])
+def test_scenes_one_task_each_and_those_that_fail_are_named(request, film, tmp_path, on_cluster):
+    client = request.getfixturevalue("client") if on_cluster else None
+    paths, calls = [film / "T.npz", tmp_path / "none.npz", film / "T.npz", tmp_path / "nor.npz"], []
+
+    def light(path: Path) -> float:
+        return float(ltcl.load(path).first_bounce.sum())
+
+    with pytest.raises(BatchError, match=r"2 of 4 .*none\.npz: .*nor\.npz: ") as error:
+        ltcl.batch.map(light, paths, client=client, progress=lambda *now: calls.append(now))
+    assert calls == [("scenes", number, 4) for number in (1, 2, 3, 4)]
+    assert error.value.results[::2] == [pytest.approx(SCENE.F.sum(), rel=0.2)] * 2
+    assert all(isinstance(each, FileError) for each in error.value.results[1::2])

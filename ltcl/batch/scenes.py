@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`map`: one task for each of many scenes, here or on the workers of a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+from ltcl.cluster import stream
+from ltcl.errors import BatchError, LtclError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+def map(
+    function: Callable[[Any], Any],
+    scenes: Iterable[Any],
+    *,
+    client: Client | None = None,
+    share_gpu: bool = False,
+    progress: Callable[[str, int, int | None], object] | None = None,
+) -> list[Any]:
+    """Results of a function of each scene, in order; one that fails is named, and the rest go on.
+
+    Parameters
+    ----------
+    function : callable(scene)
+        Such as one that loads a transport and solves. What it returns comes back from the workers.
+    scenes : iterable
+        Paths of transports, which workers then have to see, or whatever `function` takes.
+    client, share_gpu
+        As of `ltcl.cluster.stream`; without a client, scenes are done here, one after the other.
+    progress : callable("scenes", done, total), optional
+
+    Raises
+    ------
+    BatchError
+        Some scenes failed, by an LtclError of `function`. `results` has them all, errors in their places.
+
+    Examples
+    --------
+    >>> import ltcl, numpy, pathlib, tempfile
+    >>> paths = [pathlib.Path(tempfile.mkdtemp()) / f"{number}.npz" for number in range(2)]
+    >>> for path in paths:
+    ...     ltcl.save(path, ltcl.Transport(numpy.eye(6), grid=(2, 3)))
+    >>> ltcl.batch.map(lambda path: float(ltcl.load(path).first_bounce.sum()), paths)
+    [6.0, 6.0]
+    """
+    scenes, results = [*scenes], []
+
+    def attempt(scene: Any) -> Any:
+        try:
+            return function(scene)
+        except LtclError as error:
+            return type(error)(*error.args)  # without what it holds, which may lie on a device
+
+    attempts = (attempt(scene) for scene in scenes)
+    if client is not None:
+        attempts = stream(client, attempt, scenes, window=1, share_gpu=share_gpu)
+    for result in attempts:
+        results.append(result)
+        if progress is not None:
+            progress("scenes", len(results), len(scenes))
+    errors = {s: r for s, r in zip(scenes, results, strict=True) if isinstance(r, LtclError)}
+    if errors:
+        named = "; ".join(f"{scene}: {error}" for scene, error in errors.items())
+        raise BatchError(f"{len(errors)} of {len(scenes)} scenes failed: {named}", results)
+    return results
