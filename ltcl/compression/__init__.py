@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-from ltcl.compression.bases import INVERSE_NAMES
+from ltcl.compression.coefficients import INVERSE_NAMES
 from ltcl.compression.compress import ChannelCompression, Compression, Trial, compress
-from ltcl.compression.invert import invert
-from ltcl.compression.norms import inverse_norm
-from ltcl.compression.sparse_inverse import SparseInverse, invert_coefficients
+from ltcl.compression.invert import SparseInverse, invert, invert_coefficients
+from ltcl.compression.losses import inverse_norm
 
 __all__ = ["INVERSE_NAMES", "ChannelCompression", "Compression", "SparseInverse", "Trial", "compress"]
 __all__ += ["inverse_norm", "invert", "invert_coefficients"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""C = W_out R W_in^T without its small numbers.
+"""Bases in which R is written, by name, and C = W_out R W_in^T between them without its small numbers.
 
 Where the host has room for all of C, one threshold is taken of it. Else blocks of rows stream through W_in,
 what is below a first threshold is dropped, and blocks of columns stream through W_out. Both bases are
@@ -8,23 +8,143 @@ orthonormal: the error of R in the Frobenius norm is at most the sum of what bot
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import math
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from ltcl import checks
-from ltcl.compression.sources import COLUMNS, Rows, cut, rows_at_once
+from ltcl.compression.losses import estimate_norm
+from ltcl.compression.sources import COLUMNS, Rows, cut, source
+from ltcl.device import Device, open_device
+from ltcl.errors import InputError, InputTypeError
+from ltcl.operators import Basis, Compressed, SubsetBasis, Tiles, Wavelet, basis, smallest
+from ltcl.operators.bases import multiresolution_order, restrict_to_support
+from ltcl.operators.stored import basis_of
+from ltcl.operators.tiles import Packed
+from ltcl.operators.wavelets import filters
 
 Transform = Callable[[np.ndarray], np.ndarray]  # (N, k) float32 -> (N, k) float32, k a multiple of COLUMNS
 Progress = Callable[[float], object]
 _CACHED = 512  # rows of a dense block that stay in the cache while they are looked at several times
 _SHIFT = 16  # bits of a float32 that a bin of `threshold_within` leaves open
 _PIECE = 1 << 22  # numbers counted at once
+PIXELS, ROWS = "pixels", " rows"
+INVERSE_NAMES = ("db2", "haar", "db4", PIXELS)  # compared where none is named, in this order
+_SIGNS = 32  # pictures of random signs
+_own_device = functools.cache(open_device)  # of a worker, which keeps it
+
+
+def basis_names(names: Any, *, for_inverse: bool = False) -> list[str]:
+    """Names of one basis or of several, as a list."""
+    names = [names] if isinstance(names, str) else names
+    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names) or not names:
+        raise InputTypeError(f"basis is {names!r}; it must be a name, such as db2, or a list of at least one")
+    for name in names:
+        if for_inverse and name.endswith(ROWS):
+            raise InputError(f"basis is {name!r}; an inverse needs one basis on both sides, such as 'db2'")
+        try:
+            if name != PIXELS:
+                filters(name.removesuffix(ROWS))
+        except InputError as error:
+            known = "pixels, or an orthonormal wavelet such as haar, db2 or db4, with ' rows' for rows alone"
+            raise InputError(f"basis is {name!r}; it must be {known}") from error
+    return list(names)
+
+
+@dataclass(frozen=True)
+class Bases:
+    """R = out^T C into; None is pixels.
+
+    `weights` (N,) of columns, at least 1, are the root of 1 + N e: the squares that a number which is dropped
+    costs a single pixel, and light of energies e.
+    """
+
+    device: Device
+    name: str
+    out: Basis | None
+    into: Basis | None
+    weights: np.ndarray
+
+    @classmethod
+    def named(cls, device: Device, grid: tuple[int, int], name: str, light: Any = None) -> Bases:
+        """Those of a name, on a grid, with weights by `light` (N, k) of norm 1."""
+        W = basis(device, grid, name.removesuffix(ROWS))
+        if isinstance(W, Wavelet):  # large coefficients then lie side by side, in fewer tiles
+            order = multiresolution_order(grid, W.levels)
+            W = SubsetBasis(device, grid, order, of=W)
+        weights = np.sqrt(1.0 + (0.0 if light is None else len(light) * energies(W, light)))
+        weights = np.broadcast_to(weights, grid[0] * grid[1])
+        return cls(device, name, None if name.endswith(ROWS) else W, W, weights)
+
+    def compressed(self, core: Any, allowance: float) -> Compressed:
+        """R~ of a core with weights, rounded by `allowance` in the 2-norm, about: see `quantize`.
+
+        Where both sides have one basis, it is without coefficients that the core does not touch.
+        """
+        data = (core.data / self.weights[core.indices]).astype(core.dtype)
+        core = scipy.sparse.csr_array((data, core.indices, core.indptr), core.shape)
+        out, into = self.out, self.into
+        if into is not None and out is into:
+            core, into = restrict_to_support(core, into)
+            out = into
+        return Compressed(Tiles(self.device, quantize(core, allowance)), out, into, 0.0)
+
+    def gather(self, R: Rows, progress: Progress = lambda share: None, **limits: Any) -> Coefficients:
+        """The numbers of R, times the weights, within the `limits` of `coefficients`."""
+        into = Analysis(self.into, self.weights[:, None].astype(np.float32))
+        return coefficients(R, self.out and Analysis(self.out), into, progress=progress, **limits)
+
+    def noise(self, variances: Any) -> list[np.ndarray]:
+        """Standard deviations of rows and columns of weighted numbers, of random signs: each within 13 %."""
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (variances.shape[1], _SIGNS))
+        sides = zip((self.out, self.into), variances, (1.0, self.weights), strict=True)
+        return [weights * np.sqrt(energies(W, np.sqrt(each)[:, None] * signs)) for W, each, weights in sides]
+
+
+def energies(W: Basis | None, x: np.ndarray) -> np.ndarray:
+    """Mean squares of the coefficients of light x (N, k), k a multiple of `COLUMNS`; None is pixels."""
+    return np.mean(np.square(x if W is None else Analysis(W)(x.astype(np.float32)), dtype=np.float64), axis=1)
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """W x of light x (N, k) on the host in float32, times weights; None is pixels. Pickles find a device."""
+
+    W: Basis | None
+    weights: np.ndarray | None = None
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Of columns."""
+        y = x if self.W is None else self.W.apply(self.W.device.upload(x)).get()
+        return y if self.weights is None else self.weights * y
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _analysis, (self.W and self.W.to_arrays(), self.weights)
+
+
+def _analysis(arrays: Any, weights: np.ndarray | None) -> Analysis:
+    return Analysis(arrays and basis_of(_own_device(), arrays), weights)
+
+
+def quantize(C: scipy.sparse.csr_array, allowance: float) -> Packed:
+    """C in the tiles of fewest bytes whose rounding has a 2-norm of at most about `allowance`.
+
+    That norm is estimated; who hands out the tiles measures what they are worth.
+    """
+    size = float(np.linalg.norm(C.data.astype(np.float64)))
+    frobenius = allowance * math.sqrt(len(C.indptr) - 1)  # or less: the 2-norm of rounding is far below
+    while True:
+        packed = smallest(C, frobenius / size if size else 0.0)
+        if packed.precision == "float32" or packed.difference[1] <= allowance:
+            return packed
+        if estimate_norm(scipy.sparse.csr_array(packed.matrix() - C))[0] <= allowance:
+            return packed
+        frobenius = 0.5 * packed.difference[0]
 
 
 def drop_below(X: Any, threshold: float) -> tuple[scipy.sparse.csr_array, float]:
@@ -94,7 +214,7 @@ class Coefficients:
             return self
         core, lost = drop_below(self.core, threshold)
         second = math.sqrt(self.second**2 + lost)
-        return dataclasses.replace(self, core=core, second=second, threshold=threshold)
+        return replace(self, core=core, second=second, threshold=threshold)
 
 
 def coefficients(
@@ -113,60 +233,49 @@ def coefficients(
     W_out of (M, k) and W_in of (N, k) numbers are orthonormal, None of pixels. By default, `threshold` is the
     largest that drops no more than the Frobenius norm `drop`, or a larger one where that keeps more than
     `most` numbers, and `first` 0 where the host has room for all numbers twice, else what drops about a third
-    of `drop`, or more. The core has the same bits for any `R.memory`.
+    of `drop`, or more. The core has the same bits for any `R.memory` and `R.client`.
     """
     (m, n), room = R.shape, checks.host_memory() // 2
     if first is None and 4 * m * n <= room:
         C = np.empty((m, n), np.float32)
-        for at, rows in R.blocks():
+        for at, rows in R.each(lambda at, rows, _: (at, _transformed(into, rows.T).T)):
             C[at] = rows
             progress(0.5 * at.stop / m)
-        for W, side in ((into, C.T), (out, C)):
-            if W is not None:
-                for start, stop in cut(side.shape[1], _CACHED):
-                    side[:, start:stop] = _transformed(W, side[:, start:stop])
+        for start, stop in cut(n, _CACHED) if out is not None else ():
+            C[:, start:stop] = _transformed(out, C[:, start:stop])
         threshold = threshold_within(drop, C, most=most) if threshold is None else threshold
         core, lost = drop_below(C, threshold)
         progress(1.0)
         return Coefficients(core, 0.0, math.sqrt(lost), threshold)
-
-    def from_rows() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """C^T = W_in R^T, a column for each row of R."""
-        for at, rows in R.blocks():
-            yield np.arange(at.start, at.stop), _transformed(into, rows.T)
-            progress(0.5 * at.stop / m)
-
     most = min(most, room // 16)  # 8 bytes each, and up to twice as many for a while
     if out is None:
-        core, lost, threshold = _collect(from_rows(), (n, m), threshold, drop, most)
-        return Coefficients(scipy.sparse.csr_array(core.T), 0.0, lost, threshold)
-    between, left, _ = _collect(from_rows(), (n, m), first, drop / 3.0, room // 16)
-    between: Any = between.T  # sparse by columns, of which few are left where light is smooth
-    columns = np.flatnonzero(np.diff(between.indptr))
-
-    def from_columns() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for start, stop in cut(len(columns), rows_at_once(m, R.memory)):
-            yield columns[start:stop], _transformed(out, between[:, columns[start:stop]].toarray())
-            progress(0.5 + 0.5 * stop / len(columns))
-
-    core, lost, threshold = _collect(from_columns(), (m, n), threshold, drop, most)
+        core, lost, threshold = _collect(R, into, threshold, drop, most, progress)
+        return Coefficients(core, 0.0, lost, threshold)
+    between, left, _ = _collect(R, into, first, drop / 3.0, room // 16, lambda share: progress(0.5 * share))
+    columns = scipy.sparse.csr_array(between.T)
+    lit = np.flatnonzero(np.diff(columns.indptr))  # few, where light is smooth
+    columns, note = source("C", columns[lit], R.memory, R.client), lambda share: progress(0.5 + 0.5 * share)
+    core, lost, threshold = _collect(columns, out, threshold, drop, most, note)
+    core = scipy.sparse.csr_array(core.T)
+    indices = lit.astype(core.indices.dtype)[core.indices]
+    core = scipy.sparse.csr_array((core.data, indices, core.indptr), (m, n))
     return Coefficients(core, left, lost, threshold)
 
 
 def _collect(
-    blocks: Iterable[tuple[np.ndarray, np.ndarray]],
-    shape: tuple[int, int],
-    threshold: float | None,
-    drop: float,
-    most: float,
+    R: Rows, W: Transform | None, threshold: float | None, drop: float, most: float, progress: Progress
 ) -> tuple[scipy.sparse.csr_array, float, float]:
-    """A matrix by blocks of its columns, without what is below a threshold; what was lost; and the threshold.
+    """R W^T without what is below a threshold; what was lost; and the threshold.
 
     One that is not given rises whenever twice as many numbers as `most` have come together, never above what
     all of them call for.
     """
-    pieces: list[Any] = [scipy.sparse.csr_array((shape[0], 0), dtype=np.float32)]
-    columns, lost, lowest = [np.zeros(0, np.int64)], 0.0, threshold or 0.0
+    pieces: list[Any] = [scipy.sparse.csr_array((0, R.shape[1]), dtype=np.float32)]
+    lost, lowest = 0.0, threshold or 0.0
+
+    def large(at: slice, rows: np.ndarray, least: float) -> tuple[int, scipy.sparse.csr_array, float]:
+        core, squares = drop_below(_transformed(W, rows.T), least)
+        return at.stop, scipy.sparse.csr_array(core.T), squares
 
     def raise_threshold(frobenius: float) -> None:
         nonlocal pieces, lost, lowest
@@ -174,18 +283,15 @@ def _collect(
         cores, squares = zip(*(drop_below(piece, lowest) for piece in pieces), strict=True)
         pieces, lost = list(cores), lost + math.fsum(squares)
 
-    for which, block in blocks:
-        core, squares = drop_below(block, lowest)
-        pieces.append(core)
-        columns.append(which)
+    for stop, piece, squares in R.each(large, lambda: lowest):
+        pieces.append(piece)
         lost += squares
         if threshold is None and sum(piece.nnz for piece in pieces) > 2 * most:
             raise_threshold(0.0)
+        progress(stop / R.shape[0])
     if threshold is None:
         raise_threshold(math.sqrt(max(drop**2 - lost, 0.0)))
-    whole: Any = scipy.sparse.hstack(pieces, format="csr")
-    indices = np.concatenate(columns).astype(whole.indices.dtype)[whole.indices]
-    return scipy.sparse.csr_array((whole.data, indices, whole.indptr), shape), math.sqrt(lost), lowest
+    return scipy.sparse.csr_array(scipy.sparse.vstack(pieces, format="csr")), math.sqrt(lost), lowest
 
 
 def _transformed(transform: Transform | None, block: np.ndarray) -> np.ndarray:

@@ -25,38 +25,30 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import checks
-from ltcl.compression.bases import INVERSE_NAMES, Bases, quantize, validate_names
-from ltcl.compression.coefficients import Coefficients
-from ltcl.compression.norms import MISS, Starts, fresh_starts, inverse_norm
-from ltcl.compression.pictures import CONFIDENCE, PictureError, losses, picture_error, typical_light
+from ltcl import checks, cluster
+from ltcl.compression import losses
+from ltcl.compression.coefficients import INVERSE_NAMES, Bases, Coefficients, basis_names
+from ltcl.compression.losses import PictureError, Starts, fresh_starts, inverse_norm, picture_error
 from ltcl.compression.sources import Inputs, Problem, memory_errors, validate_inputs, window_of
 from ltcl.device import Device
 from ltcl.errors import ConvergenceError, InputError, InputTypeError, ToleranceError
-from ltcl.operators import IdentityPlus, ScaledColumns
-from ltcl.operators.tiles import Packed
+from ltcl.operators import Compressed, IdentityPlus, ScaledColumns, Tiles
 from ltcl.theory import TwoNorm, two_norm
 from ltcl.transport import Transport, require
 
 Note = Callable[[str, float], object]
 _GATHER = 0.7  # of what is allowed: Frobenius norm of what need not even be looked at
-_MORE = 4  # times the numbers kept on the window, which the whole may need
-_TRIES = 8
-_AIM, _GROWTH = 0.96, 8.0  # of the tolerance, what is tried next; no step grows by more
-_CLOSE = 0.92  # of the tolerance is good enough
-_UNIT = 2.0**-24  # rounding of float32
+_MORE, _TRIES = 4, 8  # times the numbers kept on the window, which the whole may need; thresholds
+_AIM, _CLOSE, _GROWTH = 0.96, 0.92, 8.0  # of the tolerance, tried next; enough; no step grows by more
 _ROUNDING = {"worst": 0.05, "pictures": 0.3}  # of what is allowed, for rounding the core
 _GUESS = 64  # pictures by which bases are compared
-_COARSE = 1.5  # between the bounds of a norm on which no choice depends
 _NOISE = math.sqrt(2.0), 3.0  # deviations that stand out, where light is most, and where it is average
-_LEAST = 0.5  # of T.noise: more of it is never taken back
-_QUIET = 0.1  # of the noise of pictures, for the rounding of the core
+_LEAST, _QUIET = 0.5, 0.1  # of T.noise, never taken back; of that of pictures, for rounding the core
 _TRANSFORMS = 1e-6  # of coefficients that went through transforms in float32, rounded there
-_FACTOR = 1.05  # between the bounds of a norm
+_FACTOR, _COARSE = 1.05, 1.5  # between the bounds of a norm, and of one on which no choice depends
 _DIFFUSE = 2.0  # ||S^-1|| of a diffuse scene, as long as nothing was measured
 _MOST = 512  # numbers a row, beyond which a basis is no use unless all are
-_WIDE = 2.0  # times what is allowed: a Frobenius norm at which bases are compared before more is measured
-_WORSE = 3  # times the numbers of the best then: left
+_WIDE, _WORSE = 2.0, 3  # times what may be dropped: bases of more numbers than 3 times the best are left
 
 
 @dataclass(frozen=True)
@@ -133,6 +125,7 @@ def compress(
     first_bounce: Any = None,
     device: Device | str | None = None,
     memory: int | None = None,
+    client: Any = None,
     progress: Note | None = None,
 ) -> Transport:
     """Write a transport in few numbers, at a known cost to its solutions.
@@ -168,6 +161,9 @@ def compress(
     memory : int, optional
         Bytes of host memory for a block of rows. Between the passes over rows and over columns half of what
         is free is taken; something is dropped there only where that is too little.
+    client : distributed.Client, optional
+        Its workers read, transform and multiply the blocks of rows: those of a Dask array, of a zarr array
+        that they see, and of what has ``rows`` by themselves; others are sent. The numbers are the same.
     progress : callable(text, share), optional
         Called as the work goes on.
 
@@ -198,23 +194,24 @@ def compress(
     (True, True, True)
     """
     began = time.perf_counter()
-    rtol = rtol if isinstance(rtol, str) and rtol == "noise" else validate_rtol(rtol, _UNIT)
+    rtol = rtol if isinstance(rtol, str) and rtol == "noise" else validate_rtol(rtol, losses.UNIT)
     goal = Goal(checks.one_of("norm", norm, tuple(_ROUNDING)), math.nan if rtol == "noise" else float(rtol))
     budget = None if budget is None else checks.count("budget", budget)
     memory = None if memory is None else checks.count("memory", memory)
-    names = validate_names(INVERSE_NAMES if basis is None else basis)
+    names = basis_names(INVERSE_NAMES if basis is None else basis)
     note = validate_progress(progress)
+    if client is not None:
+        cluster.require(client)
     with memory_errors("compress", T):
         noise = require(T).noise if rtol == "noise" else None
-        inputs = validate_inputs(T, grid, first_bounce, device, memory, noise)
+        inputs = validate_inputs(T, grid, first_bounce, device, noise, memory=memory, client=client)
         C, channels = compress_inputs(inputs, names, goal, fresh_starts("compress"), note)
     needed = sum(channel.nbytes for channel in channels)
     if budget is not None and needed > budget:
-        raise InputError(
-            f"budget is {budget} bytes, but rtol {rtol} needs {needed} ({checks.size(needed)}); "
-            f"give a budget of at least {needed} bytes, or a larger rtol"
-        )
-    window, spent = window_of(inputs.grid), time.perf_counter() - began
+        advice = f"give a budget of at least {needed} bytes, or a larger rtol"
+        what = f"budget is {budget} bytes, but rtol {rtol} needs {needed} ({checks.size(needed)})"
+        raise InputError(f"{what}; {advice}")
+    window, spent = window_of(C.grid), time.perf_counter() - began
     C.compression = Compression(rtol, norm, budget, inputs.nbytes, window, spent, channels)
     return C
 
@@ -235,9 +232,8 @@ def validate_rtol(rtol: Any, least: float) -> float:
     """`rtol`, refused before any work where a product in float32 already rounds by as much."""
     rtol = checks.number("rtol", rtol, above=0.0, below=1.0)
     if rtol <= least:
-        raise ToleranceError(
-            f"rtol is {rtol:g}; it must be above {checks.upwards(least)}, which float32 rounds"
-        )
+        message = f"rtol is {rtol:g}; it must be above {checks.upwards(least)}, which float32 rounds"
+        raise ToleranceError(message)
     return rtol
 
 
@@ -253,26 +249,20 @@ def compress_inputs(
 ) -> tuple[Transport, tuple[ChannelCompression, ...]]:
     """R of every channel in the best of the bases `names`, and what is reported of each."""
     colours = ("red: ", "green: ", "blue: ") if len(inputs.problems) == 3 else ("",)
-    matrices, reports, draws = [], [], fresh_starts("pictures", 1.0 - CONFIDENCE)
-    for number, (problem, F) in enumerate(zip(inputs.problems, inputs.F, strict=True)):
-
-        def note(text: str, share: float, number: int = number) -> None:
-            progress(colours[number] + text, (number + share) / len(colours))
-
+    matrices, reports, draws = [], [], fresh_starts("pictures", 1.0 - losses.PICTURES)
+    for number, problem in enumerate(inputs.problems):
+        note = lambda text, share, c=number: progress(colours[c] + text, (c + share) / len(colours))  # noqa: E731
         best, trials = _compare(problem, names, goal, note)
         fit = _whole(problem, best, goal, starts, draws, note)
-        matrices.append(ScaledColumns(fit.system(problem), F))
+        matrices.append(ScaledColumns(fit.system(problem), problem.F))
         reports.append(fit.report(trials))
         note("done", 1.0)
-    on_dark = "mask" if inputs.masked else "raise"
-    settings: dict[str, Any] = {"on_dark": on_dark, "mixing": inputs.mixing, "noise": inputs.noise}
-    C = Transport(matrices, inputs.grid, first_bounce=inputs.F, dark=0.0, **settings)
-    return C, tuple(reports)
+    return Transport(matrices, dark=0.0, **inputs.settings), tuple(reports)
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """R~ in some bases: the largest `numbers` of the `candidates`, `packed` on their `support`.
+    """R~ in some bases: the largest `numbers` of the `candidates`, rounded.
 
     `norm` is that of R~ - R, `inverse` an upper bound on that of S~^-1, or a guess where nothing confirms it,
     `pictures` what these lose, and `risk` the estimated squared error of theirs where noise decides.
@@ -281,12 +271,16 @@ class _Fit:
     bases: Bases
     candidates: Coefficients
     numbers: Coefficients
-    support: Bases
-    packed: Packed
+    R: Any  # Compressed, of Tiles
     norm: TwoNorm | None
     inverse: float
     pictures: PictureError | None
     risk: float = 0.0
+
+    @property
+    def nbytes(self) -> int:
+        """Of the core, without a transpose that products made."""
+        return self.R.core.packed.nbytes
 
     @property
     def error_bound(self) -> float:
@@ -299,24 +293,22 @@ class _Fit:
         return self.pictures.error if self.pictures else self.error_bound
 
     def system(self, problem: Problem) -> IdentityPlus:
-        """S~ as it is handed out, with its errors and the diagonal of R."""
+        """S~ as it is handed out, with its errors and the diagonal of R, on a core without a transpose."""
         try:
             diagonal = problem.operator.diagonal()
         except InputError:  # somebody's own operator may have none
             diagonal = None
-        R = self.support.operator(
-            problem.operator.device, self.packed, self.norm.upper if self.norm else math.inf, diagonal
-        )
+        error, core = self.norm.upper if self.norm else math.inf, Tiles(self.R.device, self.R.core.packed)
+        R = Compressed(core, self.R.out, self.R.into, error, diagonal=diagonal)
         S = IdentityPlus(R, solution_error=self.solution_error)
         S.error_bound = self.error_bound
         return S
 
     def trial(self) -> Trial:
         """What the report says of it as one of several."""
-        packed, per_row = self.packed, self.numbers.core.nnz / (len(self.numbers.core.indptr) - 1)
-        form = (self.bases.name, "tiles", packed.width, packed.precision)
+        core, per_row = self.R.core, self.numbers.core.nnz / (len(self.numbers.core.indptr) - 1)
         error = self.norm.upper if self.norm else None
-        return Trial(*form, per_row, packed.nbytes, error)
+        return Trial(self.bases.name, "tiles", core.width, core.precision, per_row, self.nbytes, error)
 
     def report(self, trials: Sequence[Trial]) -> ChannelCompression:
         """What is reported of a channel."""
@@ -324,142 +316,136 @@ class _Fit:
             **vars(self.trial()),
             threshold=self.numbers.threshold,
             dropped=self.numbers.dropped,
-            quantisation=self.packed.difference[0],
+            quantisation=self.R.core.quantisation,
             inverse_norm=self.inverse,
             solution_error=self.solution_error,
             error_bound=self.error_bound,
             pictures=self.pictures,
-            confidence=1.0 - MISS,
+            confidence=1.0 - losses.MISS,
             trials=tuple(trials),
         )
 
 
-def _fit(
-    problem: Problem,
-    bases: Bases,
-    candidates: Coefficients,
-    goal: Goal,
-    inverse: float,
-    drop: float,
-    starts: Starts | None = None,
-    note: Callable[[str], object] = lambda text: None,
-) -> _Fit:
-    """R~ of fewest bytes that was found with a solution error of at most `goal.rtol`.
+@dataclass(frozen=True)
+class _Search:
+    """The way to R~ of a channel, confirmed by fresh `starts` of norms and `draws` of pictures.
 
-    The largest of the `candidates` remain; where all are too few, R is read again. `inverse` and `drop`
-    are guesses of ||S~^-1|| and of the Frobenius norm to drop; without `starts` of norms or pictures that
-    confirm what is handed out, `inverse` is believed, and few pictures suffice.
+    On the window, without them, a guess of ||S~^-1|| is believed, and few pictures suffice.
     """
-    rtol, by_pictures = goal.rtol, goal.norm == "pictures"
-    best: _Fit | None = None
-    share, low, high, misses = math.inf, 0.0, math.inf, 0
-    for number in range(_TRIES):
-        note(stage := f"{bases.name}, threshold {number + 1}")
-        numbers = candidates.largest(drop)
-        core, support = bases.restricted(numbers.core)
-        packed = quantize(core, _ROUNDING[goal.norm] * rtol / inverse)
-        R, norm, pictures = support.operator(problem.operator.device, packed), None, None
-        fresh = next(starts) if starts else {}
-        if by_pictures:
-            pictures = picture_error(problem, R, **(fresh or {"count": _GUESS}))
-            least = pictures.error
-        else:
-            certain = _certain(numbers, packed)
-            norm = two_norm(problem.operator, R, factor=_FACTOR, frobenius=certain, **fresh)
-            least = norm.estimate * inverse
-            if starts and norm.upper * inverse <= rtol:
-                note(f"{stage}: norm of S^-1")
-                inverse = inverse_norm(IdentityPlus(R), factor=_FACTOR, **next(starts)).upper
-        fit = _Fit(bases, candidates, numbers, support, packed, norm, inverse, pictures)
-        share = fit.solution_error / rtol
-        if share <= 1.0:
-            low = drop
-            best = fit if best is None or fit.packed.nbytes < best.packed.nbytes else best
-            if share >= _CLOSE or not numbers.core.nnz:
+
+    problem: Problem
+    goal: Goal
+    note: Callable[[str], object]
+    starts: Starts | None = None
+    draws: Starts | None = None
+
+    def bases(self, name: str) -> Bases:
+        """Those of a name, with weights where pictures or noise decide."""
+        worst = self.goal.norm == "worst" and not math.isnan(self.goal.rtol)
+        light = None if worst else losses.typical_light(self.problem, _GUESS)
+        return Bases.named(self.problem.operator.device, self.problem.grid, name, light)
+
+    def norm(self, numbers: Coefficients, R: Any, factor: float, **start: Any) -> TwoNorm:
+        """||R~ - R||_2, at most what is certain of its Frobenius norm."""
+        transforms = _TRANSFORMS * float(np.linalg.norm(numbers.core.data.astype(np.float64)))
+        certain = numbers.dropped + transforms + R.core.quantisation
+        return two_norm(self.problem.operator, R, factor=factor, frobenius=certain, **start)
+
+    def fit(self, bases: Bases, candidates: Coefficients, inverse: float, drop: float) -> _Fit:
+        """R~ of fewest bytes that was found with a solution error of at most `goal.rtol`.
+
+        The largest of the `candidates` remain; where all are too few, R is read again. `inverse` and `drop`
+        are guesses of ||S~^-1|| and of the Frobenius norm to drop.
+        """
+        rtol, by_pictures, N = self.goal.rtol, self.goal.norm == "pictures", self.problem.R.shape[0]
+        starts, best = self.draws if by_pictures else self.starts, None
+        share, low, high, misses = math.inf, 0.0, math.inf, 0
+        for number in range(_TRIES):
+            self.note(stage := f"{bases.name}, threshold {number + 1}")
+            numbers, norm, pictures = candidates.largest(drop), None, None
+            R = bases.compressed(numbers.core, _ROUNDING[self.goal.norm] * rtol / inverse)
+            fresh = next(starts) if starts else {}
+            if by_pictures:
+                pictures = picture_error(self.problem, R, **(fresh or {"count": _GUESS}))
+                least = pictures.error
+            else:
+                norm = self.norm(numbers, R, _FACTOR, **fresh)
+                least = norm.estimate * inverse
+                if starts and norm.upper * inverse <= rtol:
+                    self.note(f"{stage}: norm of S^-1")
+                    inverse = inverse_norm(IdentityPlus(R), factor=_FACTOR, **next(starts)).upper
+            fit = _Fit(bases, candidates, numbers, R, norm, inverse, pictures)
+            share = fit.solution_error / rtol
+            if share <= 1.0:
+                low = drop
+                best = fit if best is None or fit.nbytes < best.nbytes else best
+                if share >= _CLOSE or not numbers.core.nnz:
+                    break
+            elif fit.R.core.precision == "float32" and least - numbers.dropped * inverse > rtol:
+                break  # by rounding alone
+            elif numbers.core.nnz < candidates.core.nnz:
+                high, misses = drop, misses + 1
+            else:  # all are too few
+                finer = _GATHER * min(self.goal.frobenius(inverse, N), candidates.dropped / share)
+                again = bases.gather(self.problem.R, drop=finer) if candidates.dropped else candidates
+                if not again.dropped < candidates.dropped:
+                    break
+                candidates = again
+            # How far the 2-norm lies below the Frobenius norm changes slowly: in proportion, a little short.
+            # Where that misses again, rounding is most of it, and leaves less for what is dropped.
+            drop *= min(_AIM / share / 2.0 ** max(misses - 1, 0), _GROWTH) if share else _GROWTH
+            if not low < drop < high:
+                between, widest = low and high < math.inf, self.goal.frobenius(inverse, N)
+                drop = math.sqrt(low * high) if between else 2.0 * low or 0.5 * min(high, widest)
+            if high < 1.05 * low:
                 break
-        elif packed.precision == "float32" and least - numbers.dropped * inverse > rtol:
-            break  # by rounding alone
-        elif numbers.core.nnz < candidates.core.nnz:
-            high, misses = drop, misses + 1
-        else:  # all are too few
-            finer = _GATHER * min(goal.frobenius(inverse, problem.R.shape[0]), candidates.dropped / share)
-            again = bases.gather(problem.R, drop=finer) if candidates.dropped else candidates
-            if not again.dropped < candidates.dropped:
-                break
-            candidates = again
-        # How far the 2-norm lies below the Frobenius norm changes slowly: in proportion, a little short.
-        # Where that misses again, rounding is most of it, and leaves less for what is dropped.
-        drop *= min(_AIM / share / 2.0 ** max(misses - 1, 0), _GROWTH) if share else _GROWTH
-        if not low < drop < high:
-            between = low and high < math.inf
-            widest = goal.frobenius(inverse, problem.R.shape[0])
-            drop = math.sqrt(low * high) if between else 2.0 * low or 0.5 * min(high, widest)
-        if high < 1.05 * low:
-            break
-    if best is None:
-        least = float(checks.upwards(1.25 * share * rtol))
-        raise ToleranceError(f"rtol is {rtol:g}, but float32 reaches about {least:g} for this T", least)
-    return best
+        if best is None:
+            least = float(checks.upwards(1.25 * share * rtol))
+            message = f"rtol is {rtol:g}, but float32 reaches about {least:g} for this T"
+            raise ToleranceError(message, least)
+        return best
 
-
-def _certain(numbers: Coefficients, packed: Packed) -> float:
-    """||R~ - R||_F at most."""
-    transforms = _TRANSFORMS * float(np.linalg.norm(numbers.core.data.astype(np.float64)))
-    return numbers.dropped + transforms + packed.difference[0]
-
-
-def _bases(problem: Problem, name: str, goal: Goal) -> Bases:
-    """Those of a name, with weights where pictures or noise decide."""
-    worst = goal.norm == "worst" and not math.isnan(goal.rtol)
-    light = None if worst else typical_light(problem, _GUESS)
-    return Bases.named(problem.operator.device, problem.grid, name, light)
-
-
-def _significant(problem: Problem, bases: Bases, note: Callable[[str], object]) -> _Fit:
-    """R~ of the numbers that stand out of the noise."""
-    note(f"{bases.name}, noise")
-    rows, columns = bases.noise(problem.noise)
-    weights, (low, middle) = bases.weights**2, _NOISE
-    limits = np.sqrt(low**2 + 2.0 * (middle**2 - low**2) / weights)
-    least = [float(np.min(side, where=side > 0.0, initial=np.inf)) for side in (rows, limits * columns)]
-    least = _LEAST * math.prod(least) if max(least) < math.inf else 0.0
-    coefficients = bases.gather(problem.R, threshold=least)
-    core, total = coefficients.core.copy(), float(np.sum(rows**2) * np.sum(columns**2))
-    sizes = np.repeat(rows, np.diff(core.indptr)) * columns[core.indices]
-    small = np.abs(core.data) < limits[core.indices] * sizes
-    # What is dropped has all of its noise: where it is less than T.noise says, that is too much.
-    left, noise = coefficients.dropped**2 + np.sum(core.data[small] ** 2), total - np.sum(sizes[~small] ** 2)
-    sizes *= np.clip(math.sqrt(left / noise), _LEAST, 1.0) if noise > 0.0 else 1.0
-    small = np.abs(core.data) < limits[core.indices] * sizes
-    second, core.data[small] = math.hypot(coefficients.second, np.linalg.norm(core.data[small])), 0.0
-    core.eliminate_zeros()
-    numbers, indices = replace(coefficients, core=core, second=second), coefficients.core.indices[~small]
-    core, support = bases.restricted(core)
-    of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2 / weights))  # noise in light of norm 1
-    packed = quantize(core, _QUIET * of_pictures)
-    R, light = support.operator(problem.operator.device, packed), typical_light(problem, _GUESS)
-    energies = ((1.0 - 1.0 / weights) / len(weights))[indices]  # over the weights, which `sizes` have
-    risk = np.sum(losses(problem, R, light)[0] ** 2) / _GUESS + 2.0 * np.sum(sizes[~small] ** 2 * energies)
-    return _Fit(bases, coefficients, numbers, support, packed, None, _DIFFUSE, None, float(risk))
+    def significant(self, bases: Bases) -> _Fit:
+        """R~ of the numbers that stand out of the noise."""
+        self.note(f"{bases.name}, noise")
+        rows, columns = bases.noise(self.problem.noise)
+        weights, (low, middle) = bases.weights**2, _NOISE
+        limits = np.sqrt(low**2 + 2.0 * (middle**2 - low**2) / weights)
+        least = [float(np.min(side, where=side > 0.0, initial=np.inf)) for side in (rows, limits * columns)]
+        least = _LEAST * math.prod(least) if max(least) < math.inf else 0.0
+        coefficients = bases.gather(self.problem.R, threshold=least)
+        core, total = coefficients.core.copy(), float(np.sum(rows**2) * np.sum(columns**2))
+        sizes = np.repeat(rows, np.diff(core.indptr)) * columns[core.indices]
+        small = np.abs(core.data) < limits[core.indices] * sizes
+        # What is dropped has all of its noise: where it is less than T.noise says, that is too much.
+        left = coefficients.dropped**2 + np.sum(core.data[small] ** 2)
+        noise = total - np.sum(sizes[~small] ** 2)
+        sizes *= np.clip(math.sqrt(left / noise), _LEAST, 1.0) if noise > 0.0 else 1.0
+        small = np.abs(core.data) < limits[core.indices] * sizes
+        second, core.data[small] = math.hypot(coefficients.second, np.linalg.norm(core.data[small])), 0.0
+        core.eliminate_zeros()
+        numbers, indices = replace(coefficients, core=core, second=second), coefficients.core.indices[~small]
+        of_pictures = math.sqrt(np.mean(rows**2) * np.sum(columns**2 / weights))  # noise in light of norm 1
+        R, light = bases.compressed(core, _QUIET * of_pictures), losses.typical_light(self.problem, _GUESS)
+        energies = ((1.0 - 1.0 / weights) / len(weights))[indices]  # over the weights, which `sizes` have
+        risk = np.sum(losses.lost(self.problem, R, light)[0] ** 2) / _GUESS
+        risk += 2.0 * np.sum(sizes[~small] ** 2 * energies)
+        return _Fit(bases, coefficients, numbers, R, None, _DIFFUSE, None, float(risk))
 
 
 def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> tuple[_Fit, list[Trial]]:
     """The fit of fewest bytes on a window, and all that was tried; the first also tells the norm of S^-1."""
     window, trials, fits, refusals, fewest = problem.window(), [], [], [], math.inf
-    inverse = _DIFFUSE if goal.norm == "pictures" else None
-    device, pixels = window.operator.device, window.R.shape[0]
+    inverse, pixels = _DIFFUSE if goal.norm == "pictures" else None, window.R.shape[0]
     for number, name in enumerate(names):
-
-        def tried(text: str, at: float = 0.5 * number / len(names)) -> None:
-            note(f"trying {text}", at)
-
-        tried(name)
-        bases = _bases(window, name, goal)
+        search = _Search(window, goal, lambda text, k=number: note(f"trying {text}", 0.5 * k / len(names)))
+        search.note(name)
+        bases = search.bases(name)
         if math.isnan(goal.rtol):
-            fits.append(_significant(window, bases, tried))
+            fits.append(search.significant(bases))
             trials.append(fits[-1].trial())
             continue
-        allowed = goal.frobenius(inverse or _DIFFUSE, pixels)
+        allowed, left = goal.frobenius(inverse or _DIFFUSE, pixels), ""
         candidates = bases.gather(window.R, drop=_GATHER * allowed, most=_MOST * pixels)
         count = candidates.largest(_WIDE * allowed).core.nnz
         if fits and count > _WORSE * fewest:
@@ -467,56 +453,45 @@ def _compare(problem: Problem, names: Sequence[str], goal: Goal, note: Note) -> 
         else:
             fewest = min(fewest, count)
             if inverse is None:
-                tried(f"{name}: norm of S^-1")
+                search.note(f"{name}: norm of S^-1")
                 try:
-                    core, support = bases.restricted(candidates.core)
-                    R = support.operator(device, quantize(core, 0.0))
-                    inverse = inverse_norm(IdentityPlus(R)).upper
+                    inverse = inverse_norm(IdentityPlus(bases.compressed(candidates.core, 0.0))).upper
                 except ConvergenceError:  # the candidates are not good enough for that
                     inverse = inverse_norm(IdentityPlus(window.operator)).upper
             try:
-                drop = _WIDE * goal.frobenius(inverse, pixels)
-                fits.append(_fit(window, bases, candidates, goal, inverse, drop, note=tried))
-                trials.append(fits[-1].trial())
-                continue
+                fits.append(search.fit(bases, candidates, inverse, _WIDE * goal.frobenius(inverse, pixels)))
             except ToleranceError as error:
                 refusals.append(error)
                 left = str(error)
-        form = (name, "csr", 1, "float32", count / pixels, 8 * count)
-        trials.append(Trial(*form, error=None, left=left))
+        refused = Trial(name, "csr", 1, "float32", count / pixels, 8 * count, None, left)
+        trials.append(refused if left else fits[-1].trial())
     if not fits:
         raise refusals[0]
-    return min(fits, key=lambda fit: (fit.risk, fit.packed.nbytes)), trials
+    return min(fits, key=lambda fit: (fit.risk, fit.nbytes)), trials
 
 
 def _whole(problem: Problem, best: _Fit, goal: Goal, starts: Starts, draws: Starts, note: Note) -> _Fit:
-    """All of R in the bases that are best on the window, confirmed by norms or pictures from fresh starts."""
-    pixels, N = len(best.numbers.core.indptr) - 1, problem.R.shape[0]
-    bases, candidates, drop = best.bases, best.candidates, best.numbers.dropped
-    if pixels < N:
-        bases = _bases(problem, bases.name, goal)
-    if math.isnan(goal.rtol):
-        best = best if pixels == N else _significant(problem, bases, lambda text: note(text, 0.5))
-        return _bounded(problem, best, goal, starts, draws)
-    if pixels < N:  # begun where the window ended: the same is dropped of each row
-        drop *= math.sqrt(N / pixels)
-        allowed = max(drop, goal.frobenius(best.inverse, N))
-        most = _MORE * math.ceil(best.numbers.core.nnz / pixels) * N
-        share = lambda share: note("coefficients of all pixels", 0.5 + 0.4 * share)  # noqa: E731
-        candidates = bases.gather(problem.R, share, drop=_GATHER * allowed, most=most)
-    fresh = draws if goal.norm == "pictures" else starts
-    fit = _fit(problem, bases, candidates, goal, best.inverse, drop, fresh, lambda text: note(text, 0.9))
-    return _bounded(problem, fit, goal, starts, draws)
-
-
-def _bounded(problem: Problem, fit: _Fit, goal: Goal, starts: Starts, draws: Starts) -> _Fit:
-    """With what the norm states, and a bound for all light: a coarse one, where nothing depends on it."""
+    """All of R in the bases that are best on the window, confirmed by norms and pictures."""
+    pixels, N, by_noise = len(best.numbers.core.indptr) - 1, problem.R.shape[0], math.isnan(goal.rtol)
+    at, fit, candidates = 0.5 if by_noise else 0.9, best, best.candidates
+    search = _Search(problem, goal, lambda text: note(text, at), starts, draws)
+    bases = search.bases(best.bases.name) if pixels < N else best.bases
+    if by_noise and pixels < N:
+        fit = search.significant(bases)
+    elif not by_noise:
+        drop = best.numbers.dropped * math.sqrt(N / pixels)  # begun where the window ended, row by row
+        if pixels < N:
+            allowed = max(drop, goal.frobenius(best.inverse, N))
+            most = _MORE * math.ceil(best.numbers.core.nnz / pixels) * N
+            share = lambda share: note("coefficients of all pixels", 0.5 + 0.4 * share)  # noqa: E731
+            candidates = bases.gather(problem.R, share, drop=_GATHER * allowed, most=most)
+        fit = search.fit(bases, candidates, best.inverse, drop)
     if fit.norm:
         return fit
-    R, pictures = fit.support.operator(problem.operator.device, fit.packed), fit.pictures
+    # A bound for all light, a coarse one, where nothing depends on it.
+    pictures = fit.pictures
     if goal.norm == "pictures" and pictures is None:
-        pictures = picture_error(problem, R, **next(draws))
-    certain = _certain(fit.numbers, fit.packed)
-    norm = two_norm(problem.operator, R, factor=_COARSE, frobenius=certain, **next(starts))
-    inverse = inverse_norm(IdentityPlus(R), factor=_COARSE, **next(starts)).upper
+        pictures = picture_error(problem, fit.R, **next(draws))
+    norm = search.norm(fit.numbers, fit.R, _COARSE, **next(starts))
+    inverse = inverse_norm(IdentityPlus(fit.R), factor=_COARSE, **next(starts)).upper
     return replace(fit, norm=norm, inverse=inverse, pictures=pictures)

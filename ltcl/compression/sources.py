@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import contextlib
+import copy
+import itertools
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,6 +17,7 @@ import scipy.sparse.linalg
 
 from ltcl import checks
 from ltcl import first_bounce as _first_bounce
+from ltcl.cluster import stream
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.noise import Noise
@@ -23,53 +27,86 @@ from ltcl.transport import Transport, require
 COLUMNS = 16  # blocks are of a multiple of this, so that kernels run alike whatever the block
 _WINDOW = 64  # pixels a side of the part of a picture on which bases are compared
 _PER_VALUE = 32  # bytes of host memory for a value of a block: float64, float32, transformed, kept
-_BLOCK = 1 << 27  # bytes of a block unless `memory` says otherwise
-_MOST = 512  # rows at once: more do not help
+_BLOCK, _MOST = 1 << 27, 512  # bytes of a block unless `memory` says otherwise; rows: more do not help
 
 
 class Rows(scipy.sparse.linalg.LinearOperator):
-    """A matrix (M, N) by a function that reads its rows; products read all of them, on the host."""
+    """A matrix (M, N) by its rows, of which memory holds a few; products read all of them, on the host.
 
-    def __init__(self, shape: tuple[int, int], rows: Callable[..., np.ndarray], memory: int | None) -> None:
+    `fetch(start, stop)` reads rows of what they are made of, `make(start, stop, rows)` checks and makes them.
+    With a Dask `client` its workers make them, and fetch them if they can, `there`; else rows are sent.
+    `chunks` are how many rows are best fetched at once: of each time, or always.
+    """
+
+    client: Any = None
+    there = False
+    chunks: int | tuple[int, ...] = 1
+
+    def __init__(self, shape: Any, fetch: Callable, make: Callable, memory: int | None) -> None:
         super().__init__(np.float64, shape)
-        self.rows, self.memory = rows, memory
+        self.fetch, self.make, self.memory = fetch, make, memory
 
-    def blocks(self, dtype: type = np.float32) -> Iterator[tuple[slice, np.ndarray]]:
-        """All rows in blocks that fit into `memory`."""
-        for start, stop in cut(self.shape[0], rows_at_once(self.shape[1], self.memory)):
-            yield slice(start, stop), np.asarray(self.rows(start, stop), dtype)
+    def rows(self, start: int, stop: int) -> np.ndarray:
+        """Rows start .. stop - 1, (stop - start, N)."""
+        return self.make(start, stop, self.fetch(start, stop))
+
+    def each(self, work: Callable, value: Callable = lambda: None, dtype: Any = np.float32) -> Iterator[Any]:
+        """`work(at, rows, value())` of all blocks that fit into `memory`, in order, here or on workers."""
+        make, size = self.make, rows_at_once(self.shape[1], self.memory)
+        fetch = self.fetch if self.there or self.client is None else None
+
+        def task(item: tuple[int, int, Any, Any]) -> list[Any]:  # without `self`: workers get it
+            start, stop, rows, value = item
+            rows = fetch(start, stop) if fetch else rows
+            blocks = [(start, stop, rows)]
+            if stop - start > size:
+                blocks = [(start + i, start + j, rows[i:j]) for i, j in cut(stop - start, size)]
+            return [work(slice(i, j), np.asarray(make(i, j, block), dtype), value) for i, j, block in blocks]
+
+        if isinstance(self.chunks, int):
+            spans = cut(self.shape[0], size * -(-self.chunks // size) if self.there else size)
+        else:
+            spans = itertools.pairwise([0, *itertools.accumulate(self.chunks)])
+        items = ((*span, None if fetch else self.fetch(*span), value()) for span in spans)
+        results = stream(self.client, task, items) if self.client is not None else map(task, items)
+        return itertools.chain.from_iterable(results)
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64, not rounded: a first bounce may be made of it."""
-        return np.concatenate([np.diagonal(rows, at.start) for at, rows in self.blocks(np.float64)])
+        return np.concatenate([*self.each(lambda at, rows, _: rows.diagonal(at.start).copy(), dtype=float)])
 
     def _matmat(self, X: np.ndarray) -> np.ndarray:
         x = X.astype(np.float32)
-        return np.concatenate([rows @ x for _, rows in self.blocks()]).astype(np.float64)
+        return np.concatenate([*self.each(lambda at, rows, _: rows @ x)]).astype(np.float64)
 
     def _rmatmat(self, X: np.ndarray) -> np.ndarray:
         x, product = X.astype(np.float32), np.zeros((self.shape[1], X.shape[1]))
-        for at, rows in self.blocks():
-            product += rows.T @ x[at]
+        for part in self.each(lambda at, rows, _: rows.T @ x[at]):
+            product += part
         return product
 
 
-def source(name: str, matrix: Any, memory: int | None = None) -> Rows:
+def source(name: str, matrix: Any, memory: int | None = None, client: Any = None) -> Rows:
     """`matrix` by its rows, in blocks of `memory` bytes, which are checked as they are read.
 
-    It is sparse, sliced as arrays, memory-mapped files, HDF5 and zarr arrays are, has ``rows(start, stop)``,
-    or is an operator, by products with its transpose.
+    It is sparse, sliced as arrays, memory-mapped files, HDF5, zarr and Dask arrays are, has
+    ``rows(start, stop)``, or is an operator, by products with its transpose.
     """
     if np.size(getattr(matrix, "shape", (0, 0))) != 2:
         raise InputError(f"{name} has shape {matrix.shape}; it must be (M, N)")
-    csr: Any = checks.csr(name, matrix) if scipy.sparse.issparse(matrix) else None
+    if not hasattr(matrix, "shape") or not any(hasattr(matrix, a) for a in ("__getitem__", "rows", "matvec")):
+        kinds = "be an array, sparse, an operator, or have shape and rows(start, stop)"
+        raise InputTypeError(f"{name} is a {type(matrix).__name__}; it must {kinds}")
+    matrix = checks.csr(name, matrix) if scipy.sparse.issparse(matrix) else matrix
+    columns, there = matrix.shape[1], client is not None and _is_there(client, matrix)
+    scheduler = "synchronous" if there else client  # of Dask: a worker does not wait for others
 
-    def read(start: int, stop: int) -> Any:
-        if csr is not None:
-            return csr[start:stop].toarray()
+    def fetch(start: int, stop: int) -> Any:
         if hasattr(matrix, "rows"):
             return matrix.rows(start, stop)
-        if not hasattr(matrix, "matvec"):
+        if hasattr(matrix, "dask"):
+            return matrix[start:stop].compute(scheduler=scheduler)
+        if scipy.sparse.issparse(matrix) or not hasattr(matrix, "matvec"):
             return matrix[start:stop]
         units = np.zeros((matrix.shape[0], stop - start), np.float32)
         units[np.arange(start, stop), np.arange(stop - start)] = 1.0
@@ -78,31 +115,44 @@ def source(name: str, matrix: Any, memory: int | None = None) -> Rows:
         except (NotImplementedError, TypeError) as error:  # what SciPy raises, by its version
             raise InputError(f"{name} is a {type(matrix).__name__} without rmatvec or rows") from error
 
-    def validated(start: int, stop: int) -> np.ndarray:
-        block = checks.real(f"{name} in rows {start} to {stop - 1}", read(start, stop))
-        return checks.shape(f"{name} in rows {start} to {stop - 1}", block, (stop - start, columns))
+    def make(start: int, stop: int, rows: Any) -> np.ndarray:
+        what = f"{name} in rows {start} to {stop - 1}"
+        rows = checks.real(what, rows.toarray() if scipy.sparse.issparse(rows) else rows)
+        return checks.shape(what, rows, (stop - start, columns))
 
-    if not hasattr(matrix, "shape") or not any(hasattr(matrix, a) for a in ("__getitem__", "rows", "matvec")):
-        raise InputTypeError(
-            f"{name} is a {type(matrix).__name__}; it must be an array, sparse, an operator, or have "
-            "shape and rows(start, stop)"
-        )
-    rows, columns = matrix.shape
-    return Rows((rows, columns), validated, memory)
+    R = Rows(matrix.shape, fetch, make, memory)
+    chunks = getattr(matrix, "chunks", None) or [1]  # of Dask those of all rows, else how many are in each
+    R.client, R.chunks, R.there = client, chunks[0], there
+    return R
+
+
+def _is_there(client: Any, matrix: Any) -> bool:
+    """Whether workers can fetch rows: compute them (Dask), read files (zarr), or call `rows`."""
+    from distributed import futures_of
+    from distributed.protocol.pickle import dumps
+
+    if root := getattr(getattr(matrix, "store", None), "root", None):
+        return all(client.run(os.path.isdir, str(root)).values())
+    if hasattr(matrix, "dask"):
+        return not futures_of(matrix)
+    with contextlib.suppress(Exception):  # of whatever it holds that cannot be sent
+        return hasattr(matrix, "rows") and bool(dumps(matrix, buffer_callback=lambda buffer: False))
+    return False
 
 
 def interreflection(T: Rows, F: np.ndarray) -> Rows:
     """R = T F^-1 - I by rows, in float64 and rounded once; of a masked pixel, F = 0, the column is 0."""
-    lit = F > 0
+    R, lit, make_T = copy.copy(T), F > 0, T.make
 
-    def read(start: int, stop: int) -> np.ndarray:
-        block = checks.finite(f"T in rows {start} to {stop - 1}", T.rows(start, stop))
+    def make(start: int, stop: int, rows: Any) -> np.ndarray:
+        block = checks.finite(f"T in rows {start} to {stop - 1}", make_T(start, stop, rows))
         block = block / np.where(lit, F, np.inf)
         here = np.arange(stop - start)
         block[here, start + here] -= lit[start:stop]
         return block.astype(np.float32)
 
-    return Rows(T.shape, read, T.memory)
+    R.make = make
+    return R
 
 
 @dataclass(frozen=True)
@@ -135,26 +185,17 @@ def window_of(grid: tuple[int, int]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Inputs:
-    """R of every channel, and what else a transport is made of; `nbytes` is what T takes."""
+    """R of every channel, keywords of a Transport that is made of it, and the bytes of T."""
 
     problems: list[Problem]
-    F: np.ndarray
-    grid: tuple[int, int]
+    settings: dict[str, Any]
     nbytes: int
-    masked: bool = False
-    mixing: np.ndarray | None = None
-    noise: Noise | None = None
 
 
 def validate_inputs(
-    T: Any,
-    grid: Any = None,
-    first_bounce: Any = None,
-    device: Device | str | None = None,
-    memory: int | None = None,
-    noise: Noise | None = None,
+    T: Any, grid: Any, first_bounce: Any, device: Device | str | None, noise: Noise | None, **reading: Any
 ) -> Inputs:
-    """Whatever `compress` takes, checked: a Transport, operators, or rows."""
+    """Whatever `compress` takes, checked: a Transport, operators, or rows; see `source` for `reading`."""
     if isinstance(T, Transport):
         for name, value in {"grid": grid, "first_bounce": first_bounce, "device": device}.items():
             if value is not None:
@@ -162,16 +203,16 @@ def validate_inputs(
         require(T)
         if T.error > 0.0:
             raise InputError(f"T is compressed already, with an error of {T.error:.2g}; compress its origin")
-        return of_transport(T, memory, noise)
+        return of_transport(T, noise, **reading)
     matrices = list(T) if isinstance(T, (list, tuple)) else [T]
     if len(matrices) not in (1, 3):
         raise InputError(f"T has {len(matrices)} channels; it must be one, or three for RGB")
     if grid is None:
         raise InputError("grid is None, but T is no Transport; it must be (h, w), the projector's pixels")
+    F = "diagonal" if first_bounce is None else first_bounce
     if all(hasattr(matrix, "matvec") and not hasattr(matrix, "rows") for matrix in matrices):
-        F = "diagonal" if first_bounce is None else first_bounce
-        return validate_inputs(Transport(T, grid, F, device=device), memory=memory)
-    rows = [source("T", matrix, memory) for matrix in matrices]
+        return validate_inputs(Transport(T, grid, F, device=device), None, None, None, None, **reading)
+    rows = [source("T", matrix, **reading) for matrix in matrices]
     n = rows[0].shape[0]
     for channel in rows:
         if channel.shape != (n, n):
@@ -180,36 +221,30 @@ def validate_inputs(
     grid, device = checks.grid("grid", grid, n), device if isinstance(device, Device) else open_device(device)
     if isinstance(first_bounce, str):
         raise InputError(f"first_bounce is {first_bounce!r}, but T is rows; give an array (N,), or None")
-    F, _ = _first_bounce.find(rows, "diagonal" if first_bounce is None else first_bounce, lambda: device)
+    F, _ = _first_bounce.find(rows, F, lambda: device)
     F, *_ = _first_bounce.mask_dark(F, F <= 0.0, grid, may_mask=False)
     R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
     problems = [Problem(r, Host(device, r), grid, f) for r, f in zip(R, F, strict=True)]
-    return Inputs(problems, F, grid, 4 * F.size * F.shape[1])  # in float32
+    return Inputs(problems, {"grid": grid, "first_bounce": F}, 4 * F.size * n)  # in float32
 
 
-def of_transport(T: Transport, memory: int | None = None, noise: Noise | None = None) -> Inputs:
+def of_transport(T: Transport, noise: Noise | None = None, **reading: Any) -> Inputs:
     """Rows of R of a square transport: read from T, or products where it is compressed."""
-    F = np.atleast_2d(T.first_bounce)
+    F, nbytes = np.atleast_2d(T.first_bounce), 4 * T.channels * T.shape[1] ** 2
     if T.is_compressed:
-        R = [source("R of T", S.R, memory) for S in T.systems]
+        R = [source("R of T", S.R, **reading) for S in T.systems]
     else:
-        R = [interreflection(source("T", matrix, memory), f) for matrix, f in zip(T.matrices, F, strict=True)]
+        rows = [source("T", matrix, **reading) for matrix in T.matrices]
+        R = [interreflection(channel, f) for channel, f in zip(rows, F, strict=True)]
     try:
-        operators, nbytes = [S.R for S in T.systems], T.nbytes
+        operators, nbytes = [S.R for S in T.systems], T.nbytes or nbytes
     except MemoryError:  # of the device, or of the host
-        operators, nbytes = [Host(T.device, rows) for rows in R], 0
+        operators = [Host(T.device, rows) for rows in R]
     problems = [Problem(r, product, T.grid, f) for r, product, f in zip(R, operators, F, strict=True)]
     if noise is not None:
         problems = [replace(p, noise=_noise_of(p, noise, c)) for c, p in enumerate(problems)]
-    return Inputs(
-        problems,
-        F,
-        T.grid,
-        nbytes or 4 * F.size * F.shape[1],
-        bool(T.masked.any()),
-        T.mixing,
-        noise or T.measured_noise,
-    )
+    settings = {"grid": T.grid, "first_bounce": F, "mixing": T.mixing, "noise": noise or T.measured_noise}
+    return Inputs(problems, settings | {"on_dark": "mask" if T.masked.any() else "raise"}, nbytes)
 
 
 def _noise_of(problem: Problem, noise: Noise, channel: int) -> np.ndarray:
@@ -226,10 +261,8 @@ def rows_at_once(values: int, memory: int | None = None) -> int:
     room = min(_BLOCK, checks.host_memory() // 4) if memory is None else memory
     count = min(room // (_PER_VALUE * max(values, 1)), _MOST) // COLUMNS * COLUMNS
     if count == 0:
-        raise MemoryLimitError(
-            f"memory is {checks.size(room)}; it must be at least "
-            f"{checks.size(COLUMNS * values * _PER_VALUE)}, for {COLUMNS} rows of {values} numbers"
-        )
+        least = f"{checks.size(COLUMNS * values * _PER_VALUE)}, for {COLUMNS} rows of {values} numbers"
+        raise MemoryLimitError(f"memory is {checks.size(room)}; it must be at least {least}")
     return count
 
 
@@ -242,10 +275,8 @@ def memory_errors(command: str, T: Any) -> Iterator[None]:
         raise
     except MemoryError as error:
         pixels = getattr(T, "shape", (0, 0))[-1]
-        raise MemoryLimitError(
-            f"{command} needs up to {checks.size(8 * pixels**2)} for {pixels} pixels, more than the host "
-            f"gives: {error}"
-        ) from error
+        needed = f"{command} needs up to {checks.size(8 * pixels**2)} for {pixels} pixels"
+        raise MemoryLimitError(f"{needed}, more than the host gives: {error}") from error
 
 
 def cut(count: int, size: int) -> Iterator[tuple[int, int]]:
