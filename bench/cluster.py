@@ -83,13 +83,10 @@ def main() -> None:
             for count, client in clients.items():
                 rates[count].append(frames / run(f"{count} {turn}", client=client))
         one, two = (float(np.median(rates[count][1:])) for count in rates)
-        facts |= {"pixels": T.shape[1], "frames": frames, "cores": os.cpu_count()}
-        facts |= {"frames/s, 1 worker": one, "frames/s, 2 workers": two}
+        facts |= {"pixels": T.shape[1], "frames": frames, "of memory": many, "cores": os.cpu_count()}
         goal = None if given.smoke else 2.0 * EFFICIENCY
         rows.append(Row("frames a second, two workers", "one worker", one, two, "frames/s", two / one, goal))
-
-        client, sizes = clients[2], []
-        own = psutil.Process()
+        client, sizes, own = clients[2], [], psutil.Process()
 
         def weigh(step: str, done: int, total: int | None) -> None:
             if done % (10 * BATCH) == 0:
@@ -100,7 +97,6 @@ def main() -> None:
         run("many", small, client=client, progress=weigh, resize=True)
         quarter = max(1, len(sizes) // 4)
         early, late = np.median(sizes[:quarter]), np.median(sizes[-quarter:])
-        facts |= {"small frames, for memory": many}
         goal = None if given.smoke else 1.0 / GROWTH
         rows.append(Row("largest process, last quarter", "first", early, late, "MB", early / late, goal))
 
@@ -114,10 +110,9 @@ def main() -> None:
                 ended.append(done)
 
         slow = run("killed", client=client, progress=kill)
-        same = bytes_of(place / "killed") == bytes_of(place / "serial")
+        same = float(bytes_of(place / "killed") == bytes_of(place / "serial"))
         facts |= {"kills, after frames": ended, "seconds with kills": slow, "files": frames + 1}
-        right = float(same)
-        rows.append(Row(f"bytes after {len(ended)} kills", "serial run", 1.0, right, "equal", right, 1.0))
+        rows.append(Row(f"bytes after {len(ended)} kills", "serial run", 1.0, same, "equal", same, 1.0))
     report(given, "Frames over a cluster", rows, facts)
 
 
