@@ -300,7 +300,7 @@ def _transform(
     """
     formats.find(out, inverse=is_inverse)
     if not is_inverse and out.suffix.lower() not in (".npz", ".zarr"):
-        raise InputError(f"--out is {out}; a {context.name}ed transport must be a .npz or a .zarr")
+        raise InputError(f"--out is {out}; what {context.name} makes must be a .npz or a .zarr")
     if out.exists() and file.exists() and out.samefile(file):
         raise InputError(f"--out is {out}, which is TRANSPORT itself; it must be another file")
     T = options.load(context, file)
