@@ -118,5 +118,7 @@ def test_an_inverse_is_made_and_kept(program, transport, tmp_path):
 
 def test_dark_of_0_keeps_every_pixel_lit(program, tmp_path):
     np.savez(tmp_path / "T.npz", T=np.diag([1.0, 1e-9, 1.0, 1.0]), grid=(2, 2))
-    reports = [program("analyze", tmp_path / "T.npz", "--json", *dark).json for dark in ([], ["--dark", "0"])]
+    reports = [
+        program("analyze", tmp_path / "T.npz", "--json", *dark).json[0] for dark in ([], ["--dark", "0"])
+    ]
     assert [report["masked"] for report in reports] == [1, 0]
