@@ -23,7 +23,7 @@ from ltcl.cli.main import main as main_of_ltcl
 from ltcl.device import Device
 
 ROOT = Path(__file__).resolve().parents[1]
-CORE = 13_240
+CORE = 13_250
 
 _TASKS = [f"ltcl/{name}" for name in ("compensation", "separation.py", "relighting.py", "analysis.py")]
 _NOISE = ["ltcl/noise", *(f"ltcl/{name}.py" for name in ("uncertainty", "denoising", "verdict"))]
@@ -36,7 +36,7 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "compression": (1765, ["ltcl/compression"]),
     "compensation, separation, relighting, analysis": (1370, _TASKS),
     # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
-    "noise": (1380, _NOISE),
+    "noise": (1390, _NOISE),
     "transport and the rest": (1390, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
