@@ -246,15 +246,15 @@ def draw(costs: list[Found]) -> Figure:
 
 def main() -> None:
     given = options(__doc__ or "")
-    sides = [8, 16] if given.smoke else [16, 24, 32, 48, 64]
+    sides = [6, 8] if given.smoke else [16, 24, 32, 48, 64]
     run = partial(measured, device=given.device)
-    truth, cameras = Truth([corner(sides[-1])]), list(CAMERAS)[1:] if given.smoke else CAMERAS
+    truth, cameras = Truth([corner(sides[-1])]), list(CAMERAS)[-1:] if given.smoke else CAMERAS
     found = [run(truth, camera, k, name=f"{k}, {camera}") for camera in cameras for k in STRATEGIES]
     costs = []
     for n, k in itertools.product(sides[:-1], STRATEGIES):
         costs.append(run(Truth([corner(n)]), "film, 12 bits", k, name=f"{k}, {n}"))
     costs += [one for one in found if "film" in one.name]
-    colour = Truth([corner(8 if given.smoke else 32, albedo) for albedo in COLOURS], MIXING)
+    colour = Truth([corner(6 if given.smoke else 32, albedo) for albedo in COLOURS], MIXING)
     found += [run(colour, "srgb, 8 bits", k, name=f"{k}, colours") for k in STRATEGIES[:2]]
     facts: dict[str, Any] = {"pixels": sides[-1] ** 2}
     for one in found:

@@ -303,7 +303,7 @@ def main() -> None:
     kinds, quiet = list(CAMERAS), next(iter(NOISES))
     seen, sizes, louder, seeds = kinds, SIZES, list(NOISES)[1:], range(PLACES)
     if given.smoke:
-        seen, sizes, louder, seeds = kinds[:1], CLAIMED[:1], (), range(2)
+        seen, sizes, louder, seeds = kinds[:1], CLAIMED[:1], (), range(1)
     found = [run(askance(size), camera, quiet) for camera in seen for size in sizes]
     found += [run(askance(3.0), kinds[-1], noise) for noise in louder]
     cameras = [run(at_random(seed), kinds[-1], quiet) for seed in seeds]
