@@ -2,12 +2,12 @@
 """Denoising of a measured T: reciprocal pairs averaged, wavelet coefficients and singular values shrunk.
 
 1. The diagonal of a square T, the first bounce, stays as measured; it is left out of all that follows.
-2. Reciprocity: T_ij d_j = T_ji d_i of a Lambertian scene. Errors of d are the largest ones of smooth pictures,
-   so its fit is linear in T: logarithms of dim entries, as in `ltcl.diagnostics`, have a bias, 12 % in d of a
-   path-traced corner. d holds areas and irradiance, no albedo: what of its wavelet coefficients the covariance
-   of the fit explains goes. In Z = D^-1/2 T D^1/2 both entries of a pair are the same light; they are averaged
-   with weights 1 / variance, unless sums of Z - Z^T between blocks exceed what noise explains, that of the
-   model or of these entries, whichever is larger: gloss.
+2. Reciprocity: T_ij d_j = T_ji d_i of a Lambertian scene. Errors of d are the largest of smooth pictures, so
+   its fit is linear in T: logarithms of dim entries, as in `ltcl.diagnostics`, have a bias, 12 % in d of a
+   path-traced corner. d holds areas and irradiance, no albedo: what of its wavelet coefficients the
+   covariance of the fit explains goes. In Z = D^-1/2 T D^1/2 both entries of a pair are the same light; they
+   are averaged with weights 1 / variance, unless sums of Z - Z^T between blocks exceed what noise explains,
+   that of the model or of these entries, whichever is larger: gloss.
 3. C = K Z K^T, K orthonormal multiwavelets of 1 to 4 vanishing moments (Alpert 1993) at a few random shifts,
    whose results are averaged (cycle spinning, Coifman and Donoho 1995). What is below 3 standard deviations
    goes; with this first estimate P of C the Wiener factor P^2 / (P^2 + variance) is applied to the measured C
