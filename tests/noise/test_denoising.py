@@ -84,6 +84,29 @@ def test_reciprocity_is_restored_where_the_scene_has_it_and_left_out_where_not(s
         assert 0.5 < D.reciprocity_defect / exact.reciprocity_defect < 2.0
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_few_photons_an_entry_do_not_move_light_between_reciprocal_pairs(seed: int) -> None:
+    """As of a path tracer, whose columns have few paths each: logarithms of dim entries would have a bias."""
+    exact = truth("corner", 8)
+    E, x, white = exact.to_numpy(), np.arange(8 * 16) % 16 / 16, np.ones(exact.grid)
+    light = float(E[~np.eye(len(E), dtype=bool)].mean())
+    known = Noise.uniform(E.shape, 1e-6 * light, photons=light)
+    columns = np.exp(2.0 * np.cos(2.0 * np.pi * x))
+    known = dataclasses.replace(known, columns=columns[None] / columns.mean())
+    photon = light * known.columns[0]
+    noisy = np.random.default_rng(seed).poisson(E / photon) * photon
+    np.fill_diagonal(noisy, np.diag(E))
+    T = ltcl.Transport(noisy, exact.grid, noise=known)
+
+    def last(some: ltcl.Transport) -> np.ndarray:
+        return (
+            ltcl.separate(some, exact @ white, 3).bounces[2]
+            - ltcl.separate(exact, exact @ white, 3).bounces[2]
+        )
+
+    assert relative(last, T, ltcl.denoise(T)) < 0.75
+
+
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_noise_of_the_result_is_that_of_its_pictures(scene: str) -> None:
     """Within a factor 2, of a white one."""
