@@ -8,7 +8,6 @@ task. Dask does the tasks of a lost worker on others. The next item is taken whe
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import math
 import os
@@ -36,8 +35,8 @@ _PERIOD = 1.0  # seconds between two looks at the list of workers
 _PCI = ("pci_domain_id_nv", "pci_bus_id_nv", "pci_slot_id_nv")  # what CUDA_VISIBLE_DEVICES does not renumber
 _GATHER = 5.0  # seconds that a result may take on its way, at first
 
-# Of a worker's process: functions of streams, by their tokens; one device, one task.
-_functions: dict[str, _Sent] = {}
+# Of a worker's process: functions of streams, by tokens, pickled until the first task; one device, one task.
+_functions: dict[str, Any] = {}
 _running = threading.Lock()
 
 
@@ -80,12 +79,12 @@ def stream(
     [1, 2, 3]
     """
     require(client)
-    crew, window = _Crew(client, _Sent(function), share_gpu), checks.count("window", window)
+    crew, window = _Crew(client, _pickled(function), share_gpu), checks.count("window", window)
     try:
         for item in items:
             while crew.tasks and len(crew.tasks) >= window * len(crew.ready):
                 yield crew.result()
-            crew.tasks.append(_Task(_Sent(item)))
+            crew.tasks.append(_Task(_pickled(item)))
             crew.submit(crew.tasks[-1])
         while crew.tasks:
             yield crew.result()
@@ -120,12 +119,14 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
             names = gpus or [same or open_device().description.index]
             local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
             one = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL}
-            nannies = [{**one, "env": {**cores, "LTCL_DEVICE": names[k % len(names)]}} for k in range(count)]
-            specification = {k: {"cls": dask.Nanny, "options": nanny} for k, nanny in enumerate(nannies)}
+            envs = [
+                {**cores, "LTCL_DEVICE": names[k % len(names)]} for k in range(count)
+            ]  # LocalCluster: one
+            nannies = {k: {"cls": dask.Nanny, "options": {**one, "env": env}} for k, env in enumerate(envs)}
             scheduler = {"cls": dask.Scheduler, "options": local}
             # Else a worker that takes 15 s to start again, on a busy machine, is given up.
             stack.enter_context(config.set({"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}))
-            address = dask.SpecCluster(specification, scheduler, silence_logs=logging.CRITICAL)
+            address = dask.SpecCluster(nannies, scheduler, silence_logs=logging.CRITICAL)
             stack.enter_context(address)
         elif workers is not None:
             raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
@@ -147,28 +148,20 @@ def _distributed() -> Any:
     return distributed
 
 
-class _Sent:
-    """A value on its way, pickled once: Dask looks for no keys in it, and a worker reads it when it may."""
+def _pickled(value: Any) -> bytes:
+    """Bytes: Dask looks for no keys in them, and a worker reads them when it has ltcl."""
+    from distributed.protocol.pickle import dumps
 
-    def __init__(self, value: Any = None, data: bytes = b"") -> None:
-        from distributed.protocol.pickle import dumps
-
-        try:
-            self.data = data or dumps(value)
-        except (TypeError, AttributeError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise InputTypeError(f"what workers need cannot be sent to them: {reason:.200}") from error
-
-    @functools.cached_property
-    def value(self) -> Any:
-        from distributed.protocol.pickle import loads
-
-        return loads(self.data)
+    try:
+        return dumps(value)
+    except (TypeError, AttributeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputTypeError(f"what workers need cannot be sent to them: {reason:.200}") from error
 
 
 @dataclass(eq=False)
 class _Task:
-    item: _Sent
+    item: bytes
     future: Any = None
     workers: frozenset[str] = frozenset()  # that may do it
     tries: int = 0
@@ -179,7 +172,7 @@ class _Crew:
     """The workers of a stream, and its tasks on them."""
 
     client: Any
-    function: _Sent
+    function: bytes
     share_gpu: bool
     tasks: deque[_Task] = field(default_factory=deque)  # in order, until their results are yielded
     ready: dict[str, str | None] = field(default_factory=dict)  # addresses of workers, and their GPUs
@@ -189,18 +182,21 @@ class _Crew:
     seen: float = field(default_factory=time.monotonic)  # when some worker was last there
     looked: float = -math.inf
 
+    def __post_init__(self) -> None:
+        self.scheduler = self.client.scheduler.address
+
     def submit(self, task: _Task) -> None:
         """Send a task to the workers that are ready, when there are some."""
         if task.tries == _TRIES:
             raise ClusterError(f"an item lost its workers {_TRIES} times; it may be what ends them")
+        self.look()
         while not self.ready:
+            time.sleep(_PERIOD / 10)
             self.look()
-            time.sleep(0.0 if self.ready else _PERIOD / 10)
         task.workers, task.tries = frozenset(self.ready), task.tries + 1
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large arguments, which `window` bounds
-            workers = [*task.workers]
-            task.future = self.client.submit(_work, self.token, task.item, workers=workers, pure=False)
+        rules: Any = {"workers": [*task.workers], "pure": False}
+        with warnings.catch_warnings(action="ignore"):  # of large arguments, which `window` bounds
+            task.future = self.client.submit(_work, self.token, task.item, **rules)
 
     def result(self) -> Any:
         """What the first task gives, however many workers it takes."""
@@ -243,17 +239,18 @@ class _Crew:
         """Forget workers that have gone, ask new ones; ClusterError where none can be expected."""
         from ltcl import __version__  # here, because it is set after this module is imported
 
-        if self.ready and time.monotonic() < self.looked + _PERIOD:
+        running = self.client.status == "running"
+        if running and self.ready and time.monotonic() < self.looked + _PERIOD:
             return
-        self.looked, scheduler, there, answers = time.monotonic(), self.client.scheduler.address, [], None
+        self.looked, there, answers = time.monotonic(), [], None
         with contextlib.suppress(OSError):
-            if self.client.status == "running":
+            if running:
                 there = [*self.client.nthreads()]
                 new = [each for each in there if each not in self.ready and each not in self.excluded]
-                question = __version__, self.token, self.function.data
+                question = __version__, self.token, self.function
                 answers = self.client.run(_ask(), *question, workers=new, on_error="return")
         if answers is None:
-            raise ClusterError(f"the scheduler at {scheduler} was lost")
+            raise ClusterError(f"the scheduler at {self.scheduler} was lost")
         self.lost |= not self.ready.keys() <= {*there}
         self.ready = {address: gpu for address, gpu in self.ready.items() if address in there}
         self.excluded &= {*there}
@@ -263,7 +260,7 @@ class _Crew:
             self.seen = time.monotonic()
         elif (self.excluded and not self.lost) or time.monotonic() > self.seen + _PATIENCE:
             excluded = f"; {len(self.excluded)} take no work, for the reasons above" if self.excluded else ""
-            raise ClusterError(f"no worker is left at {scheduler}{excluded}")
+            raise ClusterError(f"no worker is left at {self.scheduler}{excluded}")
 
     def admit(self, address: str, answer: Any) -> None:
         """A worker is ready, excluded, or, where it has just gone, neither."""
@@ -291,23 +288,22 @@ class _Crew:
 def _ask() -> Callable[..., Any]:
     """A local function is sent as code, and the other by it: a worker may have another ltcl, or none."""
 
-    def ask(version: str, token: str, data: bytes) -> Any:
+    def ask(version: str, token: str, function: bytes) -> Any:
         try:
             from ltcl import __version__, cluster
 
-            same = __version__ == version
-            return (
-                cluster.join(token, data) if same else f"it has ltcl {__version__}, and the client {version}"
-            )
+            if __version__ != version:
+                return f"it has ltcl {__version__}, and the client {version}"
+            return cluster.join(token, function)
         except Exception as error:  # noqa: BLE001 - whatever its ltcl or its driver raises
             return f"{type(error).__name__}: {error}"
 
     return ask
 
 
-def join(token: str, data: bytes) -> tuple[str, str | None]:
+def join(token: str, function: bytes) -> tuple[str, str | None]:
     """Keep the function of a stream; answers like `describe`."""
-    answer, _functions[token] = describe(), _Sent(data=data)
+    answer, _functions[token] = describe(), function
     return answer
 
 
@@ -320,19 +316,21 @@ def describe() -> tuple[str, str | None]:
     return device.name, f"{platform.node()} {' '.join(place)}" if device.kind == "gpu" else None
 
 
-def _work(token: str, item: _Sent) -> tuple[Any, LtclError | None, tuple[str, str] | None]:
+def _work(token: str, item: bytes) -> tuple[Any, LtclError | None, tuple[str, str] | None]:
     """Result or error of an item; or the address of this worker, and why it has no such function."""
     from distributed import get_worker
+    from distributed.protocol.pickle import loads
 
-    if (sent := _functions.get(token)) is None:  # started again, at the same address
-        return None, None, (get_worker().address, "")
     with _running:
+        if token not in _functions:  # started again, at the same address
+            return None, None, (get_worker().address, "")
         try:
-            function = sent.value
+            if isinstance(_functions[token], bytes):
+                _functions[token] = loads(_functions[token])
         except Exception as error:  # noqa: BLE001 - of whatever reads a part of it
             return None, None, (get_worker().address, f"{type(error).__name__}: {error}")
         try:
-            return function(item.value), None, None
+            return _functions[token](loads(item)), None, None
         except LtclError as error:  # without what it holds, which may lie on the device
             return None, type(error)(*error.args), None
 

@@ -14,7 +14,7 @@ import inspect
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -188,8 +188,8 @@ def compensate_frames(
         require_client(client)
         each = partial(stream, client, share_gpu=share_gpu)
         reload: Any = T.reload
-        if reload and all(client.run(os.path.exists, reload.args[0]).values()):
-            solver.sent = reload
+        visible: Any = reload and client.run(os.path.exists, reload.args[0])  # by address
+        solver.sent = reload if reload and all(visible.values()) else None
     run = _Run(solver, each, opened, limit, resize, manifest, batch, format, white, codes)
     with locked(folder):
         manifest.begin(resume)
@@ -294,13 +294,13 @@ class _Run:
 
     def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
         """All batches; yields the number of frames done, before the first that is not and after each."""
-        batches, waiting = self._batches(), deque[tuple[list[Frame], list[str]]]()
+        batches, waiting = self._batches(), deque[tuple[Any, Any]]()
 
         def tasks() -> Iterator[tuple[list[int], np.ndarray, float]]:
             nonlocal coming
             while (batch := coming.result()) is not None:
                 coming = reader.submit(next, batches, None)
-                frames, digests, pictures = batch
+                frames, digests, pictures = zip(*batch, strict=True)
                 waiting.append((frames, digests))
                 numbers = [frame.number for frame in frames]
                 yield numbers, _stack(pictures), self._gain(gain, loss, pictures)
@@ -331,7 +331,7 @@ class _Run:
         names = ["pattern_{:06}.{}", "appearance/appearance_{:06}.{}"][: 1 + self.solver.appearance]
         return [self.manifest.path.parent / name.format(number, self.format) for name in names]
 
-    def _batches(self) -> Iterator[tuple[list[Frame], list[str], list[np.ndarray]]]:
+    def _batches(self) -> Iterator[list[tuple[Frame, str, np.ndarray]]]:
         """The frames that no earlier run has done, with digests and pictures, and without broken ones."""
         frames, folder = islice(self.source, self.limit), self.manifest.path.parent
         while batch := list(islice(frames, self.size)):
@@ -342,16 +342,14 @@ class _Run:
                     digest = frame.digest()
                     if record is not None and record.digest != digest:
                         advice = f"give the same frames to go on, or another folder than {folder}"
-                        raise OtherRun(
-                            f"{self._place(frame)} has changed since its pattern was made; {advice}"
-                        )
+                        changed = "has changed since its pattern was made"
+                        raise OtherRun(f"{self._place(frame)} {changed}; {advice}")
                     if record and all(file.is_file() for file in self._files(frame.number)):
                         self.done.add(frame.number)
                     else:
                         missing.append((frame, digest, self._picture(frame)))
             if missing:
-                frames_, digests, pictures = map(list, zip(*missing, strict=True))
-                yield frames_, digests, pictures
+                yield missing
 
     @contextmanager
     def _left_out(self, frame: Frame) -> Iterator[None]:
@@ -375,7 +373,7 @@ class _Run:
         self.read += 1
         return picture if picture.shape[:2] == (h, w) else images.resize(picture, (h, w))
 
-    def _gain(self, gain: float | str, loss: float | None, first: list[np.ndarray]) -> float:
+    def _gain(self, gain: float | str, loss: float | None, first: Sequence[np.ndarray]) -> float:
         """The one of all frames, found once, of a sample: the first frames where their number is unknown."""
         if self.manifest.gain is None and isinstance(gain, str):
             count = self.count or self.size
@@ -390,9 +388,7 @@ class _Run:
             self.manifest.gain = float(gain)
         return self.manifest.gain
 
-    def _keep(
-        self, frames: list[Frame], digests: list[str], patterns: Any, appearances: Any, *numbers: Any
-    ) -> None:
+    def _keep(self, frames: Any, digests: Any, patterns: Any, appearances: Any, *numbers: Any) -> None:
         """Patterns of a batch, on the disk, and then their records."""
         with ThreadPoolExecutor(_WRITERS) as writers:
             list(writers.map(self._write, (frame.number for frame in frames), patterns, appearances))
@@ -421,7 +417,7 @@ def _portable(value: Any) -> Any:
     return value
 
 
-def _stack(pictures: list[np.ndarray]) -> np.ndarray:
+def _stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
     """(frames, h, w), or (frames, h, w, 3) where one of them is in colour."""
     if any(picture.ndim == 3 for picture in pictures):
         pictures = [np.stack([p] * 3, axis=-1) if p.ndim == 2 else p for p in pictures]

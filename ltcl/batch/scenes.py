@@ -25,9 +25,9 @@ def map(
 ) -> list[Any]:
     """Results of a function of each scene, in order; one that fails is named, and the rest go on.
 
-    `function` gets a path, or whatever `scenes` hold, and what it returns comes back: here one after the other,
-    or with a `client` by its workers, which then have to see the paths; `share_gpu` as of
-    `ltcl.cluster.stream`. `progress("scenes", done, total)` is called after each.
+    `function` gets a path, or whatever `scenes` hold. Without a `client` it is called here, else on workers,
+    which then have to see the paths; `share_gpu` is as of `ltcl.cluster.stream`. `progress("scenes", done,
+    total)` is called after each.
 
     Raises
     ------
