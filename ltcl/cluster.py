@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One function of many items on the workers of a Dask cluster: results in order, in bounded memory.
 
-Before its first task a worker says whether it can take part (its version of ltcl, its device, that nobody
-else works on its GPU) and gets the function, once. Dask does the tasks of a lost worker again on others; one
-that was started again is asked anew. The next item is taken when a result is.
+A worker that comes is asked for its version of ltcl and its device, and gets the function, before its first
+task. Dask does the tasks of a lost worker on others. The next item is taken when a result is.
 """
 
 from __future__ import annotations
@@ -27,18 +26,17 @@ from ltcl.device import list_devices, open_device
 from ltcl.errors import ClusterError, InputError, InputTypeError, LtclError
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client
 
 logger = logging.getLogger(__name__)
 _TRIES = 20  # of an item whose workers are lost, before it is taken for the reason
 _PATIENCE = 60.0  # seconds without a worker: what was killed has been started again by then
 _PERIOD = 1.0  # seconds between two looks at the list of workers
-_GATHER = 5.0  # seconds that a result may take on its way, at first
 _PCI = ("pci_domain_id_nv", "pci_bus_id_nv", "pci_slot_id_nv")  # what CUDA_VISIBLE_DEVICES does not renumber
+_GATHER = 5.0  # seconds that a result may take on its way, at first
 
-# Of a worker's process: functions of streams, by their tokens; one device, one task.
-_functions: dict[str, Callable[[Any], Any]] = {}
-_ended: set[str] = set()
+# Of a worker's process: functions of streams, by tokens, pickled until the first task; one device, one task.
+_functions: dict[str, Any] = {}
 _running = threading.Lock()
 
 
@@ -56,9 +54,8 @@ def stream(
     ----------
     client : distributed.Client
     function : callable(item)
-        Sent to each worker once, with all it holds, and called by one thread at a time. It may offer two
-        methods: `reference()`, a small stand-in for it, or None; and `resolve()` of that on a worker, which
-        is the function, or None where it has to be sent after all, or an LtclError, which excludes a worker.
+        Sent to each worker once, with all it holds, and called by one thread at a time. A worker that cannot
+        unpickle it takes no work.
     items : iterable
     window : int
         Items on the way for each worker: one is computed, others are there when it ends.
@@ -82,12 +79,12 @@ def stream(
     [1, 2, 3]
     """
     require(client)
-    crew, window = _Crew(client, function, share_gpu), checks.count("window", window)
+    crew, window = _Crew(client, _pickled(function), share_gpu), checks.count("window", window)
     try:
         for item in items:
             while crew.tasks and len(crew.tasks) >= window * len(crew.ready):
                 yield crew.result()
-            crew.tasks.append(_Task(_Item(item)))
+            crew.tasks.append(_Task(_pickled(item)))
             crew.submit(crew.tasks[-1])
         while crew.tasks:
             yield crew.result()
@@ -122,12 +119,14 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
             names = gpus or [same or open_device().description.index]
             local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
             one = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL}
-            nannies = [{**one, "env": {**cores, "LTCL_DEVICE": names[k % len(names)]}} for k in range(count)]
-            specification = {k: {"cls": dask.Nanny, "options": nanny} for k, nanny in enumerate(nannies)}
+            envs = [
+                {**cores, "LTCL_DEVICE": names[k % len(names)]} for k in range(count)
+            ]  # LocalCluster: one
+            nannies = {k: {"cls": dask.Nanny, "options": {**one, "env": env}} for k, env in enumerate(envs)}
             scheduler = {"cls": dask.Scheduler, "options": local}
             # Else a worker that takes 15 s to start again, on a busy machine, is given up.
             stack.enter_context(config.set({"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}))
-            address = dask.SpecCluster(specification, scheduler, silence_logs=logging.CRITICAL)
+            address = dask.SpecCluster(nannies, scheduler, silence_logs=logging.CRITICAL)
             stack.enter_context(address)
         elif workers is not None:
             raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
@@ -149,16 +148,20 @@ def _distributed() -> Any:
     return distributed
 
 
-class _Item:
-    """Around an item: Dask looks for its own keys in lists and texts."""
+def _pickled(value: Any) -> bytes:
+    """Bytes: Dask looks for no keys in them, and a worker reads them when it has ltcl."""
+    from distributed.protocol.pickle import dumps
 
-    def __init__(self, value: Any) -> None:
-        self.value = value
+    try:
+        return dumps(value)
+    except (TypeError, AttributeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputTypeError(f"what workers need cannot be sent to them: {reason:.200}") from error
 
 
 @dataclass(eq=False)
 class _Task:
-    item: _Item
+    item: bytes
     future: Any = None
     workers: frozenset[str] = frozenset()  # that may do it
     tries: int = 0
@@ -166,163 +169,142 @@ class _Task:
 
 @dataclass(eq=False)
 class _Crew:
-    """The workers of a stream: those that are ready, asked, or excluded."""
+    """The workers of a stream, and its tasks on them."""
 
     client: Any
-    function: Any
+    function: bytes
     share_gpu: bool
     tasks: deque[_Task] = field(default_factory=deque)  # in order, until their results are yielded
-    ready: set[str] = field(default_factory=set)
-    asked: dict[str, tuple[Future, list[tuple[Any, ...]]]] = field(default_factory=dict)  # and what is next
+    ready: dict[str, str | None] = field(default_factory=dict)  # addresses of workers, and their GPUs
     excluded: set[str] = field(default_factory=set)
-    gpus: dict[str, str | None] = field(default_factory=dict)
-    token: str = field(default_factory=lambda: f"ltcl-{secrets.token_hex(8)}")
+    token: str = field(default_factory=lambda: secrets.token_hex(8))
+    lost: bool = False  # whether some worker has gone, which may be started again
     seen: float = field(default_factory=time.monotonic)  # when some worker was last there
     looked: float = -math.inf
-    begun: bool = False  # whether some worker has been ready
 
     def __post_init__(self) -> None:
-        self.dask, self.scheduler = _distributed(), self.client.scheduler.address
+        self.scheduler = self.client.scheduler.address
 
     def submit(self, task: _Task) -> None:
         """Send a task to the workers that are ready, when there are some."""
         if task.tries == _TRIES:
             raise ClusterError(f"an item lost its workers {_TRIES} times; it may be what ends them")
+        self.look()
         while not self.ready:
+            time.sleep(_PERIOD / 10)
             self.look()
-            time.sleep(0.0 if self.ready else _PERIOD / 10)
         task.workers, task.tries = frozenset(self.ready), task.tries + 1
-        task.future = self._send(task.workers, _work, self.token, task.item)
+        rules: Any = {"workers": [*task.workers], "pure": False}
+        with warnings.catch_warnings(action="ignore"):  # of large arguments, which `window` bounds
+            task.future = self.client.submit(_work, self.token, task.item, **rules)
 
     def result(self) -> Any:
         """What the first task gives, however many workers it takes."""
-        task, patience, answer = self.tasks[0], _GATHER, None
-        while answer is None:
+        from distributed import CancelledError, KilledWorker, wait
+
+        task, patience = self.tasks[0], _GATHER
+        while True:
             self.look()
             for each in self.tasks:
-                if not each.workers & self.ready:  # all of them have gone, and Dask must not choose others
+                if not each.workers & self.ready.keys():  # all have gone, and Dask must not choose others
                     self.submit(each)
             try:
                 with self.client.as_current():
-                    self.dask.wait(task.future, timeout=_PERIOD)
-                answer = task.future.result(timeout=patience)
-            except (OSError, self.dask.CancelledError, self.dask.KilledWorker) as error:
-                if task.future.status == "error" and not isinstance(error, self.dask.KilledWorker):
+                    wait(task.future, timeout=_PERIOD)
+                result, error, refusal = task.future.result(timeout=patience)
+            except (OSError, CancelledError, KilledWorker) as failure:
+                if task.future.status == "error" and not isinstance(failure, KilledWorker):
                     raise  # of the function
-                if isinstance(error, TimeoutError):  # not done; or large, or on a worker that has died
-                    patience *= 2.0 if task.future.status == "finished" else 1.0
-                    continue
-                self.looked = -math.inf
-                self.look()  # which raises where it was the scheduler
-                self.submit(task)
-            if isinstance(answer, str):  # a worker started again at the same address has no function
-                self.ready.discard(answer)
-                answer = self.submit(task)
-        self.tasks.popleft().future.release()
-        if answer[1] is not None:
-            raise answer[1]
-        return answer[0]
+                if not isinstance(failure, TimeoutError):
+                    self.looked, task.workers = -math.inf, frozenset()  # look, and submit it again
+                elif task.future.status == "finished":  # large, or on a worker that has died
+                    patience *= 2.0
+                continue
+            if refusal is None:
+                self.tasks.popleft()
+                if error is not None:
+                    raise error
+                return result
+            self.exclude(*refusal)
+            task.workers, task.tries = frozenset(), 0
+
+    def leave(self) -> None:
+        """Leave nothing on the scheduler and the workers, also where a traceback holds this."""
+        self.tasks.clear()
+        if self.ready and self.client.status == "running":
+            with contextlib.suppress(OSError):
+                self.client.run(_leave, self.token, workers=[*self.ready], on_error="ignore")
 
     def look(self) -> None:
         """Forget workers that have gone, ask new ones; ClusterError where none can be expected."""
-        if self.ready and time.monotonic() < self.looked + _PERIOD:
+        from ltcl import __version__  # here, because it is set after this module is imported
+
+        running = self.client.status == "running"
+        if running and self.ready and time.monotonic() < self.looked + _PERIOD:
             return
-        self.looked, there = time.monotonic(), None
+        self.looked, there, answers = time.monotonic(), [], None
         with contextlib.suppress(OSError):
-            there = set(self.client.nthreads()) if self.client.status == "running" else None
-        if there is None:
-            raise self._scheduler_lost()
-        self.ready &= there
-        self.excluded &= there
-        for address in self.asked.keys() - there:
-            del self.asked[address]
-        for address in there - self.ready - self.excluded - self.asked.keys():
-            self._ask(address, self._questions())
-        for address in [address for address, (future, _) in self.asked.items() if future.done()]:
-            self._admit(address)
-        self.gpus = {address: gpu for address, gpu in self.gpus.items() if address in there - self.excluded}
-        if self.ready or self.asked:
+            if running:
+                there = [*self.client.nthreads()]
+                new = [each for each in there if each not in self.ready and each not in self.excluded]
+                question = __version__, self.token, self.function
+                answers = self.client.run(_ask(), *question, workers=new, on_error="return")
+        if answers is None:
+            raise ClusterError(f"the scheduler at {self.scheduler} was lost")
+        self.lost |= not self.ready.keys() <= {*there}
+        self.ready = {address: gpu for address, gpu in self.ready.items() if address in there}
+        self.excluded &= {*there}
+        for address, answer in answers.items():
+            self.admit(address, answer)
+        if self.ready:
             self.seen = time.monotonic()
-        elif (self.excluded and not self.begun) or time.monotonic() > self.seen + _PATIENCE:
+        elif (self.excluded and not self.lost) or time.monotonic() > self.seen + _PATIENCE:
             excluded = f"; {len(self.excluded)} take no work, for the reasons above" if self.excluded else ""
             raise ClusterError(f"no worker is left at {self.scheduler}{excluded}")
 
-    def _scheduler_lost(self) -> ClusterError:
-        return ClusterError(f"the scheduler at {self.scheduler} was lost")
-
-    def leave(self) -> None:
-        """Leave nothing on the scheduler and the workers."""
-        workers = [*self.ready, *self.asked]
-        sent = [task.future for task in self.tasks if task.future is not None]
-        for future in (*sent, *(future for future, _ in self.asked.values())):
-            future.release()
-        if workers and self.client.status == "running":
-            with contextlib.suppress(OSError):
-                self.client.run(_leave, self.token, workers=workers, on_error="ignore")
-
-    def _questions(self) -> list[tuple[Any, ...]]:
-        """Calls for a worker that is new; each answers False where the next is needed."""
-        from ltcl import __version__  # here, because it is set after this module is imported
-
-        reference = self.function.reference() if hasattr(self.function, "reference") else None
-        forms = filter(None, (reference, self.function))
-        return [(_version_check(), __version__), (describe,), *((_join, self.token, form) for form in forms)]
-
-    def _ask(self, address: str, questions: list[tuple[Any, ...]]) -> None:
-        self.asked[address] = self._send([address], *questions[0]), questions[1:]
-
-    def _admit(self, address: str) -> None:
-        """Take the answer of a worker: it is ready, excluded, or asked once more."""
-        future, further = self.asked.pop(address)
-        try:
-            answer = future.result(timeout=_PATIENCE)
-        except (TimeoutError, self.dask.CancelledError, self.dask.KilledWorker):
-            return  # gone; or asked from the beginning
-        except Exception as error:  # noqa: BLE001 - whatever its ltcl or its driver raises
-            answer = f"{'' if isinstance(error, LtclError) else type(error).__name__ + ': '}{error}"
-        finally:
-            future.release()  # now: a traceback may hold it for long
+    def admit(self, address: str, answer: Any) -> None:
+        """A worker is ready, excluded, or, where it has just gone, neither."""
         if isinstance(answer, tuple):
             name, gpu = answer
-            others = [other for other in self.gpus if self.gpus[other] == gpu]
-            self.gpus[address], answer = gpu, False
-            if gpu and others and not self.share_gpu:
-                answer = f"{name} is the GPU of worker {others[0]}; give it an LTCL_DEVICE, or share_gpu=True"
-        if answer is True:
-            self.ready.add(address)
-            self.begun = True
-        elif answer is False:
-            self._ask(address, further)
-        else:
-            self.excluded.add(address)
-            logger.warning("worker %s takes no work: %s", address, " ".join(answer.split()))
+            others = [other for other, its in self.ready.items() if its == gpu]
+            if gpu is None or not others or self.share_gpu:
+                self.ready[address] = gpu
+                return
+            answer = f"{name} is the GPU of worker {others[0]}; give it an LTCL_DEVICE, or share_gpu=True"
+        if not isinstance(answer, OSError):
+            self.exclude(address, str(answer))
 
-    def _send(self, workers: Iterable[str], *call: Any) -> Future:
-        if self.client.status != "running":
-            raise self._scheduler_lost()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large arguments, which `window` bounds
-            try:
-                return self.client.submit(*call, workers=[*workers], pure=False)
-            except (TypeError, AttributeError, ValueError) as error:
-                reason = " ".join(str(error.__cause__ or error.__context__ or error).split())
-                raise InputTypeError(f"what workers need cannot be sent to them: {reason:.200}") from error
+    def exclude(self, address: str, reason: str) -> None:
+        """Name a worker that takes no work, once; without a reason it is asked again."""
+        self.ready.pop(address, None)
+        if reason and address not in self.excluded:
+            self.excluded.add(address)
+            logger.warning("worker %s takes no work: %s", address, " ".join(reason.split()))
 
 
 # What runs on workers
 
 
-def _version_check() -> Callable[[str], Any]:
-    """A local function is sent as code: a worker may have another ltcl, or none."""
+def _ask() -> Callable[..., Any]:
+    """A local function is sent as code, and the other by it: a worker may have another ltcl, or none."""
 
-    def check(version: str) -> bool | str:
+    def ask(version: str, token: str, function: bytes) -> Any:
         try:
-            from ltcl import __version__
-        except ImportError as error:
-            return f"it cannot import ltcl: {error}"
-        return __version__ != version and f"it has ltcl {__version__}, and the client {version}"
+            from ltcl import __version__, cluster
 
-    return check
+            if __version__ != version:
+                return f"it has ltcl {__version__}, and the client {version}"
+            return cluster.join(token, function)
+        except Exception as error:  # noqa: BLE001 - whatever its ltcl or its driver raises
+            return f"{type(error).__name__}: {error}"
+
+    return ask
+
+
+def join(token: str, function: bytes) -> tuple[str, str | None]:
+    """Keep the function of a stream; answers like `describe`."""
+    answer, _functions[token] = describe(), function
+    return answer
 
 
 def describe() -> tuple[str, str | None]:
@@ -334,27 +316,24 @@ def describe() -> tuple[str, str | None]:
     return device.name, f"{platform.node()} {' '.join(place)}" if device.kind == "gpu" else None
 
 
-def _join(token: str, function: Any) -> bool:
-    """Keep the function of a stream; False where it cannot be had by reference."""
-    resolved = function.resolve() if hasattr(function, "resolve") else function
-    if resolved is not None and token not in _ended:
-        _functions[token] = resolved
-    return resolved is not None
+def _work(token: str, item: bytes) -> tuple[Any, LtclError | None, tuple[str, str] | None]:
+    """Result or error of an item; or the address of this worker, and why it has no such function."""
+    from distributed import get_worker
+    from distributed.protocol.pickle import loads
 
-
-def _work(token: str, item: _Item) -> tuple[Any, LtclError | None] | str:
-    """Result or error of an item; the address of a worker that was started after the function was sent."""
-    if (function := _functions.get(token)) is None:
-        from distributed import get_worker
-
-        return get_worker().address
     with _running:
+        if token not in _functions:  # started again, at the same address
+            return None, None, (get_worker().address, "")
         try:
-            return function(item.value), None
+            if isinstance(_functions[token], bytes):
+                _functions[token] = loads(_functions[token])
+        except Exception as error:  # noqa: BLE001 - of whatever reads a part of it
+            return None, None, (get_worker().address, f"{type(error).__name__}: {error}")
+        try:
+            return _functions[token](loads(item)), None, None
         except LtclError as error:  # without what it holds, which may lie on the device
-            return None, type(error)(*error.args)
+            return None, type(error)(*error.args), None
 
 
 def _leave(token: str) -> None:
-    _ended.add(token)
     _functions.pop(token, None)

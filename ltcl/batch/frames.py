@@ -14,15 +14,14 @@ import inspect
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from ltcl.cluster import require as require_client
 from ltcl.cluster import stream
 from ltcl.compensation import compensate, problem
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
-from ltcl.files import as_path, replace_file
+from ltcl.files import as_path
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
 from ltcl.images.pictures import Encoding
 from ltcl.solvers import Inverse
@@ -136,7 +135,7 @@ def compensate_frames(
         then hold these, and not sRGB.
     client : distributed.Client, optional
         Of a Dask cluster whose workers solve, as `ltcl.cluster.stream` does it. T is loaded there from the
-        file that `ltcl.load` read here, or sent once. Folder and files are those of a run without it.
+        file that `ltcl.load` read here, if all see it, or sent once. Files are those of a run without it.
     share_gpu : bool
         Whether several workers may use one GPU.
     **options
@@ -184,13 +183,14 @@ def compensate_frames(
     described = {name: setting(value) for name, value in settings.items() if name != "callback"}
     described["codes"] = codes and curve(codes, T.grid)
     manifest, white = Manifest(folder / NAME, described, identity(T)), bounds[1] if bounds[1] > 0 else 1.0
-    results = None
+    solver, each = _Solver(T, options, appearance, manifest.transport), map
     if client is not None:
         require_client(client)
-        options.pop("callback", None)  # it stays in this process
-        results = partial(stream, client, share_gpu=share_gpu)
-    solver = _Solver(T, format, white, appearance, codes, options, manifest.transport)
-    run = _Run(solver, opened, limit, resize, manifest, batch, results)
+        each = partial(stream, client, share_gpu=share_gpu)
+        reload: Any = T.reload
+        visible: Any = reload and client.run(os.path.exists, reload.args[0])  # by address
+        solver.sent = reload if reload and all(visible.values()) else None
+    run = _Run(solver, each, opened, limit, resize, manifest, batch, format, white, codes)
     with locked(folder):
         manifest.begin(resume)
         for name in (".pattern_*", ".frames-*.json", "appearance/.appearance_*"):  # of killed runs
@@ -228,100 +228,37 @@ def _validate(
     return checks.interval("bounds", options.get("bounds", (0.0, 1.0)))
 
 
-class _Task(NamedTuple):
-    """What a worker has to know of a batch."""
-
-    numbers: list[int]
-    pictures: np.ndarray
-    gain: float
-
-
-class _Solved(NamedTuple):
-    """Of the frames of a batch; `files` by their places in the folder, where they are not written yet."""
-
-    errors: list[float]
-    clipped: list[float]
-    files: dict[str, bytes]
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Solver:
-    """From pictures of a batch to files of patterns: of a run what its workers get, once."""
+    """Pattern, appearance, errors and clipped parts of a batch: of a run what its workers get, once."""
 
     T: Transport
-    format: str
-    white: float  # light that is white in .png
-    appearance: bool
-    codes: Callable[[np.ndarray], np.ndarray] | None
     options: dict[str, Any]
+    appearance: bool
     identity: dict[str, Any]
-    load: Callable[[], Transport] | None = None  # on the way to a worker, in the place of T
+    sent: Callable[[], Transport] | None = None  # to workers in the place of T: reads it from its file
 
-    def __call__(self, task: _Task) -> _Solved:
-        """On a worker, which may not see the folder of the run: the files as bytes."""
-        from distributed import get_worker
-
-        with TemporaryDirectory(dir=get_worker().local_directory) as folder:
-            solved = self.write(Path(folder), task)
-            files = [file for file in Path(folder).rglob("*") if file.is_file()]
-            return solved._replace(files={str(f.relative_to(folder)): f.read_bytes() for f in files})
-
-    def reference(self) -> _Solver | None:
-        """A stand-in that finds T in its file, if it has one."""
-        return self.T.reload and replace(self, load=self.T.reload)
-
-    def resolve(self) -> _Solver | None:
-        """On a worker: with T. None where its file cannot be read here; refused where it is another T."""
-        if self.load is None:
-            return self
-        try:
-            T = self.load()
-        except FileError:
-            return None
-        if identity(T) != self.identity:
-            raise InputError("the file of T holds another T there; give all workers the same")
-        return replace(self, T=T, load=None)
-
-    def __getstate__(self) -> dict[str, Any]:
-        state = dict(vars(self), T=None if self.load else _portable(self.T))
-        return state | {"options": {name: _portable(value) for name, value in self.options.items()}}
-
-    def write(self, folder: Path, task: _Task) -> _Solved:
-        """Solve a batch, its files into a folder. Of "auto", every batch sees the same survey of S."""
-        with _worded(f"frames {task.numbers[0]} to {task.numbers[-1]}: "):
+    def __call__(self, batch: tuple[list[int], np.ndarray, float]) -> tuple[Any, ...]:
+        """Numbers, pictures and gain of a batch. Of "auto", every batch sees the same survey of S."""
+        numbers, pictures, gain = batch
+        with _worded(f"frames {numbers[0]} to {numbers[-1]}: "):
             if self.options.get("method", "auto") == "auto" and self.T.is_square and self.T.shape[0] > SMALL:
                 for S in self.T.systems:
                     survey(S)
-            solved = compensate(self.T, task.pictures, gain=task.gain, **self.options)
-        with ThreadPoolExecutor(_WRITERS) as writers:
-            appearances = solved.appearance if self.appearance else solved.pattern  # not written then
-            write = partial(self._write, folder, task.gain)
-            list(writers.map(write, task.numbers, solved.pattern, appearances))
-        return _Solved(solved.frame_errors.tolist(), solved.frame_clipped.tolist(), {})
+            solved = compensate(self.T, pictures, gain=gain, **self.options)
+        appearance = solved.appearance if self.appearance else solved.pattern  # not written then
+        return solved.pattern, appearance, solved.frame_errors.tolist(), solved.frame_clipped.tolist()
 
-    def _write(
-        self, folder: Path, gain: float, number: int, pattern: np.ndarray, appearance: np.ndarray
-    ) -> None:
-        """A frame's files; an appearance in a .png is divided by the gain, as the picture asked for."""
-        pairs = ((pattern, self.white), (appearance, gain))
-        for file, (light, white) in zip(self.files(folder, number), pairs, strict=False):
-            if self.format == "exr":
-                images.write(file, light)
-            elif self.codes is not None and light is pattern:
-                images.write(file, self.codes(pattern), bits=16, encoding="linear")
-            else:
-                images.write(file, light / np.float32(white), bits=16)
+    def __getstate__(self) -> dict[str, Any]:
+        options = {name: _portable(value) for name, value in self.options.items() if name != "callback"}
+        return dict(vars(self), T=None if self.sent else _portable(self.T), options=options)
 
-    def files(self, folder: Path, number: int) -> list[Path]:
-        """Those of a frame: its pattern and, where asked for, its appearance."""
-        names = ["pattern_{:06}.{}", "appearance/appearance_{:06}.{}"][: 1 + self.appearance]
-        return [folder / name.format(number, self.format) for name in names]
-
-
-class _Batch(NamedTuple):
-    frames: list[Frame]
-    digests: list[str]
-    pictures: list[np.ndarray]
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self.sent is not None:
+            self.T = self.sent()
+            if identity(self.T) != self.identity:
+                raise InputError("the file of T holds another T there; give all workers the same")
 
 
 @dataclass(eq=False)
@@ -329,12 +266,15 @@ class _Run:
     """The loop over batches: read ahead, solve here or on workers, write, record, in this order."""
 
     solver: _Solver
+    each: Callable[..., Iterator[Any]]  # `map`, or that of a cluster
     source: Source
     limit: int | None
     resize: bool
     manifest: Manifest
     size: int
-    stream: Callable[..., Iterator[_Solved]] | None  # of a cluster
+    format: str
+    white: float  # light that is white in .png
+    codes: Callable[[np.ndarray], np.ndarray] | None
     read: int = 0  # frames, of the right size
     done: set[int] = field(default_factory=set)  # numbers of frames, of earlier runs, too
     broken: dict[int, str] = field(default_factory=dict)  # frames that are left out, and why
@@ -354,24 +294,24 @@ class _Run:
 
     def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
         """All batches; yields the number of frames done, before the first that is not and after each."""
-        waiting, folder = deque[_Batch](), self.manifest.path.parent
+        batches, waiting = self._batches(), deque[tuple[Any, Any]]()
 
-        def tasks(batches: Iterator[_Batch]) -> Iterator[_Task]:
-            for batch in batches:
-                waiting.append(batch)
-                numbers = [frame.number for frame in batch.frames]
-                yield _Task(numbers, _stack(batch.pictures), self._gain(gain, loss, batch.pictures))
+        def tasks() -> Iterator[tuple[list[int], np.ndarray, float]]:
+            nonlocal coming
+            while (batch := coming.result()) is not None:
+                coming = reader.submit(next, batches, None)
+                frames, digests, pictures = zip(*batch, strict=True)
+                waiting.append((frames, digests))
+                numbers = [frame.number for frame in frames]
+                yield numbers, _stack(pictures), self._gain(gain, loss, pictures)
 
         with ThreadPoolExecutor(1) as reader:
-            batches = _read_ahead(reader, self._batches())
-            first = next(batches, None)
+            coming = reader.submit(next, batches, None)
+            coming.result()
             yield len(self.done)
-            if first is not None:
-                ordered = tasks(chain([first], batches))
-                here = map(partial(self.solver.write, folder), ordered)
-                for solved in self.stream(self.solver, ordered) if self.stream else here:
-                    self._keep(folder, waiting.popleft(), solved)
-                    yield len(self.done)
+            for solved in self.each(self.solver, tasks()):
+                self._keep(*waiting.popleft(), *solved)
+                yield len(self.done)
         if self.broken:
             named = ", ".join(f"{number} ({why})" for number, why in [*sorted(self.broken.items())][:_NAMED])
             more = f" and {len(self.broken) - _NAMED} more" if len(self.broken) > _NAMED else ""
@@ -380,13 +320,18 @@ class _Run:
     def patterns(self) -> Iterator[np.ndarray]:
         """As they were written, white at 1; codes as the light of which sRGB makes them."""
         for number in sorted(self.done):
-            pattern = images.read(self.solver.files(self.manifest.path.parent, number)[0])
-            if self.solver.format == "exr":
-                codes, white = self.solver.codes, np.float32(self.solver.white)
-                pattern = images.from_srgb(codes(pattern)) if codes else pattern / white
+            pattern = images.read(self._files(number)[0])
+            if self.format == "exr":
+                codes = self.codes
+                pattern = images.from_srgb(codes(pattern)) if codes else pattern / np.float32(self.white)
             yield pattern
 
-    def _batches(self) -> Iterator[_Batch]:
+    def _files(self, number: int) -> list[Path]:
+        """Those of a frame: its pattern and, where asked for, its appearance."""
+        names = ["pattern_{:06}.{}", "appearance/appearance_{:06}.{}"][: 1 + self.solver.appearance]
+        return [self.manifest.path.parent / name.format(number, self.format) for name in names]
+
+    def _batches(self) -> Iterator[list[tuple[Frame, str, np.ndarray]]]:
         """The frames that no earlier run has done, with digests and pictures, and without broken ones."""
         frames, folder = islice(self.source, self.limit), self.manifest.path.parent
         while batch := list(islice(frames, self.size)):
@@ -397,15 +342,14 @@ class _Run:
                     digest = frame.digest()
                     if record is not None and record.digest != digest:
                         advice = f"give the same frames to go on, or another folder than {folder}"
-                        raise OtherRun(
-                            f"{self._place(frame)} has changed since its pattern was made; {advice}"
-                        )
-                    if record and all(file.is_file() for file in self.solver.files(folder, frame.number)):
+                        changed = "has changed since its pattern was made"
+                        raise OtherRun(f"{self._place(frame)} {changed}; {advice}")
+                    if record and all(file.is_file() for file in self._files(frame.number)):
                         self.done.add(frame.number)
                     else:
                         missing.append((frame, digest, self._picture(frame)))
             if missing:
-                yield _Batch(*map(list, zip(*missing, strict=True)))
+                yield missing
 
     @contextmanager
     def _left_out(self, frame: Frame) -> Iterator[None]:
@@ -429,7 +373,7 @@ class _Run:
         self.read += 1
         return picture if picture.shape[:2] == (h, w) else images.resize(picture, (h, w))
 
-    def _gain(self, gain: float | str, loss: float | None, first: list[np.ndarray]) -> float:
+    def _gain(self, gain: float | str, loss: float | None, first: Sequence[np.ndarray]) -> float:
         """The one of all frames, found once, of a sample: the first frames where their number is unknown."""
         if self.manifest.gain is None and isinstance(gain, str):
             count = self.count or self.size
@@ -444,27 +388,25 @@ class _Run:
             self.manifest.gain = float(gain)
         return self.manifest.gain
 
-    def _keep(self, folder: Path, batch: _Batch, solved: _Solved) -> None:
+    def _keep(self, frames: Any, digests: Any, patterns: Any, appearances: Any, *numbers: Any) -> None:
         """Patterns of a batch, on the disk, and then their records."""
-
-        def write(file: tuple[str, bytes]) -> None:
-            with replace_file(folder / file[0]) as temporary:
-                temporary.write_bytes(file[1])
-
         with ThreadPoolExecutor(_WRITERS) as writers:
-            list(writers.map(write, solved.files.items()))
-        rows = zip(batch.frames, batch.digests, solved.errors, solved.clipped, strict=True)
-        self.manifest.add(Record(f.number, f.name, digest, *numbers) for f, digest, *numbers in rows)
-        self.done |= {frame.number for frame in batch.frames}
-        self.solved += len(batch.frames)
+            list(writers.map(self._write, (frame.number for frame in frames), patterns, appearances))
+        rows = zip(frames, digests, *numbers, strict=True)
+        self.manifest.add(Record(f.number, f.name, digest, *others) for f, digest, *others in rows)
+        self.done |= {frame.number for frame in frames}
+        self.solved += len(frames)
 
-
-def _read_ahead(reader: ThreadPoolExecutor, batches: Iterator[_Batch]) -> Iterator[_Batch]:
-    """The next batch is read while the caller works on the one before."""
-    coming = reader.submit(next, batches, None)
-    while (batch := coming.result()) is not None:
-        coming = reader.submit(next, batches, None)
-        yield batch
+    def _write(self, number: int, pattern: np.ndarray, appearance: np.ndarray) -> None:
+        """A frame's files; an appearance in a .png is divided by the gain, as the picture asked for."""
+        pairs = ((pattern, self.white), (appearance, self.manifest.gain))
+        for file, (light, white) in zip(self._files(number), pairs, strict=False):
+            if self.format == "exr":
+                images.write(file, light)
+            elif self.codes is not None and light is pattern:
+                images.write(file, self.codes(pattern), bits=16, encoding="linear")
+            else:
+                images.write(file, light / np.float32(white), bits=16)
 
 
 def _portable(value: Any) -> Any:
@@ -475,7 +417,7 @@ def _portable(value: Any) -> Any:
     return value
 
 
-def _stack(pictures: list[np.ndarray]) -> np.ndarray:
+def _stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
     """(frames, h, w), or (frames, h, w, 3) where one of them is in colour."""
     if any(picture.ndim == 3 for picture in pictures):
         pictures = [np.stack([p] * 3, axis=-1) if p.ndim == 2 else p for p in pictures]

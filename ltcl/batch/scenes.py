@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import builtins
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ltcl.cluster import stream
@@ -23,15 +25,9 @@ def map(
 ) -> list[Any]:
     """Results of a function of each scene, in order; one that fails is named, and the rest go on.
 
-    Parameters
-    ----------
-    function : callable(scene)
-        Such as one that loads a transport and solves. What it returns comes back from the workers.
-    scenes : iterable
-        Paths of transports, which workers then have to see, or whatever `function` takes.
-    client, share_gpu
-        As of `ltcl.cluster.stream`; without a client, scenes are done here, one after the other.
-    progress : callable("scenes", done, total), optional
+    `function` gets a path, or whatever `scenes` hold. Without a `client` it is called here, else on workers,
+    which then have to see the paths; `share_gpu` is as of `ltcl.cluster.stream`. `progress("scenes", done,
+    total)` is called after each.
 
     Raises
     ------
@@ -55,10 +51,8 @@ def map(
         except LtclError as error:
             return type(error)(*error.args)  # without what it holds, which may lie on a device
 
-    attempts = (attempt(scene) for scene in scenes)
-    if client is not None:
-        attempts = stream(client, attempt, scenes, window=1, share_gpu=share_gpu)
-    for result in attempts:
+    each = builtins.map if client is None else partial(stream, client, window=1, share_gpu=share_gpu)
+    for result in each(attempt, scenes):
         results.append(result)
         if progress is not None:
             progress("scenes", len(results), len(scenes))

@@ -57,12 +57,8 @@ def _film_options(
 
 
 _FRAMES = tuple(inspect.signature(_film_options).parameters)
-_CLUSTER = (
-    "local: processes here, one for each GPU; or the ADDRESS of a Dask scheduler. For frames and scenes."
-)
-_SCENES = (
-    "Of each of these in the place of TRANSPORT: a pattern such as 'scans/*.zarr'. DIR gets a folder each."
-)
+_CLUSTER = "Of frames and scenes. local: processes here, one for each GPU; or a Dask scheduler's ADDRESS."
+_SCENES = "In the place of TRANSPORT: many, as 'scans/*.zarr'. DIR gets a folder each."
 
 
 def _cluster_options(
@@ -289,26 +285,23 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path, own: dict
         raise InputError(f"--transports is {pattern}: it must mean files or folders of different names")
     here = dict.fromkeys(("transports", "workers", *(["device"] * bool(context.options["cluster"]))))
     task = partial(_compensate_scene, context.options | here | {"cluster": None}, paths, own)
-    failed = None
+    data, rows, failed = {"folder": out, "scenes": []}, [], None
     with _cluster(context) as client:
         try:
             results = of_each(task, scenes.values(), client=client, progress=context.progress)
         except BatchError as error:
             results, failed = error.results, error
-    data: dict[str, Any] = {"folder": out, "scenes": []}
     for name, result in zip(scenes, results, strict=True):
         if not isinstance(result, LtclError):
             facts, files = result
-            data["scenes"].append(facts | {"folder": out / name})
             with fill_folder(out / name) as folder:
                 for file, content in files.items():
                     (folder / file).write_bytes(content)
+            data["scenes"].append(facts | {"folder": out / name})
+            worst = max(picture["error"] for picture in facts["pictures"])
+            rows.append((name, facts["pictures"][0]["gain"], percent(worst)))
     if failed is not None:
         raise failed
-    rows = [
-        (n, f["pictures"][0]["gain"], percent(max(p["error"] for p in f["pictures"])))
-        for n, f in zip(scenes, data["scenes"], strict=True)
-    ]
     return Answer(data, [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"])
 
 
