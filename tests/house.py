@@ -23,28 +23,28 @@ from ltcl.cli.main import main as main_of_ltcl
 from ltcl.device import Device
 
 ROOT = Path(__file__).resolve().parents[1]
-CORE = 13_255
+CORE = 13_305
 
 _TASKS = [f"ltcl/{name}" for name in ("compensation", "separation.py", "relighting.py", "analysis.py")]
 _NOISE = ["ltcl/noise", *(f"ltcl/{name}.py" for name in ("uncertainty", "denoising", "verdict"))]
 # Lines at most, by the folders and modules that they are of: the Python of the core, and what belongs to it.
 BUDGETS: dict[str, tuple[int, list[str]]] = {
-    "device": (900, ["ltcl/device"]),
-    "operators": (2570, ["ltcl/operators"]),
+    "device": (920, ["ltcl/device"]),
+    "operators": (2600, ["ltcl/operators"]),
     "solvers": (2800, ["ltcl/solvers"]),
     "theory and diagnostics": (1100, ["ltcl/theory", "ltcl/diagnostics.py"]),
     "compression": (1700, ["ltcl/compression"]),
     "compensation, separation, relighting, analysis": (1370, _TASKS),
     # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
     "noise": (1405, _NOISE),
-    "transport and the rest": (1390, ["ltcl/*.py"]),
+    "transport and the rest": (1425, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
 _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1210, "images": 500, "batch": 715, "cli": 2015, "scenes": 2710}
+_OTHERS = {"acquisition": 6310, "store": 1225, "images": 500, "batch": 590, "cli": 2030, "scenes": 2710}
 _PAST = ("cluster", "operators/parts", "operators/distributed", "batch/scenes", "cli/ranks")
 _TESTS_PAST = (
     "batch/test_cluster",
@@ -68,7 +68,8 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     "tests of noise": (1300, ["tests/noise"]),
     "benches of the core": (1750, [f"bench/{name}.py" for name in _BENCHES.split()]),
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
-    # Clusters, ranks, several devices and disks, as far as they have files of their own.
+    # Clusters, ranks, several devices and disks, as far as they have files of their own; about 300 lines more
+    # are in other parts, mostly batch and cli: 900 are to be enough for all.
     "past one machine": (900, [f"ltcl/{name}.py" for name in _PAST]),
     "tests past one machine": (1100, [f"tests/{name}.py" for name in _TESTS_PAST]),
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),

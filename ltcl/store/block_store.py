@@ -200,9 +200,8 @@ class BlockStore:
                 file = self.path / self._places[name][array] / "c/0"  # the numbers, and 4 bytes of crc32c
                 arrays.append(np.fromfile(file, dtype, (file.stat().st_size - 4) // dtype.itemsize))
             if len(arrays[0]) == len(arrays[1]) == arrays[2][-1] and len(arrays[2]) == rows + 1:
-                arrays[2] = arrays[2].astype(
-                    np.int32 if len(arrays[0]) < 1 << 31 else np.int64
-                )  # SciPy makes both alike
+                kind = np.int32 if len(arrays[0]) < 1 << 31 else np.int64  # SciPy makes both alike
+                arrays[2] = arrays[2].astype(kind)
                 return scipy.sparse.csr_array(tuple(arrays), shape=(rows, columns))
         return self.block(channel, block).matrix  # in another layout, or damaged
 
