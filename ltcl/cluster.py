@@ -8,6 +8,7 @@ task. Dask does the tasks of a lost worker on others. The next item is taken whe
 from __future__ import annotations
 
 import contextlib
+import importlib
 import logging
 import math
 import os
@@ -290,11 +291,9 @@ def _ask() -> Callable[..., Any]:
 
     def ask(version: str, token: str, function: bytes) -> Any:
         try:
-            from ltcl import __version__, cluster
-
-            if __version__ != version:
-                return f"it has ltcl {__version__}, and the client {version}"
-            return cluster.join(token, function)
+            if (theirs := importlib.import_module("ltcl").__version__) != version:
+                return f"it has ltcl {theirs}, and the client {version}"
+            return importlib.import_module("ltcl.cluster").join(token, function)
         except Exception as error:  # noqa: BLE001 - whatever its ltcl or its driver raises
             return f"{type(error).__name__}: {error}"
 

@@ -21,7 +21,7 @@
 5. Negative entries become 0; between the same two blocks of pixels what is dim loses as much light.
 
 Known limits: at low noise or few pixels most coefficients stand out; `bench/denoise.py` prints the bound.
-Where d spans a factor of 100, what its fit drops may cost bounces more than noise.
+Where d spans a factor of over 20, reciprocity is left out: errors of the fit would cost bounces.
 """
 
 from __future__ import annotations
@@ -159,13 +159,14 @@ class Problem:
         largest = float(np.abs(X).max(initial=0.0))
         if not square or largest == 0.0:
             return cls(X, V, 1.0, False, grids, noise, channel)
-        r = np.exp(_log_d(X, V, light, grid) / 2).astype(np.float32)
+        log_d = _log_d(X, V, light, grid)
+        r = np.exp(log_d / 2).astype(np.float32)
         gauge = r / r[:, None]
         Z, W = X * gauge, np.maximum(V * gauge**2, np.finfo(np.float32).tiny)
         between = np.triu_indices(rows.shape[1], 1)
         most = np.maximum(rows.T @ (W + W.T) @ rows, rows.T @ (Z - Z.T) ** 2 @ rows)[between]
         excess = (rows.T @ (Z - Z.T) @ rows)[between] ** 2 / np.maximum(most, np.finfo(np.float32).tiny)
-        if len(excess) and excess.mean() > _EXCESS:
+        if np.ptp(log_d) > _SCALE or (len(excess) and excess.mean() > _EXCESS):
             return cls(X, V, 1.0, False, grids, noise, channel)
         mean, half = (Z * W.T + Z.T * W) / (W + W.T), (Z - Z.T) / 2 if noise.neighbours[channel] else None
         return cls(mean, 1.0 / (1.0 / W + 1.0 / W.T), gauge, True, grids, noise, channel, half)

@@ -57,8 +57,10 @@ def test_entries_pictures_and_bounces_come_nearer_to_the_truth(
     assert D.to_numpy().min() >= 0.0
 
 
-@pytest.mark.parametrize(("c", "most"), [(0.6, 0.7), (0.9, 1.15)])
-def test_errors_of_neighbours_that_cancel_are_no_reason_to_move_light(c: float, most: float) -> None:
+@pytest.mark.parametrize(("c", "most", "share"), [(0.6, 0.6, 1.2), (0.9, 1.15, 0.85)])
+def test_errors_of_neighbours_that_cancel_are_no_reason_to_move_light(
+    c: float, most: float, share: float
+) -> None:
     """Of a path tracer: pictures are known better than entries say, and stay so."""
     exact = truth("corner", 12)
     known = dataclasses.replace(noise_of(exact, 1e-3), neighbours=c)
@@ -72,7 +74,7 @@ def test_errors_of_neighbours_that_cancel_are_no_reason_to_move_light(c: float, 
     left = [
         relative(lambda some: (some @ white) - (exact @ white), T, ltcl.denoise(X)) for X in (T, independent)
     ]
-    assert left[0] < min(most, left[1])
+    assert left[0] < min(most, share * left[1])
 
 
 @pytest.mark.parametrize("scene", SCENES)
