@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +26,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     names = vars(item.module) if isinstance(item, pytest.Function) else {}
     if isinstance(names.get("random"), np.random.Generator):
         names["random"] = np.random.default_rng(zlib.crc32(item.name.encode()))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c() -> None:
+    """Ctrl-C interrupts, also where a shell started the tests in the background, and its children ignore it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)

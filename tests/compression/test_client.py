@@ -6,6 +6,8 @@ from __future__ import annotations
 import os
 from typing import Any
 
+import dask.array
+import distributed
 import numpy as np
 import pytest
 import scipy.sparse
@@ -19,8 +21,6 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Wavelet
 from ltcl.transport import to_arrays
 
-dask_array = pytest.importorskip("dask.array")
-distributed = pytest.importorskip("distributed")
 GRID, N = (8, 16), 128
 SMALLEST = 32 * N * 16  # bytes of the smallest block, 16 rows
 
@@ -71,8 +71,8 @@ HOLDERS = {
     "sparse": lambda matrix, path: scipy.sparse.csr_array(matrix),
     "zarr": in_files,
     "zarr in memory": lambda matrix, path: zarr.array(matrix, chunks=(30, 50)),
-    "dask": lambda matrix, path: dask_array.from_array(matrix, chunks=((50, 70, 8), -1)),
-    "dask, persisted": lambda matrix, path: dask_array.from_array(matrix, chunks=((50, 70, 8), 64)),
+    "dask": lambda matrix, path: dask.array.from_array(matrix, chunks=((50, 70, 8), -1)),
+    "dask, persisted": lambda matrix, path: dask.array.from_array(matrix, chunks=((50, 70, 8), 64)),
     "rows": lambda matrix, path: Rows(matrix),
     "rows that are sent": lambda matrix, path: Unpicklable(matrix, 10_000),
 }

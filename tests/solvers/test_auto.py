@@ -21,6 +21,14 @@ from tests.solvers.helpers import failed
 N = auto.SMALL + 8
 
 
+@pytest.fixture(autouse=True)
+def usual_speeds(monkeypatch):
+    """Choices by time are those of a usual machine, not of one that other tests keep busy."""
+    monkeypatch.setenv("LTCL_TUNE", "0")
+    for name in ("_overheads", "_bandwidth", "_flops"):
+        monkeypatch.setattr(auto, name, getattr(auto, name).__wrapped__)
+
+
 def ring(gain: float, skew: float = 0.0) -> np.ndarray:
     """R that passes light on to both neighbours on a ring, unevenly by `skew`; rho(R) = |gain|."""
     right = np.roll(np.eye(N), 1, axis=1)
@@ -87,10 +95,7 @@ def test_a_first_solve_needs_no_survey_and_the_second_makes_one_for_good(device)
     assert gone() is None
 
 
-def test_many_right_hand_sides_are_worth_a_factorization_and_one_is_not(device, monkeypatch):
-    monkeypatch.setenv("LTCL_TUNE", "0")
-    for name in ("_overheads", "_bandwidth", "_flops"):
-        monkeypatch.setattr(auto, name, getattr(auto, name).__wrapped__)
+def test_many_right_hand_sides_are_worth_a_factorization_and_one_is_not(device):
     S = IdentityPlus(Dense(device, ring(0.9)))
     methods = [next(auto.plan(S, 1e-2, k))[0].name for k in (4000, 1)]
     assert methods[1] != methods[0] == "direct"
