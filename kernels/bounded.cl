@@ -21,10 +21,10 @@ static inline real bounded_free(real x, real g, real lower, real upper)
 kernel void bounded_direction(
     int rows, int k, int slices, global const int *rest, global const real *numbers, global const real *lower,
     global const real *upper, global const real *x, global const real *g, global real *d, global real *sums,
-    global real *shares, local real *scratch)
+    local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *alphas = columns_totals(numbers + 4 * k, slices, 2, 0, k, s, scratch, 0), *betas = alphas + s.width;
+    local real *alphas = columns_totals(numbers + 4 * k, slices, 2, 2, k, s, scratch, 0), *betas = alphas + s.width;
     EACH_COLUMN(j) {
         betas[j] = NUMBER(1) > 0 ? -betas[j] / NUMBER(1) : 0;  // -z.h / <A d, A d>
         alphas[j] = rest[s.origin + j] ? 0 : NUMBER(0);
@@ -42,23 +42,22 @@ kernel void bounded_direction(
         if (step != 0)
             most = fmax(most, step / ((step > 0 ? upper[row] : lower[row]) - x[i]));
     }
-    columns_sum(gd, sums + get_group_id(0) * 2 * k, 0, s, scratch);
-    columns_sum(dd, sums + (get_group_id(0) * 2 + 1) * k, 0, s, scratch);
-    columns_sum(most, shares + get_group_id(0) * k, 1, s, scratch);
+    const int slice = 3 * get_group_id(0);
+    for (int n = 0; n < 3; n++)  // one loop: PoCL compiles each function of barriers anew, and more than once
+        columns_sum(n == 0 ? gd : n == 1 ? dd : most, sums + (slice + n) * k, n == 2, s, scratch);
 }
 
-// `sums` and `shares` are of bounded_direction, `curvatures` the sums of w Ad Ad; of 0 slices nothing moves. u = w r,
+// `sums` are of bounded_direction, `curvatures` the sums of w Ad Ad; of 0 slices nothing moves. u = w r,
 // which may be r where w does not count. scratch: 4 more a column.
 kernel void bounded_move(
     int rows, int k, int height, int slices, int weighted, global real *numbers, global const real *sums,
-    global const real *shares, global const real *curvatures, global const real *lower, global const real *upper,
+    global const real *curvatures, global const real *lower, global const real *upper,
     global const real *d, global real *x, global const real *w, global const real *Ad, global real *r,
     global real *u, local real *scratch)
 {
     share s = columns_share(rows, k);
-    local real *totals = columns_totals(sums, slices, 2, 0, k, s, scratch, 0), *lambdas = totals;
-    columns_totals(shares, slices, 1, 1, k, s, scratch, 2);
-    columns_totals(curvatures, slices, 1, 0, k, s, scratch, 3);
+    local real *totals = columns_totals(sums, slices, 3, 2, k, s, scratch, 0), *lambdas = totals;
+    columns_totals(curvatures, slices, 1, 1, k, s, scratch, 3);
     EACH_COLUMN(j) {
         const real gd = totals[j], dd = totals[s.width + j], curvature = totals[3 * s.width + j];
         const bool moves = gd < 0 && curvature > 0 && isfinite(curvature);

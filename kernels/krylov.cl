@@ -28,7 +28,7 @@ kernel void krylov_subtract(
     local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *totals = columns_totals(partials, slices, count + 1, 0, k, s, scratch, 0);
+    local real *totals = columns_totals(partials, slices, count + 1, count + 1, k, s, scratch, 0);
     local real *scale = totals + (count + 1) * s.width;
     EACH_COLUMN(j) {
         real squares = 0, all = 0;
@@ -70,7 +70,7 @@ kernel void krylov_cg(
     local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *alphas = columns_totals(partials, slices, 2, 0, k, s, scratch, 0), *betas = alphas + s.width;
+    local real *alphas = columns_totals(partials, slices, 2, 2, k, s, scratch, 0), *betas = alphas + s.width;
     EACH_COLUMN(j) {
         const real square = alphas[j], product = betas[j];
         const real previous = state[OWN(step, 0)], last = state[OWN(step, 1)];
@@ -129,7 +129,7 @@ kernel void krylov_half(
     global const real *v, global real *half_way, local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *totals = columns_totals(partials, slices, 2, 0, k, s, scratch, 0);
+    local real *totals = columns_totals(partials, slices, 2, 2, k, s, scratch, 0);
     EACH_COLUMN(j) {
         const real sigma = totals[j], square = totals[s.width + j];
         const bool lost = fabs(sigma) <= ORTHOGONAL * sqrt(square) * sqrt(state[AGAINST]);
@@ -152,7 +152,7 @@ kernel void krylov_bicgstab(
     global const real *v, global real *p, global real *x, global real *r, local real *scratch)
 {
     const share s = columns_share(rows, k);
-    local real *totals = columns_totals(partials, slices, 5, 0, k, s, scratch, 0);
+    local real *totals = columns_totals(partials, slices, 5, 5, k, s, scratch, 0);
     local real *alphas = totals, *omegas = totals + s.width, *betas = totals + 2 * s.width;
     EACH_COLUMN(j) {
         const real ts = totals[j], tt = totals[s.width + j], ss = totals[4 * s.width + j];
@@ -185,7 +185,6 @@ kernel void krylov_bicgstab(
         p[i] = next;
     }
     global real *sums = next_partials + (int)get_group_id(0) * 2 * k;
-    columns_sum(along, sums, 0, s, scratch);
-    columns_sum(square, sums + k, 0, s, scratch);
-    columns_sum(sum, SQUARES, 0, s, scratch);
+    for (int n = 0; n < 3; n++)  // one loop: PoCL compiles each function of barriers anew, and more than once
+        columns_sum(n == 0 ? along : n == 1 ? square : sum, n < 2 ? sums + n * k : SQUARES, 0, s, scratch);
 }

@@ -59,13 +59,13 @@ static inline real dot_share(global const real *x, global const real *y, global 
 static inline void columns_sum(real value, global real *sums, int largest, share s, local real *scratch)
 {
     scratch[get_local_id(0)] = value;
-    fold(scratch, get_local_size(0), s.width, largest);
+    fold(scratch, get_local_size(0), s.width, largest ? 0 : s.width);
     EACH_COLUMN(j) sums[s.origin + j] = scratch[j];
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// The partial sums of the group's columns, added up over the slices, or the largest: that of `sum` at [(first + sum) *
-// width + j] behind the first real an item of `scratch`. Returns where those of `first` begin.
+// The partial sums of the group's columns, added up over the slices, from sum `largest` on the largest: that of `sum` at
+// [(first + sum) * width + j] behind the first real an item of `scratch`. Returns where those of `first` begin.
 static inline local real *columns_totals(
     global const real *partials, int slices, int sums, int largest, int k, share s, local real *scratch, int first)
 {
@@ -77,10 +77,10 @@ static inline local real *columns_totals(
         real sum = 0;
         for (int slice = me / width; slice < slices && me < together * width; slice += together) {
             const real partial = partials[(slice * sums + entry / s.width) * k + s.origin + entry % s.width];
-            sum = largest ? fmax(sum, partial) : sum + partial;
+            sum = entry < largest * s.width ? sum + partial : fmax(sum, partial);
         }
         scratch[me] = sum;
-        fold(scratch, items, width, largest);
+        fold(scratch, items, width, largest * s.width - start);
         if (me < width)
             totals[start + me] = scratch[me];
         barrier(CLK_LOCAL_MEM_FENCE);

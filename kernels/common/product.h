@@ -22,7 +22,7 @@ static inline void group_sums(real *value, local real *scratch)
 {
     for (int k = 0; k < K; ++k)
         scratch[get_local_id(0) * K + k] = value[k];
-    fold(scratch, K * (int)get_local_size(0), K, 0);
+    fold(scratch, K * (int)get_local_size(0), K, K);
     for (int k = 0; k < K; ++k)
         value[k] = scratch[k];
 }

@@ -185,15 +185,15 @@ class _Descent:
         numbers = np.zeros((4 + 3 * slices, k))
         numbers[0] = 1.0  # the first alpha
         self._numbers = numbers = device.upload(numbers)
-        sums, shares, curvatures = (columns.sums(count) for count in (2, 1, 1))
+        sums, curvatures = columns.sums(3), columns.sums(1)
         self.r, Ad = self.b.like(), self.b.like()
         self._u = self.r.like() if weighted else self.r
         W = self.r if w is None else device.upload(np.square(w))
         self.g, self._q, d, h = (vectors.fill(self.x.like(), 0.0) for _ in range(4))
         around, rows, (direction, dots, move, look) = (*bounds, self.x), b.shape[0], _KERNELS
         self._look_anew = columns.bind(look, 1, *around, self._q, self.g, h, numbers)
-        to_d = (slices, self._rest, numbers, *around, self.g, d, sums, shares)
-        to_x = (weighted, numbers, sums, shares, curvatures, *bounds, d, self.x, W, Ad, self.r, self._u)
+        to_d = (slices, self._rest, numbers, *around, self.g, d, sums)
+        to_x = (weighted, numbers, sums, curvatures, *bounds, d, self.x, W, Ad, self.r, self._u)
         self._weigh_r = columns.bind(move, rows, 0, *to_x, extra=4)
         self._queued = (
             columns.bind(direction, *to_d, extra=2),

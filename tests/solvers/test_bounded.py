@@ -65,7 +65,7 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     start = np.zeros((4 + 3 * slices, k))
     start[:3] = np.linspace(0.2, 1.0, k), np.linspace(0.5, 1.0, k), np.linspace(0.3, 0.9, k)
     numbers, rest = device.upload(start), device.upload(np.zeros(k), np.int32)
-    sums, shares, squares = (columns.sums(count) for count in (2, 1, 1))
+    sums, squares = columns.sums(3), columns.sums(1)
 
     columns.bind("bounded_look", 0, L, U, X, Q, G, H, numbers)()
     new = np.stack([(-q - g) / start[2], -q])
@@ -73,14 +73,14 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     looks = numbers.get()[4 : 4 + 2 * slices].reshape(slices, 2, k).sum(axis=0)
     np.testing.assert_allclose(looks, [gap, zh], rtol=0, atol=4 * tolerance)
 
-    columns.bind("bounded_direction", slices, rest, numbers, L, U, X, G, D, sums, shares, extra=2)()
+    columns.bind("bounded_direction", slices, rest, numbers, L, U, X, G, D, sums, extra=2)()
     step, (gd, dd, share) = reference.bounded_direction(
         start[0], -looks[1] / start[1], lower, upper, x, new[1], d
     )
     np.testing.assert_allclose(D.get(), step, rtol=0, atol=1e-4)
-    found = sums.get().reshape(slices, 2, k).sum(axis=0)
-    np.testing.assert_allclose(found, [gd, dd], rtol=1e-3, atol=tolerance)
-    np.testing.assert_allclose(shares.get().max(axis=0), share, rtol=1e-3)
+    found = sums.get().reshape(slices, 3, k)
+    np.testing.assert_allclose(found[:, :2].sum(axis=0), [gd, dd], rtol=1e-3, atol=tolerance)
+    np.testing.assert_allclose(found[:, 2].max(axis=0), share, rtol=1e-3)
 
     columns.bind("vector_dots", 0, 0, 1, W, Y, Y, Y, squares)()
     (curvature,) = reference.vector_dots([(Ad, Ad)], w)
@@ -88,7 +88,7 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
 
     V = R.like()
     columns.bind(
-        "bounded_move", rows, slices, 1, numbers, sums, shares, squares, L, U, D, X, W, Y, R, V, extra=4
+        "bounded_move", rows, slices, 1, numbers, sums, squares, L, U, D, X, W, Y, R, V, extra=4
     )()
     with np.errstate(divide="ignore", invalid="ignore"):
         length = np.where(gd < 0, np.fmin(-gd / curvature, np.fmax(1 / share, 1)), 0.0)
