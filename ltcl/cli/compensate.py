@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import glob
 import inspect
+import json
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -59,24 +60,11 @@ def _film_options(
 _FRAMES = tuple(inspect.signature(_film_options).parameters)
 _CLUSTER = "Of frames and scenes. local: processes here, one for each GPU; or a Dask scheduler's ADDRESS."
 _SCENES = "In the place of TRANSPORT: many, as 'scans/*.zarr'. DIR gets a folder each."
+_MPI = "Share each solve: 'mpiexec -n 2 ltcl compensate ... --mpi'."
+_PICTURES = argument("PICTURE...", "Pictures; or one folder or one video of frames.")
 
 
-def _cluster_options(
-    cluster: Annotated[str | None, option(_CLUSTER, metavar="local|ADDRESS")] = None,
-    workers: Annotated[int | None, option("Processes of --cluster local.", metavar="N", min=1)] = None,
-    transports: Annotated[str | None, option(_SCENES, metavar="PATTERN")] = None,
-) -> None:
-    """Of `ltcl.cluster` and `ltcl.batch.map`."""
-
-
-@command(*options.TASK, _film_options, _cluster_options)
-def compensate(
-    context: Context,
-    transport: options.Matrix,
-    out: options.Out,
-    picture: Annotated[
-        list[Path] | None, argument("PICTURE...", "Pictures; or one folder or one video of frames.")
-    ] = None,
+def _own_options(
     gain: Annotated[str | None, option(_GAIN, parser=_gain, metavar="FACTOR")] = None,
     loss: Annotated[float | None, option("Error that --gain auto may cost. Default: the least.")] = None,
     low: Annotated[float, option("Darkest light of the projector.")] = 0.0,
@@ -85,9 +73,20 @@ def compensate(
     background: Annotated[Path | None, file(_BACKGROUND)] = None,
     calibration: Annotated[Path | None, file("The store of 'ltcl acquire' behind TRANSPORT.")] = None,
     weights: Annotated[Path | None, file("Picture of how much the error at each pixel counts.")] = None,
-    mpi: Annotated[
-        bool, option("Share each solve: 'mpiexec -n 2 ltcl compensate ... --mpi'.", "--mpi")
-    ] = False,
+    mpi: Annotated[bool, option(_MPI, "--mpi")] = False,
+    cluster: Annotated[str | None, option(_CLUSTER, metavar="local|ADDRESS")] = None,
+    workers: Annotated[int | None, option("Processes of --cluster local.", metavar="N", min=1)] = None,
+    transports: Annotated[str | None, option(_SCENES, metavar="PATTERN")] = None,
+) -> None:
+    """Of `ltcl.compensate`, and of what it runs on."""
+
+
+@command(_own_options, *options.TASK, _film_options)
+def compensate(
+    context: Context,
+    transport: options.Matrix,
+    out: options.Out,
+    picture: Annotated[list[Path] | None, _PICTURES] = None,
 ) -> Answer:
     """Find the projector patterns that make a scene look like PICTURE.
 
@@ -103,20 +102,20 @@ def compensate(
     gain for all; Ctrl-C keeps what is done, for --resume. With --cluster workers solve, and do --transports;
     docs/cluster.md shows how.
     """
+    paths = picture or []
+    if context.options["transports"] is not None:
+        return _compensate_scenes(context, [transport, *paths], out)
+    if not paths:
+        raise UsageError("Missing argument 'PICTURE...'.")
+    return _compensate(context, transport, paths, out)
+
+
+def _compensate(context: Context, transport: Path, paths: list[Path], out: Path) -> Answer:
+    """Patterns of pictures or of a film for one scene."""
     from ltcl.acquisition import Setup
 
-    picture = picture or []
-    if context.options["transports"] is not None:
-        own = {"gain": gain, "loss": loss, "low": low, "high": high, "clamp": clamp, "background": background}
-        own |= {"calibration": calibration, "weights": weights}
-        return _compensate_scenes(context, [transport, *picture], out, own)
-    if not picture:
-        raise UsageError("Missing argument 'PICTURE...'.")
-    film = _film(picture, context.options)
-    if mpi and film is not None:
-        raise InputError(
-            f"--mpi is given, but {film} holds frames; it is for pictures, whose solves it shares"
-        )
+    asked, film = context.options, _film(paths, context.options)
+    low, high, calibration = asked["low"], asked["high"], asked["calibration"]
     measured = calibration or (transport if options.is_measured(transport) else None)
     setup = Setup.of(measured) if measured else None
     T = options.load(context, transport)
@@ -127,21 +126,23 @@ def compensate(
         limits = "from 0 to 1, the black and the white of the projector that 'ltcl acquire' measured"
         raise InputError(f"--low is {low:g} and --high is {high:g}; they must be {limits}")
     settings = options.solving(context, T, compensation.RTOL)
-    settings |= {"loss": loss, "clamp": clamp, "bounds": (low, high)}
-    settings["gain"] = gain if gain is not None else 1.0 if setup is None else "auto"
-    for name, path in (("weights", weights), ("background", background)):
+    settings |= {"loss": asked["loss"], "clamp": asked["clamp"], "bounds": (low, high), "gain": asked["gain"]}
+    if settings["gain"] is None:
+        settings["gain"] = 1.0 if setup is None else "auto"
+    for name in ("weights", "background"):
+        path = asked[name]
         settings[name] = path and pictures.read(context, path, T.camera_grid, "the camera", upright=False)
     text = options.heading(context, transport, T, rtol=settings["rtol"], gain=settings["gain"])
     text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
-    notes = [options.caveat("errors are", T, context.options["exact"])]
-    notes += ["masked pixels do not count in errors"] * bool(weights is None and T.masked.any())
+    notes = [options.caveat("errors are", T, asked["exact"])]
+    notes += ["masked pixels do not count in errors"] * bool(asked["weights"] is None and T.masked.any())
     if setup is not None:
         notes.append("pattern .png holds the codes of the measured projector: show it pixel for pixel")
-    if setup is not None and background is None:
+    if setup is not None and asked["background"] is None:
         settings["background"], text["options"]["background"] = setup.ambient, "measured"
         notes.append("the background is the ambient light that was measured")
     if film is None:
-        lines = _compensate_pictures(context, T, picture, out, text, settings, setup)
+        lines = _compensate_pictures(context, T, paths, out, text, settings, setup)
     else:
         lines = _compensate_frames(context, T, film, out, text, settings | {"codes": setup and setup.codes})
     return Answer({"folder": out, **text}, [*lines, *notes])
@@ -155,9 +156,11 @@ def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
     if films and len(paths) > 1:
         text = f"holds frames, and there are {len(paths) - 1} more inputs; it must be the only one"
         raise InputError(f"{films[0]}: {text}")
-    for name in (*_FRAMES, "cluster", "workers"):
-        if not films and asked[name] not in (None, False):
-            raise InputError(f"--{name} is given, but {paths[0]} is a picture; it is for a folder or a video")
+    refused = ("mpi", "transports") if films else (*_FRAMES, "cluster", "workers")
+    why = "holds frames; it is for pictures" if films else "is a picture; it is for a folder or a video"
+    for name in refused:
+        if asked[name] not in (None, False):
+            raise InputError(f"--{name} is given, but {paths[0]} {why}")
     return films[0] if films else None
 
 
@@ -275,44 +278,44 @@ def _cluster(context: Context) -> AbstractContextManager[Any]:
     return nullcontext() if cluster is None else connect(cluster, workers, device)
 
 
-def _compensate_scenes(context: Context, paths: list[Path], out: Path, own: dict[str, Any]) -> Answer:
-    """The pictures on each of many scenes, one task each; at the end those that failed are named."""
+def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer:
+    """The pictures on each of many scenes, one task each; those that failed are named at the end."""
     from ltcl.batch import map as of_each
 
     pattern = context.options["transports"]
-    scenes = {Path(name).stem: Path(name) for name in sorted(glob.glob(pattern))}
-    if len(scenes) < max(1, len(glob.glob(pattern))):
+    scenes = sorted(map(Path, glob.glob(pattern)))
+    if len({scene.stem for scene in scenes}) < max(1, len(scenes)):
         raise InputError(f"--transports is {pattern}: it must mean files or folders of different names")
-    here = dict.fromkeys(("transports", "workers", *(["device"] * bool(context.options["cluster"]))))
-    task = partial(_compensate_scene, context.options | here | {"cluster": None}, paths, own)
-    data, rows, failed = {"folder": out, "scenes": []}, [], None
+    here = {"cluster": None, "workers": None, "transports": None}
+    here |= {"device": None} if context.options["cluster"] else {}  # workers have their own
+    reports, rows, failed = [], [], None
     with _cluster(context) as client:
         try:
-            results = of_each(task, scenes.values(), client=client, progress=context.progress)
+            task = partial(_compensate_scene, context.options | here, paths)
+            results = of_each(task, scenes, client=client, progress=context.progress)
         except BatchError as error:
             results, failed = error.results, error
-    for name, result in zip(scenes, results, strict=True):
-        if not isinstance(result, LtclError):
-            facts, files = result
-            with fill_folder(out / name) as folder:
-                for file, content in files.items():
-                    (folder / file).write_bytes(content)
-            data["scenes"].append(facts | {"folder": out / name})
-            worst = max(picture["error"] for picture in facts["pictures"])
-            rows.append((name, facts["pictures"][0]["gain"], percent(worst)))
+    for scene, files in zip(scenes, results, strict=True):
+        if not isinstance(files, LtclError):
+            with fill_folder(out / scene.stem) as folder:
+                for name, content in files.items():
+                    (folder / name).write_bytes(content)
+            reports.append({"folder": out / scene.stem, **json.loads(files["compensate.json"])})
+            pictures_of = reports[-1]["pictures"]
+            worst = max(picture["error"] for picture in pictures_of)
+            rows.append((scene.stem, pictures_of[0]["gain"], percent(worst)))
     if failed is not None:
         raise failed
-    return Answer(data, [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"])
+    lines = [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"]
+    return Answer({"folder": out, "scenes": reports}, lines)
 
 
-def _compensate_scene(
-    asked: dict[str, Any], paths: list[Path], own: dict[str, Any], scene: Path
-) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """What the command says of one scene, and the files that it writes."""
+def _compensate_scene(asked: dict[str, Any], paths: list[Path], scene: Path) -> dict[str, bytes]:
+    """The files of one scene."""
     with TemporaryDirectory() as folder, Progress(quiet=True) as progress:
-        context, place = Context("compensate", asked, progress), Path(folder) / "scene"
-        answer = inspect.unwrap(compensate)(context, transport=scene, picture=paths, out=place, **own)
-        return report.plain(answer.data), {file.name: file.read_bytes() for file in place.iterdir()}
+        place = Path(folder) / "scene"
+        _compensate(Context("compensate", asked, progress), scene, paths, place)
+        return {file.name: file.read_bytes() for file in place.iterdir()}
 
 
 @command(*options.TASK)
@@ -347,10 +350,8 @@ def separate(
             for part, picture_of in light.items():
                 panels.append(pictures.panel(picture_of, part, factor))
                 place = f"{name}/{part}" if len(images) > 1 else part
-                facts: dict[str, Any] = {
-                    "part": part,
-                    **pictures.write(folder, place, picture_of, panels[-1]),
-                }
+                files = pictures.write(folder, place, picture_of, panels[-1])
+                facts: dict[str, Any] = {"part": part, **files}
                 facts["share"], facts["lowest"] = _share(picture_of, images[name]), float(picture_of.min())
                 facts["channels"] = solves = report.solution(solved[part]) if part in solved else []
                 if part in std:
