@@ -79,9 +79,8 @@ def stream(
     ...     list(stream(client, abs, [-1, -2, 3]))
     [1, 2, 3]
     """
-    require(client)
+    crew = _Crew(client, require(client), _pickled(function), share_gpu)
     window = checks.count("window", window)
-    crew = _Crew(client, client.scheduler.address, _pickled(function), share_gpu)
     try:
         for item in items:
             while crew.tasks and len(crew.tasks) >= window * len(crew.ready):
@@ -94,12 +93,13 @@ def stream(
         crew.leave()
 
 
-def require(client: Any) -> None:
-    """Refuse what is no connected `distributed.Client`, and that Dask is missing."""
+def require(client: Any) -> str:
+    """Address of its scheduler; refuses what is no connected `distributed.Client`, and a missing Dask."""
     if not isinstance(client, _distributed().Client):
         raise InputTypeError(f"client is a {type(client).__name__}; it must be a distributed.Client")
     if client.status != "running":
         raise ClusterError(f"client is {client.status}; it must be connected to a scheduler")
+    return client.scheduler.address
 
 
 @contextlib.contextmanager
@@ -131,20 +131,20 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
 
 def _processes(workers: int | None, device: str | None) -> Any:
     """Workers on this machine, each with an environment of its own, unlike those of a LocalCluster."""
-    from distributed import Nanny, Scheduler, SpecCluster
-
+    distributed, quiet = _distributed(), logging.CRITICAL
     device = device or os.environ.get("LTCL_DEVICE")
     gpus = [] if device else [each.index for each in list_devices() if each.kind == "gpu"]
     count = checks.count("workers", max(1, len(gpus)) if workers is None else workers)
     cores = {} if gpus else {"POCL_MAX_PTHREAD_COUNT": str(max(1, (os.cpu_count() or 1) // count))}
     devices = itertools.cycle(gpus or [device or open_device().description.index])
     local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
-    alike = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL}
+    alike = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": quiet}
     nannies = {}
     for number, name in zip(range(count), devices, strict=False):
         options = {**alike, "env": {**cores, "LTCL_DEVICE": name}}
-        nannies[number] = {"cls": Nanny, "options": options}
-    return SpecCluster(nannies, {"cls": Scheduler, "options": local}, silence_logs=logging.CRITICAL)
+        nannies[number] = {"cls": distributed.Nanny, "options": options}
+    scheduler = {"cls": distributed.Scheduler, "options": local}
+    return distributed.SpecCluster(nannies, scheduler, silence_logs=quiet)
 
 
 def _distributed() -> Any:
@@ -266,7 +266,7 @@ class _Crew:
             raise ClusterError(f"no worker is left at {self.scheduler}{excluded}")
 
     def admit(self, address: str, answer: Any) -> None:
-        """A worker is ready, or excluded and named, once; or, where it has gone or is asked again, neither."""
+        """A worker is ready, or excluded and named once; neither where it has gone or is asked again."""
         self.ready.pop(address, None)
         if isinstance(answer, tuple):
             name, gpu = answer

@@ -74,26 +74,24 @@ def _run(words: list[str]) -> int:
 
 
 def _run_on_every_rank(words: list[str]) -> int:
-    """All ranks do the same; the first alone writes and prints. One that fails alone ends all, and says why."""
+    """All do the same, and the first alone writes and prints; one that fails alone says why and ends all."""
     try:
         from mpi4py import MPI
     except (ImportError, RuntimeError) as error:  # the latter where it finds no library
         problem = InputError(f"--mpi needs mpi4py and an MPI, pip install mpi4py mpich: {error}")
         return fail(problem, "--json" in words)["exit_code"]
-    ends, said = MPI.COMM_WORLD.Dup(), io.StringIO()
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as silence:
+    ends, said, out, err = MPI.COMM_WORLD.Dup(), io.StringIO(), sys.stdout, sys.stderr
+    with tempfile.TemporaryDirectory() as folder:
         if ends.rank > 0:
-            words = [*words, "--out", f"{folder}/out"]  # the last one counts
-            silence.enter_context(contextlib.redirect_stdout(io.StringIO()))
-            silence.enter_context(contextlib.redirect_stderr(said))
-        code = _run(words)
-        all_ended, limit = ends.Ibarrier(), time.monotonic() + _PATIENCE
-        while not all_ended.Test():
-            if code and time.monotonic() > limit:
-                silence.close()
-                sys.stderr.write(said.getvalue())
-                ends.Abort(code)
-            time.sleep(0.01)
+            words, out, err = [*words, "--out", f"{folder}/out"], io.StringIO(), said  # the last --out counts
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = _run(words)
+    all_ended, limit = ends.Ibarrier(), time.monotonic() + _PATIENCE
+    while not all_ended.Test():
+        if code and time.monotonic() > limit:
+            sys.stderr.write(said.getvalue())
+            ends.Abort(code)
+        time.sleep(0.01)
     return code
 
 

@@ -29,10 +29,7 @@ _DIM = 0.25  # of white: what is darker is shown a second time on a contact shee
 
 @contextmanager
 def fill(out: Path, text: dict[str, Any]) -> Iterator[Path]:
-    """Fill `out` as `fill_folder` does, with the report `text`, named after its command, of all files.
-
-    Other files in it stay. A second run that writes there is refused at once.
-    """
+    """`fill_folder`, with a report `text`, named after its command, of all files; one run at a time."""
     from ltcl.batch.manifest import locked
 
     with locked(out), fill_folder(out) as folder:
