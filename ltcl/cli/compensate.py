@@ -15,13 +15,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from ltcl import checks, compensation, relighting, report, separation
+from ltcl import checks, compensation, images, relighting, report, separation
 from ltcl.cli import options, pictures
 from ltcl.cli.command import Answer, Context, Progress, UsageError, command, note, percent, table
 from ltcl.cli.options import argument, file, option, writable_file
 from ltcl.cluster import connect
 from ltcl.errors import BatchError, InputError, LtclError
 from ltcl.files import fill_folder
+from ltcl.images.frames import is_frames
 from ltcl.transport import Transport
 
 _MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
@@ -145,12 +146,9 @@ def compensate(
 
 def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
     """The folder or video, which must be the only input; None where there are pictures."""
-    from ltcl.images.frames import is_frames
-
     films = [path for path in paths if is_frames(path)]
     if films and len(paths) > 1:
-        text = f"holds frames, and there are {len(paths) - 1} more inputs; it must be the only one"
-        raise InputError(f"{films[0]}: {text}")
+        raise InputError(f"{films[0]}: holds frames; it must be the only input, but there are {len(paths)}")
     refused = ("mpi",) if films else (*_FRAMES, "cluster", "workers")
     why = "holds frames; it is for pictures" if films else "is a picture; it is for a folder or a video"
     for name in refused:
@@ -199,8 +197,6 @@ def _write(
     stem: Path, desired: np.ndarray, result: Any, factor: float, high: float, setup: Any, noisy: bool
 ) -> tuple[dict[str, Any], list[Any]]:
     """Files of one picture, and its row of the contact sheet."""
-    from ltcl import images
-
     folder, name, pattern = stem.parent, stem.name, result.pattern
     units = {"pattern": 1 / high, "appearance": factor / result.gain}  # to compare with what was asked for
     seen = pictures.shades(result.appearance, units["appearance"])
@@ -321,22 +317,22 @@ def separate(
     """
     T = options.load(context, transport)
     settings = options.solving(context, T, separation.RTOL, bounces + 1)
-    images = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
-    noisy, factor = options.shows_noise(T, settings), pictures.exposure(*images.values())
+    photographs = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
+    noisy, factor = options.shows_noise(T, settings), pictures.exposure(*photographs.values())
     text = options.heading(context, transport, T, rtol=settings["rtol"])
     text["exposure"], text["pictures"], sheet, rows = factor, [], [], []
     with pictures.fill(out, text) as folder:
-        for name, path in zip(context.progress.each(list(images)), picture, strict=True):
-            result = separation.separate(T, images[name], bounces, **settings)
+        for name, path in zip(context.progress.each(list(photographs)), picture, strict=True):
+            result = separation.separate(T, photographs[name], bounces, **settings)
             numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
             light = {"direct": result.direct, "indirect": result.indirect, **numbered, "rest": result.rest}
             solved = dict(zip(["direct", *numbered], result.solutions, strict=True))
             std = dict(zip(solved, [result.std.direct, *result.std.bounces], strict=True)) if noisy else {}
-            panels, deviations, parts = [pictures.panel(images[name], name, factor)], [], []
-            whole = float(images[name].mean(dtype=np.float64))
+            panels, deviations, parts = [pictures.panel(photographs[name], name, factor)], [], []
+            whole = float(photographs[name].mean(dtype=np.float64))
             for part, picture_of in light.items():
                 panels.append(pictures.panel(picture_of, part, factor))
-                place = f"{name}/{part}" if len(images) > 1 else part
+                place = f"{name}/{part}" if len(photographs) > 1 else part
                 files = pictures.write(folder, place, picture_of, panels[-1])
                 facts: dict[str, Any] = {"part": part, **files}
                 mean, facts["lowest"] = float(picture_of.mean(dtype=np.float64)), float(picture_of.min())

@@ -241,8 +241,7 @@ def compress(
 
     def make(T: Transport, progress: Any) -> Transport:
         if T.is_compressed and T.error:
-            error = f"with an error of {T.error:.2g}"
-            raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
+            raise InputError(f"{file}: is compressed already, to {T.error:.2g}; compress what it came from")
         return compression.compress(T, rtol, budget, norm=norm, basis=basis, progress=progress)
 
     _, C, data = _transform(context, file, out, make)

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
-from ltcl import report
+from ltcl import images, report
 from ltcl.cli.command import Context
 from ltcl.errors import InputError
 from ltcl.files import fill_folder
@@ -47,8 +48,6 @@ def read(
     Integers are codes for the projector of a `setup`, where there is one and no other encoding is asked for.
     Photographs, not `upright`, keep the camera's pixels. InputError where the size is another.
     """
-    from ltcl import images
-
     encoding = context.options["encoding"]
     is_code = setup is not None and encoding == "auto" and images.read_codes(path).dtype.kind == "u"
     picture = images.read(path, encoding="linear" if is_code else encoding, upright=upright)
@@ -63,13 +62,13 @@ def read(
 
 def read_all(context: Context, paths: Sequence[Path], *place: Any, **settings: Any) -> dict[str, np.ndarray]:
     """All pictures, as `read` does, by names for their results: stems, longer where an earlier one has it."""
-    images: dict[str, np.ndarray] = {}
+    named: dict[str, np.ndarray] = {}
     for path in paths:
         name = path.stem
-        while name.lower() in map(str.lower, images):  # some file systems ignore case
+        while name.lower() in map(str.lower, named):  # some file systems ignore case
             name += "_2"
-        images[name] = read(context, path, *place, **settings)
-    return images
+        named[name] = read(context, path, *place, **settings)
+    return named
 
 
 def exposure(*pictures: np.ndarray) -> float:
@@ -84,8 +83,6 @@ def exposure(*pictures: np.ndarray) -> float:
 
 def write(folder: Path, name: str, picture: np.ndarray, shown: Any) -> dict[str, str]:
     """Write ``name.exr`` with the values and ``name.png``, a `panel`; their names, for the report."""
-    from ltcl import images
-
     images.write(folder / f"{name}.exr", picture)
     shown.save(folder / f"{name}.png")
     return {"exr": f"{name}.exr", "png": f"{name}.png"}
@@ -93,8 +90,6 @@ def write(folder: Path, name: str, picture: np.ndarray, shown: Any) -> dict[str,
 
 def shades(picture: np.ndarray, factor: float) -> np.ndarray:
     """A linear picture times `factor` in sRGB, (h, w, 3) in [0, 1]."""
-    from ltcl import images
-
     codes = images.to_srgb(np.clip(picture * np.float32(factor), 0.0, 1.0))
     return codes if codes.ndim == 3 else np.stack([codes] * 3, axis=-1)
 
@@ -111,8 +106,6 @@ def mark(codes: np.ndarray, missing: np.ndarray) -> np.ndarray:
 
 def panel(picture: np.ndarray, label: str, factor: float | None = None) -> Any:
     """A linear picture times `factor`, or sRGB values, as one of Pillow: enlarged, with its label above."""
-    from PIL import Image, ImageDraw, ImageFont
-
     codes = picture if factor is None else shades(picture, factor)
     side = -(-_WIDTH // codes.shape[1])
     large = np.rint(255 * codes).astype(np.uint8).repeat(side, axis=0).repeat(side, axis=1)
@@ -131,8 +124,6 @@ def deviation(folder: Path, name: str, std: np.ndarray, factor: float) -> tuple[
 
 def contact_sheet(rows: Sequence[Sequence[Any]]) -> Any:
     """Panels in rows, as one picture."""
-    from PIL import Image
-
     widths = [sum(each.width + _MARGIN for each in row) for row in rows]
     heights = [max(each.height for each in row) + _MARGIN for row in rows]
     sheet = Image.new("RGB", (max(widths) + _MARGIN, sum(heights) + _MARGIN), _PAPER)
