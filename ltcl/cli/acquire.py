@@ -207,9 +207,8 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     best, why = choose(strategies)
     data = {"folder": folder, "rig": project.kind, "measured": is_measured}
     data |= {"asked_for": settings.strategy, "auto": best, "why": why}
-    data |= {name: facts[name] for name in ("exposures", "noise", "light", "channels")} | {
-        "plans": strategies
-    }
+    data |= {name: facts[name] for name in ("exposures", "noise", "light", "channels")}
+    data["plans"] = strategies
     rows = []
     for name, each in strategies.items():
         counts = "{} x {}".format(*each.grid), each.patterns, each.photographs

@@ -121,8 +121,7 @@ def compensate(
         sizes = f"{setup.grid} and {setup.channels} channel(s); TRANSPORT has {T.grid} and {T.channels}"
         raise InputError(f"{calibration}: is of {sizes}")
     if setup is not None and not 0.0 <= low < high <= 1.0:
-        limits = "from 0 to 1, the black and the white of the projector that 'ltcl acquire' measured"
-        raise InputError(f"--low is {low:g} and --high is {high:g}; they must be {limits}")
+        raise InputError(f"--low is {low:g} and --high is {high:g}; a measured projector has 0 to 1")
     settings = options.solving(context, T, compensation.RTOL)
     settings |= {"loss": loss, "clamp": clamp, "bounds": (low, high)}
     settings["gain"] = gain if gain is not None else 1.0 if setup is None else "auto"
