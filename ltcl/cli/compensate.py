@@ -148,7 +148,7 @@ def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
     films = [path for path in paths if is_frames(path)]
     if films and len(paths) > 1:
         raise InputError(f"{films[0]}: holds frames; it must be the only input, but there are {len(paths)}")
-    refused = ("mpi",) if films else (*_FRAMES, "cluster", "workers")
+    refused = ("mpi", "transports") if films else (*_FRAMES, "cluster", "workers")
     why = "holds frames; it is for pictures" if films else "is a picture; it is for a folder or a video"
     for name in refused:
         if asked[name] not in (None, False):
@@ -265,12 +265,12 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer
     scenes = sorted(map(Path, glob.glob(pattern)))
     if len({scene.stem for scene in scenes}) < max(1, len(scenes)):
         raise InputError(f"--transports is {pattern}: it must mean files or folders of different names")
-    has_own_device = context.options["cluster"] is not None
-    here = dict.fromkeys(["cluster", "workers", "transports", *["device"] * has_own_device])
+    here = dict.fromkeys(["cluster", "workers", *["device"] * (context.options["cluster"] is not None)])
+    _film(paths, context.options | here)  # is refused
     reports, rows, failed = [], [], None
     with _cluster(context) as client:
         try:
-            task = partial(_compensate_scene, context.options | here, paths)
+            task = partial(_compensate_scene, context.options | here | {"transports": None}, paths)
             results = of_each(task, scenes, client=client, progress=context.progress)
         except BatchError as error:
             results, failed = error.results, error
