@@ -147,7 +147,7 @@ def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
     """The folder or video, which must be the only input; None where there are pictures."""
     films = [path for path in paths if is_frames(path)]
     if films and len(paths) > 1:
-        raise InputError(f"{films[0]}: holds frames; it must be the only input, but there are {len(paths)}")
+        raise InputError(f"{films[0]}: holds frames and must be alone; there are {len(paths) - 1} more")
     refused = ("mpi", "transports") if films else (*_FRAMES, "cluster", "workers")
     why = "holds frames; it is for pictures" if films else "is a picture; it is for a folder or a video"
     for name in refused:
