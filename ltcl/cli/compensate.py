@@ -15,14 +15,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from ltcl import checks, compensation, images, relighting, report, separation
+from ltcl import checks, compensation, relighting, report, separation
 from ltcl.cli import options, pictures
 from ltcl.cli.command import Answer, Context, Progress, UsageError, command, note, percent, table
 from ltcl.cli.options import argument, file, option, writable_file
 from ltcl.cluster import connect
 from ltcl.errors import BatchError, InputError, LtclError
 from ltcl.files import fill_folder
-from ltcl.images.frames import is_frames
 from ltcl.transport import Transport
 
 _MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
@@ -145,6 +144,8 @@ def compensate(
 
 def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
     """The folder or video, which must be the only input; None where there are pictures."""
+    from ltcl.images.frames import is_frames
+
     films = [path for path in paths if is_frames(path)]
     if films and len(paths) > 1:
         raise InputError(f"{films[0]}: holds frames and must be alone; there are {len(paths) - 1} more")
@@ -196,6 +197,8 @@ def _write(
     stem: Path, desired: np.ndarray, result: Any, factor: float, high: float, setup: Any, noisy: bool
 ) -> tuple[dict[str, Any], list[Any]]:
     """Files of one picture, and its row of the contact sheet."""
+    from ltcl import images
+
     folder, name, pattern = stem.parent, stem.name, result.pattern
     units = {"pattern": 1 / high, "appearance": factor / result.gain}  # to compare with what was asked for
     seen = pictures.shades(result.appearance, units["appearance"])

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from ltcl import images, report
+from ltcl import report
 from ltcl.cli.command import Context
 from ltcl.errors import InputError
 from ltcl.files import fill_folder
@@ -48,6 +48,8 @@ def read(
     Integers are codes for the projector of a `setup`, where there is one and no other encoding is asked for.
     Photographs, not `upright`, keep the camera's pixels. InputError where the size is another.
     """
+    from ltcl import images
+
     encoding = context.options["encoding"]
     is_code = setup is not None and encoding == "auto" and images.read_codes(path).dtype.kind == "u"
     picture = images.read(path, encoding="linear" if is_code else encoding, upright=upright)
@@ -83,6 +85,8 @@ def exposure(*pictures: np.ndarray) -> float:
 
 def write(folder: Path, name: str, picture: np.ndarray, shown: Any) -> dict[str, str]:
     """Write ``name.exr`` with the values and ``name.png``, a `panel`; their names, for the report."""
+    from ltcl import images
+
     images.write(folder / f"{name}.exr", picture)
     shown.save(folder / f"{name}.png")
     return {"exr": f"{name}.exr", "png": f"{name}.png"}
@@ -90,6 +94,8 @@ def write(folder: Path, name: str, picture: np.ndarray, shown: Any) -> dict[str,
 
 def shades(picture: np.ndarray, factor: float) -> np.ndarray:
     """A linear picture times `factor` in sRGB, (h, w, 3) in [0, 1]."""
+    from ltcl import images
+
     codes = images.to_srgb(np.clip(picture * np.float32(factor), 0.0, 1.0))
     return codes if codes.ndim == 3 else np.stack([codes] * 3, axis=-1)
 
