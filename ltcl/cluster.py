@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import itertools
 import logging
 import math
 import os
@@ -34,7 +35,6 @@ _TRIES = 20  # of an item whose workers are lost, before it is taken for the rea
 _PATIENCE = 60.0  # seconds without a worker: what was killed has been started again by then
 _PERIOD = 1.0  # seconds between two looks at the list of workers
 _PCI = ("pci_domain_id_nv", "pci_bus_id_nv", "pci_slot_id_nv")  # what CUDA_VISIBLE_DEVICES does not renumber
-_GATHER = 5.0  # seconds that a result may take on its way, at first
 
 # Of a worker's process: functions of streams, by tokens, pickled until the first task; one device, one task.
 _functions: dict[str, Any] = {}
@@ -79,8 +79,8 @@ def stream(
     ...     list(stream(client, abs, [-1, -2, 3]))
     [1, 2, 3]
     """
-    require(client)
-    crew, window = _Crew(client, _pickled(function), share_gpu), checks.count("window", window)
+    crew = _Crew(client, require(client), _pickled(function), share_gpu)
+    window = checks.count("window", window)
     try:
         for item in items:
             while crew.tasks and len(crew.tasks) >= window * len(crew.ready):
@@ -93,12 +93,13 @@ def stream(
         crew.leave()
 
 
-def require(client: Any) -> None:
-    """Refuse what is no connected `distributed.Client`, and that Dask is missing."""
+def require(client: Any) -> str:
+    """Address of its scheduler; refuses what is no connected `distributed.Client`, and a missing Dask."""
     if not isinstance(client, _distributed().Client):
         raise InputTypeError(f"client is a {type(client).__name__}; it must be a distributed.Client")
     if client.status != "running":
         raise ClusterError(f"client is {client.status}; it must be connected to a scheduler")
+    return client.scheduler.address
 
 
 @contextlib.contextmanager
@@ -108,37 +109,42 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
     These have a GPU each; or share `device`, by default that of LTCL_DEVICE, or the CPU and its cores. By
     default they are as many as there are GPUs, or one. ClusterError where nothing answers.
     """
-    dask = _distributed()
+    distributed = _distributed()
     from dask import config
 
     with contextlib.ExitStack() as stack:
+        address: Any = cluster
         if cluster == "local":
-            same = device or os.environ.get("LTCL_DEVICE")
-            gpus = [] if same else [each.index for each in list_devices() if each.kind == "gpu"]
-            count = checks.count("workers", max(1, len(gpus)) if workers is None else workers)
-            cores = {} if gpus else {"POCL_MAX_PTHREAD_COUNT": str(max(1, (os.cpu_count() or 1) // count))}
-            names = gpus or [same or open_device().description.index]
-            local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
-            one = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": logging.CRITICAL}
-            envs = [
-                {**cores, "LTCL_DEVICE": names[k % len(names)]} for k in range(count)
-            ]  # LocalCluster: one
-            nannies = {k: {"cls": dask.Nanny, "options": {**one, "env": env}} for k, env in enumerate(envs)}
-            scheduler = {"cls": dask.Scheduler, "options": local}
             # Else a worker that takes 15 s to start again, on a busy machine, is given up.
-            stack.enter_context(config.set({"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}))
-            address = dask.SpecCluster(nannies, scheduler, silence_logs=logging.CRITICAL)
-            stack.enter_context(address)
+            patience = {"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}
+            stack.enter_context(config.set(patience))
+            address = stack.enter_context(_processes(workers, device))
         elif workers is not None:
             raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
-        else:
-            address = cluster
         try:
-            client = stack.enter_context(dask.Client(address, set_as_default=False))
+            client = stack.enter_context(distributed.Client(address, set_as_default=False))
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise ClusterError(f"cluster is {cluster!r}, where no scheduler answers: {reason}") from None
         yield client
+
+
+def _processes(workers: int | None, device: str | None) -> Any:
+    """Workers on this machine, each with an environment of its own, unlike those of a LocalCluster."""
+    distributed, quiet = _distributed(), logging.CRITICAL
+    device = device or os.environ.get("LTCL_DEVICE")
+    gpus = [] if device else [each.index for each in list_devices() if each.kind == "gpu"]
+    count = checks.count("workers", max(1, len(gpus)) if workers is None else workers)
+    cores = {} if gpus else {"POCL_MAX_PTHREAD_COUNT": str(max(1, (os.cpu_count() or 1) // count))}
+    devices = itertools.cycle(gpus or [device or open_device().description.index])
+    local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
+    alike = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": quiet}
+    nannies = {}
+    for number, name in zip(range(count), devices, strict=False):
+        options = {**alike, "env": {**cores, "LTCL_DEVICE": name}}
+        nannies[number] = {"cls": distributed.Nanny, "options": options}
+    scheduler = {"cls": distributed.Scheduler, "options": local}
+    return distributed.SpecCluster(nannies, scheduler, silence_logs=quiet)
 
 
 def _distributed() -> Any:
@@ -173,6 +179,7 @@ class _Crew:
     """The workers of a stream, and its tasks on them."""
 
     client: Any
+    scheduler: str  # its address
     function: bytes
     share_gpu: bool
     tasks: deque[_Task] = field(default_factory=deque)  # in order, until their results are yielded
@@ -182,9 +189,6 @@ class _Crew:
     lost: bool = False  # whether some worker has gone, which may be started again
     seen: float = field(default_factory=time.monotonic)  # when some worker was last there
     looked: float = -math.inf
-
-    def __post_init__(self) -> None:
-        self.scheduler = self.client.scheduler.address
 
     def submit(self, task: _Task) -> None:
         """Send a task to the workers that are ready, when there are some."""
@@ -201,17 +205,15 @@ class _Crew:
 
     def result(self) -> Any:
         """What the first task gives, however many workers it takes."""
-        from distributed import CancelledError, KilledWorker, wait
+        from distributed import CancelledError, KilledWorker
 
-        task, patience = self.tasks[0], _GATHER
+        task, patience = self.tasks[0], _PERIOD
         while True:
             self.look()
             for each in self.tasks:
                 if not each.workers & self.ready.keys():  # all have gone, and Dask must not choose others
                     self.submit(each)
             try:
-                with self.client.as_current():
-                    wait(task.future, timeout=_PERIOD)
                 result, error, refusal = task.future.result(timeout=patience)
             except (OSError, CancelledError, KilledWorker) as failure:
                 if task.future.status == "error" and not isinstance(failure, KilledWorker):
@@ -226,7 +228,7 @@ class _Crew:
                 if error is not None:
                     raise error
                 return result
-            self.exclude(*refusal)
+            self.admit(*refusal)
             task.workers, task.tries = frozenset(), 0
 
     def leave(self) -> None:
@@ -264,7 +266,8 @@ class _Crew:
             raise ClusterError(f"no worker is left at {self.scheduler}{excluded}")
 
     def admit(self, address: str, answer: Any) -> None:
-        """A worker is ready, excluded, or, where it has just gone, neither."""
+        """A worker is ready, or excluded and named once; neither where it has gone or is asked again."""
+        self.ready.pop(address, None)
         if isinstance(answer, tuple):
             name, gpu = answer
             others = [other for other, its in self.ready.items() if its == gpu]
@@ -272,38 +275,28 @@ class _Crew:
                 self.ready[address] = gpu
                 return
             answer = f"{name} is the GPU of worker {others[0]}; give it an LTCL_DEVICE, or share_gpu=True"
-        if not isinstance(answer, OSError):
-            self.exclude(address, str(answer))
-
-    def exclude(self, address: str, reason: str) -> None:
-        """Name a worker that takes no work, once; without a reason it is asked again."""
-        self.ready.pop(address, None)
-        if reason and address not in self.excluded:
+        if answer and not isinstance(answer, OSError) and address not in self.excluded:
             self.excluded.add(address)
-            logger.warning("worker %s takes no work: %s", address, " ".join(reason.split()))
+            logger.warning("worker %s takes no work: %s", address, " ".join(str(answer).split()))
 
 
 # What runs on workers
 
 
 def _ask() -> Callable[..., Any]:
-    """A local function is sent as code, and the other by it: a worker may have another ltcl, or none."""
+    """Keeps the function of a stream, if it can; sent as code: a worker may have another ltcl, or none."""
 
     def ask(version: str, token: str, function: bytes) -> Any:
         try:
             if (theirs := importlib.import_module("ltcl").__version__) != version:
                 return f"it has ltcl {theirs}, and the client {version}"
-            return importlib.import_module("ltcl.cluster").join(token, function)
+            module: Any = importlib.import_module("ltcl.cluster")
+            answer, module._functions[token] = module.describe(), function
+            return answer
         except Exception as error:  # noqa: BLE001 - whatever its ltcl or its driver raises
             return f"{type(error).__name__}: {error}"
 
     return ask
-
-
-def join(token: str, function: bytes) -> tuple[str, str | None]:
-    """Keep the function of a stream; answers like `describe`."""
-    answer, _functions[token] = describe(), function
-    return answer
 
 
 def describe() -> tuple[str, str | None]:

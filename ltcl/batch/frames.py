@@ -196,12 +196,17 @@ def compensate_frames(
         for name in (".pattern_*", ".frames-*.json", "appearance/.appearance_*"):  # of killed runs
             for file in folder.glob(name):
                 file.unlink(missing_ok=True)
-        with _worded(after=run.advice):
+        try:
             for done in run.solve(gain, loss):
                 if progress is not None:
                     progress("frames", done, run.count)
             if video is not None:
                 write_video(video, run.patterns(), fps or opened.fps or _USUAL_FPS)
+        except LtclError as error:
+            if manifest.records and not isinstance(error, OtherRun):
+                done = f"{len(manifest.records)} frame(s) are done and stay in {folder}"
+                error.args = (f"{error}; {done}, resume=True goes on from there",)
+            raise
     records = tuple(manifest.records[number] for number in sorted(run.done))
     error = (options.get("exact") or T).error
     seconds, film = time.perf_counter() - start, None if video is None else as_path(video)
@@ -241,11 +246,14 @@ class _Solver:
     def __call__(self, batch: tuple[list[int], np.ndarray, float]) -> tuple[Any, ...]:
         """Numbers, pictures and gain of a batch. Of "auto", every batch sees the same survey of S."""
         numbers, pictures, gain = batch
-        with _worded(f"frames {numbers[0]} to {numbers[-1]}: "):
+        try:
             if self.options.get("method", "auto") == "auto" and self.T.is_square and self.T.shape[0] > SMALL:
                 for S in self.T.systems:
                     survey(S)
             solved = compensate(self.T, pictures, gain=gain, **self.options)
+        except LtclError as error:
+            error.args = (f"frames {numbers[0]} to {numbers[-1]}: {error}",)
+            raise
         appearance = solved.appearance if self.appearance else solved.pattern  # not written then
         return solved.pattern, appearance, solved.frame_errors.tolist(), solved.frame_clipped.tolist()
 
@@ -285,12 +293,6 @@ class _Run:
         """Of the frames, as far as the source tells."""
         count = self.source.count
         return count if count is None or self.limit is None else min(count, self.limit)
-
-    def advice(self) -> str:
-        """How to go on after an error, if there is anything."""
-        count, folder = len(self.manifest.records), self.manifest.path.parent
-        done = f"; {count} frame(s) are done and stay in {folder}, resume=True goes on from there"
-        return done if count else ""
 
     def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
         """All batches; yields the number of frames done, before the first that is not and after each."""
@@ -422,14 +424,3 @@ def _stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
     if any(picture.ndim == 3 for picture in pictures):
         pictures = [np.stack([p] * 3, axis=-1) if p.ndim == 2 else p for p in pictures]
     return np.stack(pictures)
-
-
-@contextmanager
-def _worded(before: str = "", after: Callable[[], str] = str) -> Iterator[None]:
-    """Put words around the message of every refusal of the block but those of another run."""
-    try:
-        yield
-    except LtclError as error:
-        if not isinstance(error, OtherRun):
-            error.args = (f"{before}{error}{after()}",)
-        raise

@@ -138,8 +138,8 @@ def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
 def _file(scene: str, grid: tuple[int, int] | None) -> Any:
     """A record with a grid, or the arrays of a compressed transport."""
     if not Path(scene).suffix and not Path(scene).exists():
-        known = ", ".join(_SCENES)
-        raise InputError(f"SCENE is {scene!r}; it must be {known}, mitsuba:NAME or a transport file")
+        known = f"{', '.join(_SCENES)}, mitsuba:NAME or a transport file"
+        raise InputError(f"SCENE is {scene!r}; it must be {known}")
     record = formats.read(Path(scene))
     if record.grid is None and grid is None:
         raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
@@ -171,6 +171,7 @@ _TOML = """\
 
 
 _TAKE = "Folder with the camera's own files: copied, in the order of their numbers, to what is missing."
+_Take = Annotated[Path | None, options.file(_TAKE, metavar="FOLDER")]
 _Overhead = Annotated[float, option("Seconds of each photograph beyond its exposure.", min=0.0)]
 _ARRIVAL = "Next pattern when its photograph is in the folder of the acquisition."
 
@@ -207,7 +208,7 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     data = {"folder": folder, "rig": project.kind, "measured": is_measured}
     data |= {"asked_for": settings.strategy, "auto": best, "why": why}
     data |= {name: facts[name] for name in ("exposures", "noise", "light", "channels")}
-    data["plans"] = {name: dataclasses.asdict(each) for name, each in strategies.items()}
+    data["plans"] = strategies
     rows = []
     for name, each in strategies.items():
         counts = "{} x {}".format(*each.grid), each.patterns, each.photographs
@@ -232,10 +233,7 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
 @app.command()
 @command()
 def run(
-    context: Context,
-    folder: options.Acquisition,
-    take: Annotated[Path | None, options.file(_TAKE, metavar="FOLDER")] = None,
-    device: options.Device = None,
+    context: Context, folder: options.Acquisition, take: _Take = None, device: options.Device = None
 ) -> Answer:
     """Measure the set-up, then photograph all patterns; the transport comes to DIR/transport.zarr.
 
@@ -263,9 +261,7 @@ def run(
     try:
         with project.rig() as rig:
             if take is not None:
-                rig.take(
-                    [each for each in take.iterdir() if each.is_file() and not each.name.startswith(".")]
-                )
+                rig.take([each for each in take.glob("[!.]*") if each.is_file()])
             try:
                 with project.naming("acquire"):
                     acquire(rig, progress=context.progress, **settings)

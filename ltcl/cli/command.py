@@ -58,12 +58,11 @@ class Answer:
     exit_code: int = 0
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, also of an error.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, notes or warnings on stderr.")]
-Verbose = Annotated[bool, typer.Option("--verbose", help="Also say what is being done.")]
-
-
-def _shared(json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
+def _shared(
+    json: Annotated[bool, typer.Option("--json", help="One JSON document on stdout, or an error's.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, notes or warnings.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Also say what is being done.")] = False,
+) -> None:
     """The options of every command."""
 
 

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import glob
 import inspect
+import json
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,10 @@ from ltcl.transport import Transport
 _MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
 _RESULTS = ("gain", "clipped", "error", "transport_error", "gap")
 _SHEET = 12  # pictures on a contact sheet, at most
+_REASONS = {
+    "dark": "; where the pattern is at 1 a lower --gain helps, or --gain auto",
+    "bright": ", by bounces or the background; brighten its dark parts",
+}
 
 
 def _gain(text: str) -> float | str:
@@ -59,14 +63,17 @@ def _film_options(
 _FRAMES = tuple(inspect.signature(_film_options).parameters)
 _CLUSTER = "Of frames and scenes. local: processes here, one for each GPU; or a Dask scheduler's ADDRESS."
 _SCENES = "In the place of TRANSPORT: many, as 'scans/*.zarr'. DIR gets a folder each."
+_MPI = "Share each solve: 'mpiexec -n 2 ltcl compensate ... --mpi'."
+_PICTURES = argument("PICTURE...", "Pictures; or one folder or one video of frames.")
 
 
 def _cluster_options(
+    mpi: Annotated[bool, option(_MPI, "--mpi")] = False,
     cluster: Annotated[str | None, option(_CLUSTER, metavar="local|ADDRESS")] = None,
     workers: Annotated[int | None, option("Processes of --cluster local.", metavar="N", min=1)] = None,
     transports: Annotated[str | None, option(_SCENES, metavar="PATTERN")] = None,
 ) -> None:
-    """Of `ltcl.cluster` and `ltcl.batch.map`."""
+    """What shares the work."""
 
 
 @command(*options.TASK, _film_options, _cluster_options)
@@ -74,9 +81,7 @@ def compensate(
     context: Context,
     transport: options.Matrix,
     out: options.Out,
-    picture: Annotated[
-        list[Path] | None, argument("PICTURE...", "Pictures; or one folder or one video of frames.")
-    ] = None,
+    picture: Annotated[list[Path] | None, _PICTURES] = None,
     gain: Annotated[str | None, option(_GAIN, parser=_gain, metavar="FACTOR")] = None,
     loss: Annotated[float | None, option("Error that --gain auto may cost. Default: the least.")] = None,
     low: Annotated[float, option("Darkest light of the projector.")] = 0.0,
@@ -85,9 +90,6 @@ def compensate(
     background: Annotated[Path | None, file(_BACKGROUND)] = None,
     calibration: Annotated[Path | None, file("The store of 'ltcl acquire' behind TRANSPORT.")] = None,
     weights: Annotated[Path | None, file("Picture of how much the error at each pixel counts.")] = None,
-    mpi: Annotated[
-        bool, option("Share each solve: 'mpiexec -n 2 ltcl compensate ... --mpi'.", "--mpi")
-    ] = False,
 ) -> Answer:
     """Find the projector patterns that make a scene look like PICTURE.
 
@@ -105,18 +107,12 @@ def compensate(
     """
     from ltcl.acquisition import Setup
 
-    picture = picture or []
-    if context.options["transports"] is not None:
-        own = {"gain": gain, "loss": loss, "low": low, "high": high, "clamp": clamp, "background": background}
-        own |= {"calibration": calibration, "weights": weights}
-        return _compensate_scenes(context, [transport, *picture], out, own)
-    if not picture:
+    asked, paths = context.options, picture or []
+    if asked["transports"] is not None:
+        return _compensate_scenes(context, [transport, *paths], out)
+    if not paths:
         raise UsageError("Missing argument 'PICTURE...'.")
-    film = _film(picture, context.options)
-    if mpi and film is not None:
-        raise InputError(
-            f"--mpi is given, but {film} holds frames; it is for pictures, whose solves it shares"
-        )
+    film = _film(paths, asked)
     measured = calibration or (transport if options.is_measured(transport) else None)
     setup = Setup.of(measured) if measured else None
     T = options.load(context, transport)
@@ -124,8 +120,7 @@ def compensate(
         sizes = f"{setup.grid} and {setup.channels} channel(s); TRANSPORT has {T.grid} and {T.channels}"
         raise InputError(f"{calibration}: is of {sizes}")
     if setup is not None and not 0.0 <= low < high <= 1.0:
-        limits = "from 0 to 1, the black and the white of the projector that 'ltcl acquire' measured"
-        raise InputError(f"--low is {low:g} and --high is {high:g}; they must be {limits}")
+        raise InputError(f"--low is {low:g} and --high is {high:g}; a measured projector has 0 to 1")
     settings = options.solving(context, T, compensation.RTOL)
     settings |= {"loss": loss, "clamp": clamp, "bounds": (low, high)}
     settings["gain"] = gain if gain is not None else 1.0 if setup is None else "auto"
@@ -133,7 +128,7 @@ def compensate(
         settings[name] = path and pictures.read(context, path, T.camera_grid, "the camera", upright=False)
     text = options.heading(context, transport, T, rtol=settings["rtol"], gain=settings["gain"])
     text["pattern_png"] = "sRGB" if setup is None else "codes of the measured projector"
-    notes = [options.caveat("errors are", T, context.options["exact"])]
+    notes = [options.caveat("errors are", T, asked["exact"])]
     notes += ["masked pixels do not count in errors"] * bool(weights is None and T.masked.any())
     if setup is not None:
         notes.append("pattern .png holds the codes of the measured projector: show it pixel for pixel")
@@ -141,7 +136,7 @@ def compensate(
         settings["background"], text["options"]["background"] = setup.ambient, "measured"
         notes.append("the background is the ambient light that was measured")
     if film is None:
-        lines = _compensate_pictures(context, T, picture, out, text, settings, setup)
+        lines = _compensate_pictures(context, T, paths, out, text, settings, setup)
     else:
         lines = _compensate_frames(context, T, film, out, text, settings | {"codes": setup and setup.codes})
     return Answer({"folder": out, **text}, [*lines, *notes])
@@ -153,11 +148,12 @@ def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
 
     films = [path for path in paths if is_frames(path)]
     if films and len(paths) > 1:
-        text = f"holds frames, and there are {len(paths) - 1} more inputs; it must be the only one"
-        raise InputError(f"{films[0]}: {text}")
-    for name in (*_FRAMES, "cluster", "workers"):
-        if not films and asked[name] not in (None, False):
-            raise InputError(f"--{name} is given, but {paths[0]} is a picture; it is for a folder or a video")
+        raise InputError(f"{films[0]}: holds frames and must be alone; there are {len(paths) - 1} more")
+    refused = ("mpi", "transports") if films else (*_FRAMES, "cluster", "workers")
+    why = "holds frames; it is for pictures" if films else "is a picture; it is for a folder or a video"
+    for name in refused:
+        if asked[name] not in (None, False):
+            raise InputError(f"--{name} is given, but {paths[0]} {why}")
     return films[0] if films else None
 
 
@@ -183,7 +179,14 @@ def _compensate_pictures(
             facts |= {"too_dark": float(np.mean(lack > 0)), "too_bright": float(np.mean(lack < 0))}
             facts |= {key: report.solution(each) for key, each in solves.items()}
             text["pictures"].append({"file": str(path), **facts, **written})
-            rows.append(_row(path, facts, f"{name}_pattern.png"))
+            solved = facts["channels"] + [each for each in facts["limited"] if each not in facts["channels"]]
+            methods = ", ".join(dict.fromkeys(each["method"] for each in solved))
+            counts = methods, sum(each["products"] for each in solved), facts["gain"]
+            shares = percent(facts["clipped"]), percent(facts["error"])
+            rows.append((path.name, *counts, *shares, f"{name}_pattern.png"))
+            for what, reason in _REASONS.items():
+                if (share := facts[f"too_{what}"]) > _MANY:
+                    note(f"{path}: {100 * share:.0f} % of it stays too {what}{reason}")
         pictures.contact_sheet(sheet[:_SHEET]).save(folder / "compensate.png")
     columns = ("picture", "method", "products", "gain", "clipped", "error", "pattern")
     where = f"\npatterns, appearances and what is out of reach as .exr and .png in {out}"
@@ -193,15 +196,11 @@ def _compensate_pictures(
 def _write(
     stem: Path, desired: np.ndarray, result: Any, factor: float, high: float, setup: Any, noisy: bool
 ) -> tuple[dict[str, Any], list[Any]]:
-    """Files of one picture, and its row of the contact sheet.
-
-    Appearance / gain compares with the picture that was asked for, whatever the units of T. The .png of the
-    pattern has a pixel for each of the projector: codes of the measured one, else sRGB.
-    """
+    """Files of one picture, and its row of the contact sheet."""
     from ltcl import images
 
     folder, name, pattern = stem.parent, stem.name, result.pattern
-    units = {"pattern": 1 / high, "appearance": factor / result.gain}
+    units = {"pattern": 1 / high, "appearance": factor / result.gain}  # to compare with what was asked for
     seen = pictures.shades(result.appearance, units["appearance"])
     missing = pictures.mark(seen, result.out_of_reach * units["appearance"])
     panels = {
@@ -222,20 +221,6 @@ def _write(
     return written, list(panels.values())
 
 
-def _row(file: Path, facts: dict[str, Any], pattern: str) -> tuple:
-    """Of the table; notes say what would help."""
-    solves = facts["channels"] + [each for each in facts["limited"] if each not in facts["channels"]]
-    methods = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
-    products = sum(solve["products"] for solve in solves)
-    reasons = {"dark": "; where the pattern is at 1 a lower --gain helps, or --gain auto"}
-    reasons["bright"] = ", by bounces or the background; brighten its dark parts"
-    for name, reason in reasons.items():
-        if (share := facts[f"too_{name}"]) > _MANY:
-            note(f"{file}: {100 * share:.0f} % of it stays too {name}{reason}")
-    shares = percent(facts["clipped"]), percent(facts["error"])
-    return (file.name, methods, products, facts["gain"], *shares, pattern)
-
-
 def _compensate_frames(
     context: Context, T: Transport, film: Path, out: Path, text: Any, settings: Any
 ) -> list[Any]:
@@ -251,9 +236,9 @@ def _compensate_frames(
         count = f"{context.progress.done:.0f} frame(s) are done and stay in {out}"
         raise KeyboardInterrupt(f"interrupted; {count}; --resume goes on from there") from None
     worst, most, records = result.worst, result.most_clipped, result.records
-    names = ("video", "gain", "solved", "seconds", "frames_per_second", "transport_error")
-    text |= {"source": film, **{name: getattr(result, name) for name in names}, "worst": worst}
-    text |= {"most_clipped": most, "frames": [dataclasses.asdict(record) for record in records]}
+    names = ("video", "gain", "solved", "seconds", "frames_per_second", "transport_error", "worst")
+    text |= {"source": film, **{name: getattr(result, name) for name in names}}
+    text |= {"most_clipped": most, "frames": records}
     if most.clipped > _MANY:
         count = sum(record.clipped > _MANY for record in records)
         frame = f"frame {most.number} ({most.name}) most; a lower --gain helps where patterns are at 1"
@@ -275,44 +260,46 @@ def _cluster(context: Context) -> AbstractContextManager[Any]:
     return nullcontext() if cluster is None else connect(cluster, workers, device)
 
 
-def _compensate_scenes(context: Context, paths: list[Path], out: Path, own: dict[str, Any]) -> Answer:
-    """The pictures on each of many scenes, one task each; at the end those that failed are named."""
+def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer:
+    """The pictures on each of many scenes, one task each; those that failed are named at the end."""
     from ltcl.batch import map as of_each
 
     pattern = context.options["transports"]
-    scenes = {Path(name).stem: Path(name) for name in sorted(glob.glob(pattern))}
-    if len(scenes) < max(1, len(glob.glob(pattern))):
+    scenes = sorted(map(Path, glob.glob(pattern)))
+    if len({scene.stem for scene in scenes}) < max(1, len(scenes)):
         raise InputError(f"--transports is {pattern}: it must mean files or folders of different names")
-    here = dict.fromkeys(("transports", "workers", *(["device"] * bool(context.options["cluster"]))))
-    task = partial(_compensate_scene, context.options | here | {"cluster": None}, paths, own)
-    data, rows, failed = {"folder": out, "scenes": []}, [], None
+    here = dict.fromkeys(["cluster", "workers", *["device"] * (context.options["cluster"] is not None)])
+    _film(paths, context.options | here)  # is refused
+    reports, rows, failed = [], [], None
     with _cluster(context) as client:
         try:
-            results = of_each(task, scenes.values(), client=client, progress=context.progress)
+            task = partial(_compensate_scene, context.options | here | {"transports": None}, paths)
+            results = of_each(task, scenes, client=client, progress=context.progress)
         except BatchError as error:
             results, failed = error.results, error
-    for name, result in zip(scenes, results, strict=True):
-        if not isinstance(result, LtclError):
-            facts, files = result
-            with fill_folder(out / name) as folder:
-                for file, content in files.items():
-                    (folder / file).write_bytes(content)
-            data["scenes"].append(facts | {"folder": out / name})
-            worst = max(picture["error"] for picture in facts["pictures"])
-            rows.append((name, facts["pictures"][0]["gain"], percent(worst)))
+    for scene, files in zip(scenes, results, strict=True):
+        if not isinstance(files, LtclError):
+            with fill_folder(out / scene.stem) as folder:
+                for name, content in files.items():
+                    (folder / name).write_bytes(content)
+            reports.append({"folder": out / scene.stem, **json.loads(files["compensate.json"])})
+            pictures_of = reports[-1]["pictures"]
+            worst = max(picture["error"] for picture in pictures_of)
+            rows.append((scene.stem, pictures_of[0]["gain"], percent(worst)))
     if failed is not None:
         raise failed
-    return Answer(data, [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"])
+    lines = [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"]
+    return Answer({"folder": out, "scenes": reports}, lines)
 
 
-def _compensate_scene(
-    asked: dict[str, Any], paths: list[Path], own: dict[str, Any], scene: Path
-) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """What the command says of one scene, and the files that it writes."""
+def _compensate_scene(asked: dict[str, Any], paths: list[Path], scene: Path) -> dict[str, bytes]:
+    """The files of one scene."""
     with TemporaryDirectory() as folder, Progress(quiet=True) as progress:
-        context, place = Context("compensate", asked, progress), Path(folder) / "scene"
-        answer = inspect.unwrap(compensate)(context, transport=scene, picture=paths, out=place, **own)
-        return report.plain(answer.data), {file.name: file.read_bytes() for file in place.iterdir()}
+        call, place = inspect.unwrap(compensate), Path(folder) / "scene"
+        own = {name: asked.get(name) for name in [*inspect.signature(call).parameters][1:]}
+        own |= {"transport": scene, "picture": paths, "out": place}
+        call(Context("compensate", asked, progress), **own)
+        return {file.name: file.read_bytes() for file in place.iterdir()}
 
 
 @command(*options.TASK)
@@ -332,32 +319,31 @@ def separate(
     """
     T = options.load(context, transport)
     settings = options.solving(context, T, separation.RTOL, bounces + 1)
-    images = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
-    noisy, factor = options.shows_noise(T, settings), pictures.exposure(*images.values())
+    photographs = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
+    noisy, factor = options.shows_noise(T, settings), pictures.exposure(*photographs.values())
     text = options.heading(context, transport, T, rtol=settings["rtol"])
-    text["exposure"], text["pictures"], sheet, rows, errors = factor, [], [], [], []
+    text["exposure"], text["pictures"], sheet, rows = factor, [], [], []
     with pictures.fill(out, text) as folder:
-        for name, path in zip(context.progress.each(list(images)), picture, strict=True):
-            result = separation.separate(T, images[name], bounces, **settings)
+        for name, path in zip(context.progress.each(list(photographs)), picture, strict=True):
+            result = separation.separate(T, photographs[name], bounces, **settings)
             numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
             light = {"direct": result.direct, "indirect": result.indirect, **numbered, "rest": result.rest}
             solved = dict(zip(["direct", *numbered], result.solutions, strict=True))
             std = dict(zip(solved, [result.std.direct, *result.std.bounces], strict=True)) if noisy else {}
-            panels, deviations, parts = [pictures.panel(images[name], name, factor)], [], []
+            panels, deviations, parts = [pictures.panel(photographs[name], name, factor)], [], []
+            whole = float(photographs[name].mean(dtype=np.float64))
             for part, picture_of in light.items():
                 panels.append(pictures.panel(picture_of, part, factor))
-                place = f"{name}/{part}" if len(images) > 1 else part
-                facts: dict[str, Any] = {
-                    "part": part,
-                    **pictures.write(folder, place, picture_of, panels[-1]),
-                }
-                facts["share"], facts["lowest"] = _share(picture_of, images[name]), float(picture_of.min())
+                place = f"{name}/{part}" if len(photographs) > 1 else part
+                files = pictures.write(folder, place, picture_of, panels[-1])
+                facts: dict[str, Any] = {"part": part, **files}
+                mean, facts["lowest"] = float(picture_of.mean(dtype=np.float64)), float(picture_of.min())
+                facts["share"] = mean / whole if whole else None
                 facts["channels"] = solves = report.solution(solved[part]) if part in solved else []
                 if part in std:
                     facts["std"], shown = pictures.deviation(folder, place, std[part], factor)
                     deviations.append(shown)
                 parts.append(facts)
-                errors += [solve["error"] for solve in solves if solve["error"] is not None]
                 residual = max((each["residual"] for each in solves if each["error"] is None), default=None)
                 products = sum(each["products"] for each in solves) or None
                 rows.append((path.name, part, percent(facts["share"], 4), products, residual))
@@ -367,17 +353,12 @@ def separate(
         pictures.contact_sheet([row for row in sheet if row]).save(folder / "separate.png")
     lines: list[Any] = [table(("picture", "part", "share of light", "products", "residual"), rows)]
     lines.append(f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}")
-    if errors:
+    solves = [each for entry in text["pictures"] for part in entry["parts"] for each in part["channels"]]
+    if errors := [each["error"] for each in solves if each["error"] is not None]:
         worst = 100 * float(checks.upwards(max(errors)))
         lines.append(f"the relative error of each part by the inverse is at most {worst:.2g} %")
     lines.append(options.caveat("all of this is", T, context.options["exact"]))
     return Answer({"folder": out, **text}, lines)
-
-
-def _share(light: np.ndarray, picture: np.ndarray) -> float | None:
-    """Of the light of a picture, over pixels and three colours."""
-    sums = [float(np.sum(each, dtype=np.float64)) * (1 if each.ndim == 3 else 3) for each in (light, picture)]
-    return sums[0] / sums[1] if sums[1] else None
 
 
 @command(options.file_options, options.picture_options)

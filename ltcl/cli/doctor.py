@@ -102,9 +102,8 @@ def _cache_folder() -> str:
 def _drivers() -> str:
     """Every OpenCL driver compiles and runs a kernel in a child process of its own."""
     vendors = Path(os.environ.get("OCL_ICD_VENDORS") or "/etc/OpenCL/vendors")
-    bundled = importlib.metadata.distribution("pyopencl").locate_file("pyopencl/.libs")  # of its wheel
-    folders = (vendors, Path(str(bundled)))
-    files = [vendors] if vendors.is_file() else sorted({f for place in folders for f in place.glob("*.icd")})
+    bundled = Path(str(importlib.metadata.distribution("pyopencl").locate_file("pyopencl/.libs")))
+    files = [vendors] if vendors.is_file() else sorted({*vendors.glob("*.icd"), *bundled.glob("*.icd")})
     paths, crashing = os.pathsep.join(filter(None, sys.path)), []
     for file in files:  # a Python error is no crash
         environment = {**os.environ, "PYTHONPATH": paths, "OCL_ICD_VENDORS": str(file)}

@@ -217,7 +217,6 @@ def _rtol(text: str) -> float | str:
 
 
 _BUDGET = "Bytes that the numbers of R may take, such as 50MB."
-_Norm = Annotated[Literal["pictures", "worst"], option("Whose error: of pictures, or any light.")]
 _BASIS = "pixels or a wavelet (haar, db2, ...; compress: 'db2 rows', too); more than once: the best of them."
 _RTOL = "Relative error that solutions may have; compress: or noise, which keeps what stands out of it."
 
@@ -235,22 +234,20 @@ def compress(
     file: options.Matrix,
     out: Annotated[Path, options.out("The compressed transport: .npz or .zarr.")],
     budget: Annotated[int | None, option(_BUDGET, parser=_bytes, metavar="SIZE")] = None,
-    norm: _Norm = "pictures",
+    norm: Annotated[Literal["pictures", "worst"], option("Whose error: of pictures, or any.")] = "pictures",
 ) -> Answer:
     """Write R in a basis where it is sparse; basis, threshold and precision are chosen by measurement."""
     rtol, basis = context.options["rtol"], context.options["basis"] or None
 
     def make(T: Transport, progress: Any) -> Transport:
         if T.is_compressed and T.error:
-            error = f"with an error of {T.error:.2g}"
-            raise InputError(f"{file}: is compressed already, {error}; compress what it came from")
+            raise InputError(f"{file}: is compressed already, to {T.error:.2g}; compress what it came from")
         return compression.compress(T, rtol, budget, norm=norm, basis=basis, progress=progress)
 
     _, C, data = _transform(context, file, out, make)
     facts: Any = C.compression
-    data |= {"bytes": facts.uncompressed, "bytes_compressed": C.nbytes}
-    data |= {"bytes_on_disk": options.on_disk(out), "solution_error": C.error}
-    data |= {"error_bound": C.error_bound, "compression": facts}
+    data |= {"bytes": facts.uncompressed, "bytes_compressed": C.nbytes, "bytes_on_disk": options.on_disk(out)}
+    data |= {"solution_error": C.error, "error_bound": C.error_bound, "compression": facts}
     before, after, disk = (checks.size(data[f"bytes{name}"]) for name in ("", "_compressed", "_on_disk"))
     columns = ("channel", "basis", "core", "numbers a row", "bytes", "error of R, 2-norm")
     rows = []
@@ -294,10 +291,7 @@ def invert(
 def _transform(
     context: Context, file: Path, out: Path, make: Callable[..., Any], is_inverse: bool = False
 ) -> tuple[Transport, Any, dict[str, Any]]:
-    """T, what is made of it and written to `out`, and the beginning of the report.
-
-    The place is checked before a long computation.
-    """
+    """T, what is made of it and written to `out`, and the beginning of the report."""
     formats.find(out, inverse=is_inverse)
     if not is_inverse and out.suffix.lower() not in (".npz", ".zarr"):
         raise InputError(f"--out is {out}; what {context.name} makes must be a .npz or a .zarr")
@@ -322,8 +316,7 @@ def convert(
     context.progress(f"reading {source}")
     record = formats.read(source, variable=context.options["variable"])
     with about(source):
-        pixels = zip(("grid", "camera_grid"), record.shape[::-1], strict=True)
-        sizes = {name: checks.grid(name, size, n) for name, n in pixels if (size := context.options[name])}
+        sizes = {name: size for name in ("grid", "camera_grid") if (size := context.options[name])}
         if isinstance(record, Record):
             record = dataclasses.replace(record, **sizes)
         elif any(size != record.grid for size in sizes.values()):

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The program `ltcl`: its commands, and wrong usage."""
+"""The program `ltcl`: its commands, wrong usage, and a command on every rank of MPI."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import sys
+import tempfile
+import time
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Annotated
@@ -11,7 +15,6 @@ from typing import Annotated
 import typer
 
 from ltcl import __version__
-from ltcl.cli import ranks
 from ltcl.cli.acquire import app as acquire
 from ltcl.cli.acquire import show, simulate
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
@@ -20,6 +23,7 @@ from ltcl.cli.doctor import demo, devices, doctor
 from ltcl.cli.files import analyze, compress, convert, denoise, info, invert
 from ltcl.errors import InputError, LtclError
 
+_PATIENCE = 5.0  # seconds within which ranks that fail alike do so
 app = typer.Typer(
     name="ltcl",
     help="Inverse light transport on any OpenCL device. Start with: ltcl demo",
@@ -48,10 +52,7 @@ def _options(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program with `arguments`, by default those of the command line; returns its exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        return ranks.on_every_rank(_run, words) if "--mpi" in words else _run(words)
-    except InputError as error:  # there is no MPI
-        return fail(error, "--json" in words)["exit_code"]
+    return _run_on_every_rank(words) if "--mpi" in words else _run(words)
 
 
 def _run(words: list[str]) -> int:
@@ -70,6 +71,28 @@ def _run(words: list[str]) -> int:
         return fail(error, "--json" in words)["exit_code"]
     except SystemExit as end:  # of a pipe that was closed
         return end.code if isinstance(end.code, int) else 1
+
+
+def _run_on_every_rank(words: list[str]) -> int:
+    """All do the same, and the first alone writes and prints; one that fails alone says why and ends all."""
+    try:
+        from mpi4py import MPI
+    except (ImportError, RuntimeError) as error:  # the latter where it finds no library
+        problem = InputError(f"--mpi needs mpi4py and an MPI, pip install mpi4py mpich: {error}")
+        return fail(problem, "--json" in words)["exit_code"]
+    ends, said, out, err = MPI.COMM_WORLD.Dup(), io.StringIO(), sys.stdout, sys.stderr
+    with tempfile.TemporaryDirectory() as folder:
+        if ends.rank > 0:
+            words, out, err = [*words, "--out", f"{folder}/out"], io.StringIO(), said  # the last --out counts
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            code = _run(words)
+    all_ended, limit = ends.Ibarrier(), time.monotonic() + _PATIENCE
+    while not all_ended.Test():
+        if code and time.monotonic() > limit:
+            sys.stderr.write(said.getvalue())
+            ends.Abort(code)
+        time.sleep(0.01)
+    return code
 
 
 if __name__ == "__main__":

@@ -216,9 +216,8 @@ def _load_exact(path: Path, T: Transport, variable: str | None) -> Transport:
     picture = T @ pattern
     error = float(np.linalg.norm(picture - exact @ pattern) / np.linalg.norm(picture))
     if not error <= T.error + _ROUNDING:
-        bound = f"differ by {error:.2g}, more than {checks.upwards(T.error + _ROUNDING)}"
-        text = f"is not what TRANSPORT was compressed from: pictures under a random pattern {bound}"
-        raise InputError(f"{path}: {text}")
+        text = f"pictures differ by {error:.2g}, more than {checks.upwards(T.error + _ROUNDING)}"
+        raise InputError(f"{path}: is not what TRANSPORT was compressed from: {text}")
     return exact
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from ltcl import report
 from ltcl.cli.command import Context
@@ -29,10 +30,7 @@ _DIM = 0.25  # of white: what is darker is shown a second time on a contact shee
 
 @contextmanager
 def fill(out: Path, text: dict[str, Any]) -> Iterator[Path]:
-    """Fill `out` as `fill_folder` does, with the report `text`, named after its command, of all files.
-
-    Other files in it stay. A second run that writes there is refused at once.
-    """
+    """`fill_folder`, with a report `text`, named after its command, of all files; one run at a time."""
     from ltcl.batch.manifest import locked
 
     with locked(out), fill_folder(out) as folder:
@@ -66,13 +64,13 @@ def read(
 
 def read_all(context: Context, paths: Sequence[Path], *place: Any, **settings: Any) -> dict[str, np.ndarray]:
     """All pictures, as `read` does, by names for their results: stems, longer where an earlier one has it."""
-    images: dict[str, np.ndarray] = {}
+    named: dict[str, np.ndarray] = {}
     for path in paths:
         name = path.stem
-        while name.lower() in map(str.lower, images):  # some file systems ignore case
+        while name.lower() in map(str.lower, named):  # some file systems ignore case
             name += "_2"
-        images[name] = read(context, path, *place, **settings)
-    return images
+        named[name] = read(context, path, *place, **settings)
+    return named
 
 
 def exposure(*pictures: np.ndarray) -> float:
@@ -114,8 +112,6 @@ def mark(codes: np.ndarray, missing: np.ndarray) -> np.ndarray:
 
 def panel(picture: np.ndarray, label: str, factor: float | None = None) -> Any:
     """A linear picture times `factor`, or sRGB values, as one of Pillow: enlarged, with its label above."""
-    from PIL import Image, ImageDraw, ImageFont
-
     codes = picture if factor is None else shades(picture, factor)
     side = -(-_WIDTH // codes.shape[1])
     large = np.rint(255 * codes).astype(np.uint8).repeat(side, axis=0).repeat(side, axis=1)
@@ -134,8 +130,6 @@ def deviation(folder: Path, name: str, std: np.ndarray, factor: float) -> tuple[
 
 def contact_sheet(rows: Sequence[Sequence[Any]]) -> Any:
     """Panels in rows, as one picture."""
-    from PIL import Image
-
     widths = [sum(each.width + _MARGIN for each in row) for row in rows]
     heights = [max(each.height for each in row) + _MARGIN for row in rows]
     sheet = Image.new("RGB", (max(widths) + _MARGIN, sum(heights) + _MARGIN), _PAPER)
