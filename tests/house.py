@@ -29,8 +29,8 @@ _TASKS = [f"ltcl/{name}" for name in ("compensation", "separation.py", "relighti
 _NOISE = ["ltcl/noise", *(f"ltcl/{name}.py" for name in ("uncertainty", "denoising", "verdict"))]
 # Lines at most, by the folders and modules that they are of: the Python of the core, and what belongs to it.
 BUDGETS: dict[str, tuple[int, list[str]]] = {
-    "device": (920, ["ltcl/device"]),
-    "operators": (2600, ["ltcl/operators"]),
+    "device": (900, ["ltcl/device"]),
+    "operators": (2599, ["ltcl/operators"]),
     "solvers": (2800, ["ltcl/solvers"]),
     "theory and diagnostics": (1100, ["ltcl/theory", "ltcl/diagnostics.py"]),
     "compression": (1700, ["ltcl/compression"]),
@@ -44,8 +44,8 @@ _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1225, "images": 500, "batch": 577, "cli": 2009, "scenes": 2710}
-_PAST = ("cluster", "operators/parts", "operators/distributed", "batch/scenes", "cli/ranks")
+_OTHERS = {"acquisition": 6310, "store": 1200, "images": 500, "batch": 577, "cli": 2000, "scenes": 2710}
+_PAST = ("cluster", "operators/parts", "operators/distributed", "batch/scenes")
 _TESTS_PAST = (
     "batch/test_cluster",
     "compression/test_client",
@@ -70,7 +70,7 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     # Clusters, ranks, several devices and disks, as far as they have files of their own; about 300 lines more
     # are in other parts, mostly batch and cli: 900 are to be enough for all.
-    "past one machine": (850, [f"ltcl/{name}.py" for name in _PAST]),
+    "past one machine": (825, [f"ltcl/{name}.py" for name in _PAST]),
     "tests past one machine": (1100, [f"tests/{name}.py" for name in _TESTS_PAST]),
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),
     "tests of these": (

@@ -101,12 +101,11 @@ class Device:
         """An uninitialised array, in microseconds; refuses what the device cannot hold with both sizes."""
         shape, dtype = (shape,) if isinstance(shape, int) else tuple(shape), np.dtype(dtype)
         nbytes = math.prod(map(int, shape)) * dtype.itemsize
-        if nbytes + SPARE_BYTES > self.max_allocation:
+        if (size := nbytes + SPARE_BYTES) > self.max_allocation:
             raise MemoryLimitError(
                 f"a buffer of {checks.size(nbytes)} for an array {shape} is beyond the largest that "
                 f"{self.name} allows, {checks.size(self.max_allocation)}"
             )
-        size = nbytes + SPARE_BYTES
         with kernels.translated(f"allocating {checks.size(nbytes)} on {self.name}"), self._lock:
             if size > self._largest_pooled:  # a new one, for which unused blocks of the pool make room
                 self.allocations += 1

@@ -74,18 +74,10 @@ def list_devices() -> list[Description]:
             with contextlib.suppress(cl.Error):  # DEVICE_NOT_FOUND
                 for d, handle in enumerate(platform.get_devices()):
                     kind = next((name for flag, name in kinds.items() if handle.type & flag), "accelerator")
-                    devices.append(
-                        Description(
-                            index=f"{p}:{d}",
-                            name=handle.name.strip(),
-                            kind="simulator" if "oclgrind" in brand.lower() else kind,
-                            driver=f"{brand} {handle.driver_version.strip()}",
-                            compute_units=handle.max_compute_units,
-                            memory=handle.global_mem_size,
-                            max_allocation=handle.max_mem_alloc_size,
-                            handle=handle,
-                        )
-                    )
+                    kind = "simulator" if "oclgrind" in brand.lower() else kind
+                    driver = f"{brand} {handle.driver_version.strip()}"
+                    sizes = handle.max_compute_units, handle.global_mem_size, handle.max_mem_alloc_size
+                    devices.append(Description(f"{p}:{d}", handle.name.strip(), kind, driver, *sizes, handle))
     return sorted(devices, key=lambda device: device.rank)
 
 
@@ -115,10 +107,9 @@ def open_device(select: str | Device | None = None) -> Device:
         return select
     if not isinstance(select, str | None):
         raise InputTypeError(f"device is {select!r}; it must be a Device, a name or an index like '0:1'")
-    devices, select = list_devices(), select or os.environ.get("LTCL_DEVICE")
-    if every := (select or "").strip().lower() == "all":
-        select = None
-    description, others = choose(devices, select), []
+    devices, select = list_devices(), select or os.environ.get("LTCL_DEVICE") or ""
+    every = select.strip().lower() == "all"
+    description, others = choose(devices, "" if every else select), []
     if every:
         platform = description.index.partition(":")[0] + ":"
         others = [open_device(d.index) for d in devices if d.index.startswith(platform) and d != description]

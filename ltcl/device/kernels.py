@@ -40,7 +40,7 @@ _ADVICE = {
     "DEVICE_NOT_AVAILABLE": "the device is in use by another process or was unplugged; try LTCL_DEVICE=cpu",
     "COMPILER_NOT_AVAILABLE": "this driver cannot compile kernels; choose another device (ltcl devices)",
 }
-_process: list[int] = []  # the first one that asked OpenCL
+_process: dict[str, int] = {}  # the first one that asked OpenCL
 
 
 def folder() -> Path:
@@ -62,28 +62,24 @@ def _expand(relative: str, root: Path, seen: set[str]) -> str:
     seen.add(relative)
     lines = [f'#line 1 "{relative}"']
     for number, line in enumerate((root / relative).read_text(encoding="utf-8").splitlines(), 1):
-        if not (include := _INCLUDE.match(line)):
-            lines.append(line)
-            continue
-        if include[1] not in seen:
+        include = _INCLUDE.match(line)
+        if include and include[1] not in seen:
             lines.append(_expand(include[1], root, seen))
-        lines.append(f'#line {number + 1} "{relative}"')
+        lines.append(f'#line {number + 1} "{relative}"' if include else line)
     return "\n".join(lines)
 
 
 def build(device: Device, file: str, defines: dict[str, Any]) -> Any:
     """`kernels/<file>.cl` as a pyopencl program for `device`; DeviceError with the compiler's own words."""
     options = _OPTIONS + [f"-D{name}={value}" for name, value in sorted(defines.items())]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", device.cl.CompilerWarning)  # Intel's compiler reports every success
+    # Intel's compiler reports every success.
+    with warnings.catch_warnings(action="ignore", category=device.cl.CompilerWarning):
         try:
             return device.cl.Program(device.context, load(file)).build(options)
         except device.cl.Error as error:
             log_text = str(error).split("(options:")[0].strip()  # pyopencl adds options and source
-            raise DeviceError(
-                f"kernels/{file}.cl does not compile on {device.name} ({device.driver}) with "
-                f"{' '.join(options)}:\n{log_text}"
-            ) from error
+            where = f"{device.name} ({device.driver}) with {' '.join(options)}"
+            raise DeviceError(f"kernels/{file}.cl does not compile on {where}:\n{log_text}") from error
 
 
 class Kernel:
@@ -178,9 +174,7 @@ class Launch:
 
 def refuse_forked() -> None:
     """Raise in a process forked from one that had used OpenCL: drivers hang there."""
-    if not _process:
-        _process.append(os.getpid())
-    if os.getpid() != _process[0]:
+    if _process.setdefault("first", os.getpid()) != os.getpid():
         raise DeviceError(
             "this process was forked from one that had used OpenCL, whose drivers do not survive that; start "
             'workers by multiprocessing.get_context("spawn") or "forkserver", and open the device in each'

@@ -115,8 +115,7 @@ def _time(run: Callable[[], object], wait: Callable[[], object]) -> float:
 
 def folder() -> Path:
     """The cache folder; it may not exist yet."""
-    named = os.environ.get("LTCL_CACHE")
-    return Path(named) if named else Path(platformdirs.user_cache_dir("ltcl", appauthor=False))
+    return Path(os.environ.get("LTCL_CACHE") or platformdirs.user_cache_dir("ltcl", appauthor=False))
 
 
 def make_folder() -> Path:

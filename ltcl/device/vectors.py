@@ -52,9 +52,7 @@ class Array:
         try:
             host = np.empty(self.shape, self.dtype)
         except MemoryError as error:
-            raise MemoryLimitError(
-                f"the host has no room for {checks.size(self.nbytes)} to copy to"
-            ) from error
+            raise MemoryLimitError(f"the host has no room to copy {checks.size(self.nbytes)}") from error
         if host.size:
             self.device.copy(host, self.buffer)
         return host

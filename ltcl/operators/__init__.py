@@ -13,7 +13,7 @@ from ltcl.operators.csr import CSR, RowBlocks
 from ltcl.operators.dense import Dense
 from ltcl.operators.distributed import Distributed, rank_device
 from ltcl.operators.interreflection import interreflections
-from ltcl.operators.parts import MultiDevice, Parts, Streamed, on_devices, stays_on_disk, stored_rows
+from ltcl.operators.parts import MultiDevice, Parts, Streamed, on_devices, stays_on_disk
 from ltcl.operators.stored import basis
 from ltcl.operators.tiles import Tiles, smallest
 from ltcl.operators.wavelets import Wavelet
@@ -54,8 +54,6 @@ def as_operator(matrix: Any, device: Device | None = None) -> Operator:
     device = device if device is not None else open_device()
     if device.agreed(stays_on_disk([matrix], device)):
         return Streamed(device, matrix)
-    if hasattr(matrix, "row_blocks"):
-        return stored_rows(device, matrix)
-    if hasattr(matrix, "matvec"):
+    if hasattr(matrix, "matvec") and not hasattr(matrix, "row_blocks"):
         return Host(device, matrix)
     return on_devices(device, matrix)

@@ -94,6 +94,10 @@ class CSR(RowOperator):
         self.nnz: int = matrix.nnz
         self._host = matrix
 
+    def upload(self, rows: Any, first: int) -> list[Slab]:
+        """Slabs of rows from `first` on, with a pattern of their own."""
+        return Pattern.of(self.device, rows).with_values(rows.data, first)
+
     @property
     def data(self) -> np.ndarray:
         """The values on the host, (nnz,)."""
@@ -156,7 +160,7 @@ class RowBlocks(CSR):
         self._blocks = blocks
         self.slabs, pointers = [], [np.zeros(1, np.int64)]
         for first, block in self.blocks():
-            self.slabs += Pattern.of(device, block).with_values(block.data, first)
+            self.slabs += self.upload(block, first)
             pointers.append(block.indptr[1:] + pointers[-1][-1])
         cuts = [(slab.first, slab.first + slab.rows) for slab in self.slabs]
         places = [slab.arguments[:2] for slab in self.slabs]

@@ -47,7 +47,13 @@ class Dense(RowOperator):
         device.require(4 * host.size, f"a dense matrix {host.shape}")
         self.defines = {"STRIP": 256 if device.is_cpu else 1}
         self._ones: Array | None = None
-        self.slabs = slabs(device, host)
+        self.slabs = self.upload(host)
+
+    def upload(self, host: np.ndarray, first: int = 0) -> list[Slab]:
+        """Slabs of rows from `first` on."""
+        rows, width = host.shape
+        cuts = cut(self.device, np.full(rows, 4 * max(width, 1)), "the dense matrix")
+        return [Slab(first + a, b - a, (width, self.device.upload(host[a:b]))) for a, b in cuts]
 
     def blocks(self) -> Iterator[tuple[int, np.ndarray]]:
         """Slab by slab, as they lie on the device."""
@@ -86,10 +92,3 @@ class Dense(RowOperator):
                 kernel = self.kernel("dense_rmatvec", 1, 1)
                 kernel((out.size, 1), (64, 1), *place, self._ones, out, out, out.size, sums)
             epilogue = Epilogue(a, 1.0, out)  # the following slabs add to what the first has written
-
-
-def slabs(device: Device, host: np.ndarray, first: int = 0) -> list[Slab]:
-    """Rows of a matrix from `first` on, uploaded."""
-    rows, width = host.shape
-    cuts = cut(device, np.full(rows, 4 * max(width, 1)), "the dense matrix")
-    return [Slab(first + a, b - a, (width, device.upload(host[a:b]))) for a, b in cuts]

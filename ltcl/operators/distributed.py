@@ -22,16 +22,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 
-from ltcl import errors
 from ltcl.device import Array, Device, list_devices, open_device
 from ltcl.device.discovery import choose
 from ltcl.errors import DeviceError, InputError, LtclError
 from ltcl.operators.base import PLAIN, Norms, Operator
-from ltcl.operators.csr import CSR
-from ltcl.operators.dense import Dense
-from ltcl.operators.parts import Parts
+from ltcl.operators.parts import Parts, on_device
 from ltcl.operators.rows import RowOperator
 
 _opened: weakref.WeakValueDictionary[tuple[int, Device], RankDevice] = weakref.WeakValueDictionary()
@@ -94,13 +90,11 @@ def together(comm: Any, make: Callable[[], Any]) -> Any:
     try:
         result = make()
     except (LtclError, MemoryError, OSError) as problem:
-        kind = type(problem).__name__ if isinstance(problem, LtclError) else "LtclError"
+        kind = type(problem) if isinstance(problem, LtclError) else LtclError
         error = kind, str(problem) or "the host has no memory left"
-    failures = comm.allgather(error)
-    for rank, failure in enumerate(failures):
-        if failure is not None:
-            kind, text = failure
-            raise getattr(errors, kind)(text if len({*failures}) == 1 else f"rank {rank}: {text}")
+    errors = comm.allgather(error)
+    for rank, (kind, text) in ((rank, error) for rank, error in enumerate(errors) if error):
+        raise kind(text if len({*errors}) == 1 else f"rank {rank}: {text}")
     return result
 
 
@@ -129,15 +123,13 @@ class Distributed(Parts):
     """
 
     where = "on several ranks"
-    exact: Any = None
 
     def __init__(self, comm: Any, rows: Any, device: Device | str | None = None) -> None:
         shapes = comm.allgather(np.shape(rows))
         if any(len(shape) != 2 or 0 in shape or shape[1] != shapes[0][1] for shape in shapes):
             raise InputError(f"rows have the shapes {shapes}, by rank; they must be (m, N), with m above 0")
         device = rank_device(comm, rows.device if isinstance(rows, Operator) else device)
-        kind = CSR if scipy.sparse.issparse(rows) else Dense
-        make = lambda: rows if isinstance(rows, Operator) else kind(device, rows)  # noqa: E731
+        make = lambda: rows if isinstance(rows, Operator) else on_device(device, rows)  # noqa: E731
         self.comm, self.rows = comm, together(comm, make)
         self.counts = [count for count, _ in shapes]
         self.first = sum(self.counts[: comm.rank])

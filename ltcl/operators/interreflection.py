@@ -16,8 +16,7 @@ from ltcl.errors import InputError
 from ltcl.operators.base import Operator
 from ltcl.operators.composed import Host, IdentityPlus, ScaledColumns, spread
 from ltcl.operators.csr import CSR, Pattern
-from ltcl.operators.dense import Dense
-from ltcl.operators.parts import Streamed, on_devices, over_devices, row_blocks, stays_on_disk, stored_rows
+from ltcl.operators.parts import Streamed, on_devices, row_blocks, stays_on_disk
 
 _DIGITS = 16.0  # times the largest entry of a column of T: up to such an F, S keeps 6 digits of the column
 
@@ -93,14 +92,13 @@ def _interreflection(matrix: Any, F: np.ndarray, device: Device, pattern: Patter
     # Divided, not multiplied by 1 / F: x / x is 1 to the bit, so that F = diag(T) leaves R no diagonal.
     divisor = np.where(lit, F, np.inf)
     if isinstance(matrix, np.ndarray):
-        make = lambda on, own: Dense(on, _dense_R(matrix[own], divisor, lit, own.start))  # noqa: E731
-        R: Any = over_devices(device, len(F), make)
+        R = on_devices(device, matrix, lambda first, rows: _dense_R(rows, divisor, lit, first))
         R.exact = matrix, divisor, lit
         return R
     if isinstance(matrix, scipy.sparse.csr_array):
-        return on_devices(device, _sparse_R(matrix, divisor, lit), pattern)
+        return on_devices(device, _sparse_R(matrix, divisor, lit), pattern=pattern)
     if hasattr(matrix, "row_blocks"):
-        return stored_rows(device, matrix, lambda k, block: _sparse_R(block, divisor, lit, k), more=len(F))
+        return on_devices(device, matrix, lambda k, rows: _sparse_R(rows, divisor, lit, k), more=len(F))
     operator = matrix if isinstance(matrix, Operator) else Host(device, matrix)
     return ScaledColumns(operator, 1.0 / divisor, 1.0 if lit.all() else lit)
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,10 +25,9 @@ from ltcl.errors import FileError, MemoryLimitError
 from ltcl.files import read_ahead
 from ltcl.operators.base import Epilogue, Operator
 from ltcl.operators.csr import CSR, Pattern, RowBlocks
-from ltcl.operators.dense import Dense, slabs
+from ltcl.operators.dense import Dense
 from ltcl.operators.rows import ReadableRows, RowOperator
 
-logger = logging.getLogger(__name__)
 _READ = 1 << 22  # bytes of rows in one reading: what caches hold, while a disk is busy for long
 _TRIAL = 4096  # rows and columns of the product by which devices are compared: beyond the caches
 
@@ -40,15 +38,13 @@ class Parts(Operator):
     Methods that read rows on one device refuse it and say `where` the rows are.
     """
 
-    where = "elsewhere"
-
-    def _gathered(self, x: Array, transpose: bool) -> np.ndarray:
-        """A x or A^T x, on the host, in the shape of the product."""
-        raise NotImplementedError
+    where: str
+    exact: tuple[Any, ...] | None = None  # as that of `Dense`
+    _gathered: Callable[[Array, bool], np.ndarray]  # A x or A^T x, on the host
 
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
         a, b, y, c = epilogue
-        product = out.like().set(self._gathered(x, transpose))
+        product = out.like().set(self._gathered(x, transpose).reshape(out.shape))
         vectors.axpby(a, product, b, product if y is None or not b else y, out)
         if c:
             vectors.axpy(c, x, out)
@@ -76,15 +72,11 @@ class Streamed(Parts, ReadableRows):
     where = "on a disk"
 
     def __init__(self, device: Device, matrix: Any) -> None:
-        super().__init__(device, matrix.shape)
-        none, self.matrix = (0, matrix.shape[1]), matrix
-        dense = isinstance(matrix, np.ndarray)
-        self._slab = Dense(device, np.zeros(none)) if dense else CSR(device, scipy.sparse.csr_array(none))
-        self._slab.shape = matrix.shape  # of which it has those rows that are on the device
-
-    def arrays(self) -> set[Array]:
-        """Of the slab that was used last."""
-        return self._slab.arrays()
+        none = matrix[:0] if isinstance(matrix, np.ndarray) else scipy.sparse.csr_array((0, matrix.shape[1]))
+        slab = on_device(device, none)
+        super().__init__(device, matrix.shape, slab)
+        self.matrix, self._slab = matrix, slab
+        slab.shape = matrix.shape  # of which it has those rows that are on the device
 
     def bytes_read(self) -> int:
         """Bytes of the matrix on the disk."""
@@ -92,33 +84,25 @@ class Streamed(Parts, ReadableRows):
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """(first row, rows) in float64, read once."""
-        for first, rows in row_blocks(self.matrix):
-            yield first, rows.astype(np.float64)
+        return ((first, rows.astype(np.float64)) for first, rows in row_blocks(self.matrix))
 
     def product(self, x: np.ndarray, transpose: bool = False) -> np.ndarray:
         """A x or A^T x on the host, of x (N, k) float64, with the numbers of the file."""
         if not transpose:
             return np.concatenate([rows @ x for _, rows in self.blocks()])
-        total = np.zeros((self.shape[1], x.shape[1]))
-        for first, rows in self.blocks():
-            total += rows.T @ x[first : first + rows.shape[0]]
-        return total
+        products = (rows.T @ x[first : first + rows.shape[0]] for first, rows in self.blocks())
+        return sum(products, np.zeros((self.shape[1], x.shape[1])))
 
     def _gathered(self, x: Array, transpose: bool) -> np.ndarray:
-        shape = (self.shape[int(transpose)], *x.shape[1:])
-        return self.product(x.get().reshape(x.shape[0], -1).astype(np.float64), transpose).reshape(shape)
+        return self.product(x.get().reshape(x.shape[0], -1).astype(np.float64), transpose)
 
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        dense = isinstance(self._slab, Dense)
-        if transpose and not dense:  # sparse rows would have to be sorted by columns first
+        if transpose and isinstance(self._slab, CSR):  # rows would have to be sorted by columns first
             super()._product(x, out, epilogue, True)
             return
         for first, rows in row_blocks(self.matrix):
             self._slab.slabs = []  # makes room
-            if dense:
-                self._slab.slabs = slabs(self.device, rows, first)
-            else:
-                self._slab.slabs = Pattern.of(self.device, rows).with_values(rows.data, first)
+            self._slab.slabs = self._slab.upload(rows, first)
             self._slab._bound(x, out, epilogue, transpose)()
             if transpose:  # the following slabs add to what the first has written
                 epilogue = Epilogue(epilogue.a, 1.0, out)
@@ -145,7 +129,6 @@ class MultiDevice(Parts, ReadableRows):
     """
 
     where = "on several devices"
-    exact: tuple[Any, ...] | None = None  # as that of `Dense`
 
     def __init__(self, device: Device, parts: Sequence[RowOperator]) -> None:
         ends = np.cumsum([part.shape[0] for part in parts]).tolist()
@@ -154,9 +137,7 @@ class MultiDevice(Parts, ReadableRows):
 
     def blocks(self) -> Iterator[tuple[int, Any]]:
         """Those of all parts."""
-        for start, part in self.parts:
-            for first, rows in part.blocks():
-                yield start + first, rows
+        return ((start + first, rows) for start, part in self.parts for first, rows in part.blocks())
 
     def _gathered(self, x: Array, transpose: bool) -> np.ndarray:
         host, products = x.get(), []
@@ -169,33 +150,57 @@ class MultiDevice(Parts, ReadableRows):
         return np.sum(results, axis=0) if transpose else np.concatenate(results)
 
 
-def on_devices(device: Device, matrix: Any, pattern: Pattern | None = None) -> Operator:
-    """An array or sparse matrix as `Dense` or `CSR`, over all devices where the device has others."""
-    sparse = scipy.sparse.issparse(matrix)
-    if not device.others:
-        return CSR(device, matrix, pattern) if sparse else Dense(device, matrix)
-    rows: Any = checks.csr("matrix", matrix) if sparse else checks.real("matrix", matrix)
-    kind: Any = CSR if sparse else Dense
-    A: Any = over_devices(device, rows.shape[0], lambda each, own: kind(each, rows[own]))
-    A.exact = rows, np.ones(A.shape[1]), np.zeros(A.shape[1])
+def on_devices(
+    device: Device,
+    matrix: Any,
+    change: Callable[[int, Any], Any] = lambda first, rows: rows,
+    pattern: Pattern | None = None,
+    more: int = 0,
+) -> Any:
+    """An array, a sparse matrix or a store, after `change` of (first row, rows), on a device and its others.
+
+    Rows of a store are uploaded block by block; `change` may give them so many `more` entries.
+    """
+    if not (stored := hasattr(matrix, "row_blocks")):
+        if not device.others:
+            return on_device(device, change(0, matrix), pattern)
+        check: Any = checks.csr if scipy.sparse.issparse(matrix) else checks.real
+        matrix = check("matrix", matrix)
+
+    def make(on: Device, own: slice) -> RowOperator:
+        if not stored:
+            return on_device(on, change(own.start, matrix[own]))
+
+        def blocks() -> Iterator[tuple[int, Any]]:
+            for first, rows in matrix.row_blocks():
+                start, stop = max(own.start - first, 0), min(own.stop - first, rows.shape[0])
+                if start < stop:
+                    yield first + start - own.start, change(first, rows)[start:stop]
+
+        M, N, count = *matrix.shape, own.stop - own.start
+        return RowBlocks(on, (count, N), blocks, (matrix.nnz + more) * count // M)
+
+    A: Any = over_devices(device, matrix.shape[0], make)
+    if not stored:
+        A.exact = matrix, np.ones(A.shape[1]), np.zeros(A.shape[1])
     return A
 
 
+def on_device(device: Device, matrix: Any, pattern: Pattern | None = None) -> CSR | Dense:
+    """A sparse matrix as `CSR`, an array as `Dense`."""
+    return CSR(device, matrix, pattern) if scipy.sparse.issparse(matrix) else Dense(device, matrix)
+
+
 def over_devices(device: Device, rows: int, make: Callable[[Device, slice], RowOperator]) -> Operator:
-    """What `make` puts on a device: all rows, or a share where there are other devices or ranks of MPI."""
+    """What `make` puts on a device: all rows, or of several devices or ranks as many as each is fast."""
     if (over_ranks := getattr(device, "over_ranks", None)) is not None:
         return over_ranks(rows, make)
-    parts = [make(each, own) for each, own in shares(device, rows)]
-    return parts[0] if len(parts) == 1 else MultiDevice(device, parts)
-
-
-def shares(device: Device, rows: int) -> list[tuple[Device, slice]]:
-    """The rows of each device, as many as it is fast; all of them where the device has no others."""
     devices = [device, *device.others]
     speeds = np.array([1.0 / _trial(each) for each in devices]) if device.others else np.ones(1)
     ends = np.rint(rows * np.cumsum(speeds) / speeds.sum()).astype(int).tolist()
-    spans = zip(devices, [0, *ends], ends, strict=False)
-    return [(each, slice(start, stop)) for each, start, stop in spans if stop > start]
+    spans = zip(devices, map(slice, [0, *ends], ends), strict=False)
+    parts = [make(each, own) for each, own in spans if own.stop > own.start]
+    return parts[0] if len(parts) == 1 else MultiDevice(device, parts)
 
 
 def _trial(device: Device) -> float:
@@ -219,7 +224,9 @@ def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
             each.require(entries // (1 + len(device.others)) + copied * each.is_cpu, "R")
     except MemoryLimitError as error:
         size = checks.size(sum(T.nbytes for T in matrices))
-        logger.warning("T of %s stays on the disk and is read at each product: %s", size, error)
+        logging.getLogger(__name__).warning(
+            "T of %s stays on the disk and is read at each product: %s", size, error
+        )
         return True
     return False
 
@@ -227,37 +234,32 @@ def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
 def row_blocks(matrix: Any) -> Iterator[tuple[int, Any]]:
     """(first row, rows) of an array or of what has `row_blocks`; those of a file are read ahead."""
     if hasattr(matrix, "row_blocks"):
-        yield from matrix.row_blocks()
-        return
+        return matrix.row_blocks()
     if scipy.sparse.issparse(matrix):
-        yield 0, matrix
-        return
-    read, count = _reader(matrix), max(1, _READ // (matrix.itemsize * matrix.shape[1]))
-    starts = range(0, matrix.shape[0], count)
-    yield from zip(starts, read_ahead(lambda start: read(start, start + count), starts), strict=True)
+        return iter([(0, matrix)])
+    rows = max(1, _READ // (matrix.itemsize * matrix.shape[1]))
+    return read_ahead(_reader(matrix, rows), range(0, matrix.shape[0], rows))
 
 
-def _reader(matrix: np.ndarray) -> Callable[[int, int], np.ndarray]:
-    """Rows start .. stop - 1; of a mapped file by reading, as page faults are several times slower."""
-    root = _root(matrix)
-    name = getattr(root, "filename", None)
-    if name is None or root.mode == "c" or not matrix.flags.c_contiguous:
-        return lambda start, stop: matrix[start:stop]
-    width, dtype, path = matrix.shape[1], matrix.dtype, Path(name)
-    address = (array.__array_interface__["data"][0] for array in (matrix, root))
-    offset = root.offset + next(address) - next(address)
+def _reader(matrix: np.ndarray, rows: int) -> Callable[[int], tuple[int, np.ndarray]]:
+    """Reads some rows from one on; of a mapped file not by page faults, which are several times slower."""
+    root, (height, width) = _root(matrix), matrix.shape
+    path = getattr(root, "filename", None)
+    if path is None or root.mode == "c" or not matrix.flags.c_contiguous:
+        return lambda first: (first, matrix[first : first + rows])
+    offset = root.offset + matrix.ctypes.data - root.ctypes.data
 
-    def read(start: int, stop: int) -> np.ndarray:
-        count = (min(stop, matrix.shape[0]) - start) * width
+    def read(first: int) -> tuple[int, np.ndarray]:
+        count, start = min(rows, height - first) * width, first * width * matrix.itemsize
         try:
-            values = np.fromfile(path, dtype, count, offset=offset + start * width * dtype.itemsize)
+            values = np.fromfile(path, matrix.dtype, count, offset=offset + start)
         except OSError as error:
             raise FileError(f"{path}: cannot be read: {error.strerror}") from error
         except MemoryError as error:
             raise MemoryLimitError(f"{path}: {error}") from error
         if values.size < count:
             raise FileError(f"{path}: has become shorter; it must stay as it is while T is used")
-        return values.reshape(-1, width)
+        return first, values.reshape(-1, width)
 
     return read
 
@@ -267,22 +269,3 @@ def _root(array: Any) -> Any:
     while isinstance(getattr(array, "base", None), np.ndarray):
         array = array.base
     return array
-
-
-def stored_rows(
-    device: Device, matrix: Any, change: Callable[[int, Any], Any] = lambda first, rows: rows, more: int = 0
-) -> Operator:
-    """The rows of a store on a device or several, after `change` of (first row, rows), `more` entries."""
-
-    def make(on: Device, own: slice) -> RowBlocks:
-        def blocks() -> Iterator[tuple[int, Any]]:
-            for first, rows in matrix.row_blocks():
-                start, stop = max(own.start - first, 0), min(own.stop - first, rows.shape[0])
-                if start < stop:
-                    yield first + start - own.start, change(first, rows)[start:stop]
-
-        count = own.stop - own.start
-        return RowBlocks(on, (count, N), blocks, (matrix.nnz + more) * count // M)
-
-    M, N = matrix.shape
-    return over_devices(device, M, make)

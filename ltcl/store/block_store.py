@@ -191,19 +191,18 @@ class BlockStore:
             matrix = sparse(lambda: scipy.sparse.csr_array((data, *places), shape=shape), shape, len(data))
             return Block(matrix, arrays.get("variance"))
 
-    def rows_again(self, channel: int, block: int) -> scipy.sparse.csr_array:
-        """The matrix of a `block` that was checked before, read without checks: as fast as the disk."""
-        name, types = self._name(channel, block), (np.dtype(self.layout.dtype), np.int32, np.int64)
-        (rows, columns), arrays = self.layout.block_shape(block), []
-        with contextlib.suppress(OSError):  # an array of no entries has no file
-            for array, dtype in zip(CSR, map(np.dtype, types), strict=True):
-                file = self.path / self._places[name][array] / "c/0"  # the numbers, and 4 bytes of crc32c
-                arrays.append(np.fromfile(file, dtype, (file.stat().st_size - 4) // dtype.itemsize))
-            if len(arrays[0]) == len(arrays[1]) == arrays[2][-1] and len(arrays[2]) == rows + 1:
-                kind = np.int32 if len(arrays[0]) < 1 << 31 else np.int64  # SciPy makes both alike
-                arrays[2] = arrays[2].astype(kind)
-                return scipy.sparse.csr_array(tuple(arrays), shape=(rows, columns))
-        return self.block(channel, block).matrix  # in another layout, or damaged
+    def rows_again(self, channel: int, block: int) -> tuple[int, scipy.sparse.csr_array]:
+        """First row and matrix of a `block` checked before, read without checks: as fast as the disk."""
+        first, shape = self.layout.span(block)[0], self.layout.block_shape(block)
+        places = (self.path / self._places[self._name(channel, block)][name] / "c/0" for name in CSR)
+        with contextlib.suppress(OSError, ValueError, IndexError):  # an array of no entries has no file
+            bare = (np.fromfile(place, np.uint8)[:-4] for place in places)  # without crc32c
+            types = self.layout.dtype, np.int32, np.int64
+            data, indices, indptr = (array.view(type_) for array, type_ in zip(bare, types, strict=True))
+            if len(data) == len(indices) == indptr[-1] and len(indptr) == shape[0] + 1:
+                kind = np.int32 if len(data) < 1 << 31 else np.int64  # SciPy makes both alike
+                return first, scipy.sparse.csr_array((data, indices, indptr.astype(kind)), shape=shape)
+        return first, self.block(channel, block).matrix  # in another layout, or damaged
 
     def extra(self, name: str, array: Any = None) -> np.ndarray:
         """A small array by name: committed where `array` is given, else read and checked."""
@@ -335,11 +334,11 @@ def read(path: Path) -> Record | Parts:
     if store.layout.kind == "compressed":
         arrays = {name: store.extra(name) for name in store.attributes["arrays"]}  # others are no part of it
         return Parts(arrays | {name: np.array(str(text)) for name, text in store.attributes["texts"].items()})
-    F, mixing = (store.extra(n) if n in store.extras else None for n in ("first_bounce", "mixing"))
     matrices = tuple(StoredRows(store, channel) for channel in range(store.layout.channels))
+    extras = {n: store.extra(n) for n in store.extras if n in EXTRAS or n.startswith("noise_")}
+    F, grids = extras.get("first_bounce"), (store.layout.grid, store.layout.camera_grid)
     F = F[0] if F is not None and len(F) == 1 else F
-    noise = Noise.from_arrays({n: store.extra(n) for n in store.extras if n.startswith("noise_")})
-    return Record(matrices, store.layout.grid, store.layout.camera_grid, F, mixing, noise)
+    return Record(matrices, *grids, F, extras.get("mixing"), Noise.from_arrays(extras))
 
 
 def write(path: Path, content: Record | Parts) -> None:

@@ -71,36 +71,35 @@ def load(
     >>> ltcl.load(path, grid=(2, 3)).shape
     (6, 6)
     """
+    options: dict[str, Any] = {"first_bounce": first_bounce, "on_dark": on_dark, "dark": dark}
+    again = options | {"variable": variable, "grid": grid, "camera_grid": camera_grid}  # on any device
+    options |= {"device": device, "noise": noise}
     content = read(path, variable=variable)
-    again: dict[str, Any] = {"grid": grid, "camera_grid": camera_grid, "first_bounce": first_bounce}
-    again |= {"variable": variable, "on_dark": on_dark, "dark": dark}  # on any device
-    reload = functools.partial(load, os.path.abspath(path), **again)
     with about(path):
         if isinstance(content, Parts):
             if content.format == INVERSE:
                 raise FileError("is an inverse, for ltcl.load_inverse; it must be a transport")
-            options: dict[str, Any] = {"first_bounce": first_bounce, "noise": noise, "dark": dark}
-            options |= {"grid": grid or camera_grid, "on_dark": on_dark, "device": device}
-            T = from_arrays(content.arrays, **options)
-            T.reload = reload
-            return T
-        M, N = content.shape
-        grid = checks.grid("grid", grid or content.grid or _unknown("grid", N, "projector"), N)
-        camera_grid = camera_grid or content.camera_grid
-        if camera_grid is not None or M != N:
-            camera_grid = checks.grid("camera_grid", camera_grid or _unknown("camera_grid", M, "camera"), M)
-        if isinstance(first_bounce, str) and first_bounce == "exact":
-            content = content.in_memory()  # which needs all entries at once
-        if first_bounce is None and camera_grid in (None, grid):  # on another grid there is no S
-            first_bounce = content.first_bounce
-        T, F = content.matrices, "diagonal" if first_bounce is None else first_bounce
-        others: dict[str, Any] = {"mixing": content.mixing, "noise": noise or content.noise, "dark": dark}
-        T = Transport(T, grid, F, camera_grid, device, on_dark=on_dark, **others)
-        T.reload = reload
-        return T
+            T = from_arrays(content.arrays, grid=grid or camera_grid, **options)
+        else:
+            M, N = content.shape
+            grid = _grid("grid", grid or content.grid, N, "projector")
+            camera_grid = camera_grid or content.camera_grid
+            if camera_grid is not None or M != N:
+                camera_grid = _grid("camera_grid", camera_grid, M, "camera")
+            if isinstance(first_bounce, str) and first_bounce == "exact":
+                content = content.in_memory()  # which needs all entries at once
+            if first_bounce is None:  # on another grid there is no S
+                known = content.first_bounce if camera_grid in (None, grid) else None
+                options["first_bounce"] = "diagonal" if known is None else known
+            options |= {"mixing": content.mixing, "noise": noise or content.noise}
+            T = Transport(content.matrices, grid, camera_grid=camera_grid, **options)
+    T.reload = functools.partial(load, os.path.abspath(path), **again)
+    return T
 
 
-def _unknown(name: str, pixels: int, whose: str) -> tuple[int, int]:
+def _grid(name: str, grid: Any, pixels: int, whose: str) -> tuple[int, int]:
+    if grid:
+        return checks.grid(name, grid, pixels)
     side = round(pixels**0.5)
     example = f", perhaps {name}=({side}, {side})" if side * side == pixels else ""
     raise FileError(f"has no grid of the {pixels} {whose} pixels; give {name}=(h, w){example}")

@@ -92,9 +92,7 @@ class StoredRows(scipy.sparse.linalg.LinearOperator):
 
     def row_blocks(self) -> Iterator[tuple[int, scipy.sparse.csr_array]]:
         """Each block with its first row."""
-        blocks = range(self._layout.blocks())
-        for block, rows in zip(blocks, read_ahead(self._again, blocks), strict=True):
-            yield self._layout.span(block)[0], rows
+        return read_ahead(self._again, range(self._layout.blocks()))
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Rows start .. stop - 1, (stop - start, N)."""
