@@ -87,9 +87,7 @@ def test_kernels_meet_their_twins(device, monkeypatch, rows, k, group):
     np.testing.assert_allclose(squares.get().sum(axis=0), curvature, rtol=1e-4)
 
     V = R.like()
-    columns.bind(
-        "bounded_move", rows, slices, 1, numbers, sums, squares, L, U, D, X, W, Y, R, V, extra=4
-    )()
+    columns.bind("bounded_move", rows, slices, 1, numbers, sums, squares, L, U, D, X, W, Y, R, V, extra=4)()
     with np.errstate(divide="ignore", invalid="ignore"):
         length = np.where(gd < 0, np.fmin(-gd / curvature, np.fmax(1 / share, 1)), 0.0)
     moved, left = reference.bounded_move(length, lower, upper, step, x), r - length * Ad
