@@ -21,6 +21,7 @@ from ltcl.errors import InputError, InputTypeError
 from ltcl.operators import Wavelet
 from ltcl.transport import to_arrays
 
+from_array: Any = dask.array.from_array  # whose chunks are no str
 GRID, N = (8, 16), 128
 SMALLEST = 32 * N * 16  # bytes of the smallest block, 16 rows
 
@@ -71,8 +72,8 @@ HOLDERS = {
     "sparse": lambda matrix, path: scipy.sparse.csr_array(matrix),
     "zarr": in_files,
     "zarr in memory": lambda matrix, path: zarr.array(matrix, chunks=(30, 50)),
-    "dask": lambda matrix, path: dask.array.from_array(matrix, chunks=((50, 70, 8), -1)),
-    "dask, persisted": lambda matrix, path: dask.array.from_array(matrix, chunks=((50, 70, 8), 64)),
+    "dask": lambda matrix, path: from_array(matrix, ((50, 70, 8), -1)),
+    "dask, persisted": lambda matrix, path: from_array(matrix, ((50, 70, 8), 64)),
     "rows": lambda matrix, path: Rows(matrix),
     "rows that are sent": lambda matrix, path: Unpicklable(matrix, 10_000),
 }
