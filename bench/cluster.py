@@ -27,7 +27,6 @@ from _harness import Row, options, report
 
 BATCH, RTOL, KILLS = 4, 1e-4, 10
 EFFICIENCY, GROWTH = 0.9, 1.1  # of two workers; of memory over the run
-ONE_CORE = {"POCL_MAX_PTHREAD_COUNT": "1"}  # a worker's
 
 
 @contextmanager
@@ -35,10 +34,14 @@ def cluster(workers: int, cache: Path) -> Iterator[Client]:
     """So many workers of one core on loopback; those that are killed are started again."""
     quiet: dict[str, Any] = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
     local: dict[str, Any] = {"n_workers": workers, "threads_per_worker": 1, "host": "127.0.0.1"}
-    local |= {"silence_logs": 50, "env": {**ONE_CORE, "LTCL_CACHE": str(cache)}, "scheduler_kwargs": quiet}
+    local |= {"silence_logs": 50, "env": {"LTCL_CACHE": str(cache)}, "scheduler_kwargs": quiet}
     with ExitStack() as stack:
         stack.enter_context(dask.config.set({"distributed.deploy.lost-worker-timeout": "120s"}))
-        yield stack.enter_context(Client(stack.enter_context(LocalCluster(**local))))
+        client = stack.enter_context(Client(stack.enter_context(LocalCluster(**local))))
+        # Bound to a core a worker has as many compute units as others, so the same bits.
+        for core, address in zip(range(workers), client.scheduler_info()["workers"], strict=True):
+            client.run(os.sched_setaffinity, 0, {core}, workers=[address])
+        yield client
 
 
 def pids(client: Client) -> list[int]:

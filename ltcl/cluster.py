@@ -106,8 +106,9 @@ def require(client: Any) -> str:
 def connect(cluster: str, workers: int | None = None, device: str | None = None) -> Iterator[Client]:
     """A client of the scheduler at an address or, "local", of `workers` processes that end with the block.
 
-    These have a GPU each; or share `device`, by default that of LTCL_DEVICE, or the CPU and its cores. By
-    default they are as many as there are GPUs, or one. ClusterError where nothing answers.
+    These have a GPU each; or share `device`, by default that of LTCL_DEVICE, or the CPU, each with all of its
+    cores: with fewer, sums are rounded in another order than without a cluster. By default they are as many
+    as there are GPUs, or one. ClusterError where nothing answers.
     """
     distributed = _distributed()
     from dask import config
@@ -135,13 +136,12 @@ def _processes(workers: int | None, device: str | None) -> Any:
     device = device or os.environ.get("LTCL_DEVICE")
     gpus = [] if device else [each.index for each in list_devices() if each.kind == "gpu"]
     count = checks.count("workers", max(1, len(gpus)) if workers is None else workers)
-    cores = {} if gpus else {"POCL_MAX_PTHREAD_COUNT": str(max(1, (os.cpu_count() or 1) // count))}
     devices = itertools.cycle(gpus or [device or open_device().description.index])
     local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
     alike = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": quiet}
     nannies = {}
     for number, name in zip(range(count), devices, strict=False):
-        options = {**alike, "env": {**cores, "LTCL_DEVICE": name}}
+        options = {**alike, "env": {"LTCL_DEVICE": name}}
         nannies[number] = {"cls": distributed.Nanny, "options": options}
     scheduler = {"cls": distributed.Scheduler, "options": local}
     return distributed.SpecCluster(nannies, scheduler, silence_logs=quiet)

@@ -189,15 +189,16 @@ def other_grid(T: Any, grid: tuple[int, int]) -> tuple[int, int] | None:
         j = np.where(i + w < n, i + w, i - w) if 2 * w <= n else rng.permutation(n)[: len(i)]
         return float(difference(i, j).mean())
 
-    def jump(w: int) -> float:
+    def jumps(w: int) -> bool:
         pixels = rng.permutation(n - 1)
         last, inner = (pixels[at][:_PAIRS] for at in (pixels % w == w - 1, pixels % w != w - 1))
-        return np.quantile(difference(last, last + 1), 0.25) / np.median(difference(inner, inner + 1))
+        usual = np.median(difference(inner, inner + 1))
+        return bool(np.quantile(difference(last, last + 1), 0.25) > _JUMP * usual)
 
     i = rng.permutation(n)[:_PAIRS]
     own = below(grid[1]) - 1e-6  # rounding of float32
     widths = {below(w): w for w in range(2, n) if n % w == 0 and w != grid[1]}
-    likely = (w for d, w in sorted(widths.items()) if d < _ALIKE * own and jump(w) > _JUMP)
+    likely = (w for d, w in sorted(widths.items()) if d < _ALIKE * own and jumps(w))
     return next(((n // w, w) for w in likely), None)
 
 
