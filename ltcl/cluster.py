@@ -205,7 +205,7 @@ class _Crew:
 
     def result(self) -> Any:
         """What the first task gives, however many workers it takes."""
-        from distributed import CancelledError, KilledWorker
+        from distributed import CancelledError, KilledWorker, wait
 
         task, patience = self.tasks[0], _PERIOD
         while True:
@@ -214,6 +214,8 @@ class _Crew:
                 if not each.workers & self.ready.keys():  # all have gone, and Dask must not choose others
                     self.submit(each)
             try:
+                with self.client.as_current():
+                    wait(task.future, timeout=_PERIOD)  # `result` that waits in vain leaves tracebacks behind
                 result, error, refusal = task.future.result(timeout=patience)
             except (OSError, CancelledError, KilledWorker) as failure:
                 if task.future.status == "error" and not isinstance(failure, KilledWorker):
