@@ -1,0 +1,78 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Compensate: the pattern that makes the scene look as desired, and how well that went.
+
+import { Panel } from "./panel.js";
+
+const DOWNLOADS = { "pattern.exr": "pattern, linear", "pattern.png": "pattern", "codes.png": "projector codes", "appearance.exr": "appearance, linear", "report.json": "report" };
+const percent = (share) => `${(100 * share).toPrecision(3)} %`;
+
+export function compensate({ $, ask, hello }) {
+  const panel = (name, title, grid, act) => new Panel($(`compensate-${name}`), { title, grid, act });
+  const wipe = panel("wipe", "Predicted appearance", hello.camera_grid, (kind, row, col) => {
+    if (kind !== "press" && kind !== "drag" && !(kind === "hover" && wipe.canvas.matches(":focus-visible"))) return;
+    part((col + 0.5) / hello.camera_grid[1]);
+  });
+  const target = panel("target", "Desired", hello.camera_grid);
+  const pattern = panel("pattern", "Pattern", hello.grid);
+  const reach = panel("reach", "Out of reach", hello.camera_grid);
+  const line = document.createElement("span"), source = $("compensate-source");
+  line.className = "line";
+  wipe.sheet.append(line);
+  wipe.others = [0, 1];
+
+  function part(share) {
+    wipe.wipe = share;
+    line.style.left = `${100 * share}%`;
+    wipe.redrawSoon();
+  }
+
+  async function solve() {
+    if (!source.value) {
+      wipe.note = "open or drop the picture that the scene should look like";
+      return;
+    }
+    wipe.note = "solving…";
+    const [auto, gain, low, high] = ["auto", "gain", "low", "high"].map((name) => $(`compensate-${name}`));
+    gain.disabled = auto.checked;
+    $("compensate-low-value").textContent = low.value;
+    $("compensate-high-value").textContent = high.value;
+    if (!auto.checked) $("compensate-gain-value").textContent = gain.value;
+    const answer = await ask("compensate", { picture: source.value, gain: auto.checked ? "auto" : Number(gain.value), bounds: [Number(low.value), Number(high.value)] });
+    if (!answer) return;
+    const { arrays } = answer, white = arrays.target.white();
+    wipe.note = "without ◂ ▸ with compensation";
+    wipe.show([arrays.appearance, arrays.uncompensated], [1, 0], white);
+    target.show(arrays.target, [1], white);
+    pattern.show(arrays.pattern);
+    reach.show(arrays.out_of_reach, [1], white);
+    if (wipe.wipe === undefined) part(0.5);
+    if (auto.checked) {
+      gain.value = answer.gain;
+      $("compensate-gain-value").textContent = answer.gain.toPrecision(2);
+    }
+    report(answer);
+  }
+
+  function report(answer) {
+    $("compensate-report").hidden = false;
+    const lines = { Error: percent(answer.error), Gain: answer.gain.toPrecision(3), Clipped: percent(answer.clipped),
+      Method: `${answer.method}, ${answer.products} products, ${answer.seconds.toPrecision(2)} s` };
+    $("compensate-numbers").replaceChildren(...Object.entries(lines).flatMap(([name, value]) => {
+      const [term, text] = [document.createElement("dt"), document.createElement("dd")];
+      [term.textContent, text.textContent] = [name, value];
+      return [term, text];
+    }));
+    const logs = answer.residuals.filter((r) => r > 0).map(Math.log10), top = Math.max(...logs, 0), low = Math.min(...logs, -1);
+    $("compensate-residuals").firstElementChild.setAttribute("points",
+      logs.map((v, k) => `${(100 * k) / Math.max(logs.length - 1, 1)},${1 + (28 * (top - v)) / (top - low)}`).join(" "));
+    $("compensate-downloads").replaceChildren(...Object.entries(DOWNLOADS).map(([name, text]) => {
+      const link = document.createElement("a");
+      Object.assign(link, { href: `result/${name}`, download: name, textContent: text });
+      return link;
+    }));
+  }
+
+  for (const name of ["source", "auto", "gain", "low", "high"]) $(`compensate-${name}`).addEventListener("input", solve);
+  source.addEventListener("change", solve);
+  return { start: solve };
+}

@@ -1,0 +1,142 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Draws linear light on canvases. One WebGL context serves them all: it draws at the size of the picture, one
+// fragment a pixel, and the result is copied to the canvas, which CSS enlarges without smoothing.
+
+const LAYERS = 10; // pictures that are summed at most
+
+const VERTEX = `#version 300 es
+void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
+
+const FRAGMENT = `#version 300 es
+precision highp float;
+precision highp sampler2DArray;
+uniform sampler2DArray light, deviation;
+uniform float weights[${LAYERS}], others[${LAYERS}], spreads[${LAYERS}]; // right, left of the wipe; of deviation
+uniform int layers, mode, height;
+uniform bool grey, logarithmic, uncertain;
+uniform float wipe;
+out vec4 colour;
+
+vec3 stored(sampler2DArray pictures, ivec2 at, int k) {
+  vec3 value = texelFetch(pictures, ivec3(at, k), 0).rgb;
+  return grey ? value.rrr : value;
+}
+vec3 heat(float t) { // fit of matplotlib's inferno by Matt Zucker (CC0)
+  return clamp(vec3(0.0002, 0.0016, -0.0194) + t * (vec3(0.1065, 0.5639, 3.9327) + t * (vec3(11.6024, -3.9728, -15.9423)
+    + t * (vec3(-41.7039, 17.4363, 44.3541) + t * (vec3(77.1629, -33.4023, -81.8073)
+    + t * (vec3(-71.3194, 32.6260, 73.2095) + t * vec3(25.1311, -12.2426, -23.0703)))))), 0.0, 1.0);
+}
+vec3 encoded(vec3 linear) { // sRGB
+  return mix(1.055 * pow(max(linear, 0.0031308), vec3(1.0 / 2.4)) - 0.055, 12.92 * linear, lessThan(linear, vec3(0.0031308)));
+}
+void main() {
+  ivec2 at = ivec2(int(gl_FragCoord.x), height - 1 - int(gl_FragCoord.y)); // row 0 is at the top
+  bool left = gl_FragCoord.x < wipe;
+  vec3 sum = vec3(0.0), variance = vec3(0.0);
+  for (int k = 0; k < layers; k++) {
+    float weight = left ? others[k] : weights[k];
+    if (weight == 0.0) continue;
+    sum += weight * stored(light, at, k);
+    if (uncertain) { vec3 sigma = spreads[k] * stored(deviation, at, k); variance += sigma * sigma; }
+  }
+  if (any(isnan(sum))) sum = vec3(0.0); // masked
+  float most = max(sum.r, max(sum.g, sum.b)), least = min(sum.r, min(sum.g, sum.b));
+  float size = -least > most ? least : most; // with the sign of what is larger
+  vec3 shown = sum;
+  if (mode > 0) shown = vec3(mode == 1 ? most : size);
+  if (logarithmic) shown = sign(shown) * clamp(1.0 + log(max(abs(shown), 1e-9)) / log(10.0) / 4.0, 0.0, 1.0);
+  if (mode == 0) colour.rgb = logarithmic ? max(shown, 0.0) : encoded(clamp(shown, 0.0, 1.0));
+  else if (mode == 1) colour.rgb = heat(clamp(shown.r, 0.0, 1.0));
+  else colour.rgb = encoded(clamp(mix(vec3(0.0), shown.r < 0.0 ? vec3(0.1, 0.45, 1.0) : vec3(1.0, 0.35, 0.1), abs(shown.r)), 0.0, 1.0));
+  if (uncertain) {
+    float sigma = sqrt(max(variance.r, max(variance.g, variance.b)));
+    colour.rgb = mix(colour.rgb, vec3(1.0, 0.2, 0.75), 0.9 * clamp(sigma / max(abs(size), 1e-4), 0.0, 1.0));
+  }
+  colour.a = 1.0;
+}`;
+
+const surface = document.createElement("canvas");
+const gl = surface.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+export const supported = Boolean(gl);
+
+const uniforms = gl && build();
+surface.addEventListener("webglcontextlost", (event) => event.preventDefault());
+surface.addEventListener("webglcontextrestored", () => location.reload());
+
+function build() {
+  const program = gl.createProgram();
+  for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+  }
+  gl.linkProgram(program);
+  gl.useProgram(program);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  return new Proxy({}, { get: (known, name) => (known[name] ??= gl.getUniformLocation(program, name)) });
+}
+
+// Pictures of one size as the layers of one texture.
+export class Layers {
+  set(pictures) {
+    const { h, w, c, dtype } = pictures[0], half = dtype === "f2";
+    const shape = [c === 1 ? (half ? gl.R16F : gl.R32F) : half ? gl.RGB16F : gl.RGB32F, w, h, pictures.length];
+    if (String(shape) !== String(this.shape)) {
+      gl.deleteTexture(this.texture ?? null);
+      this.texture = gl.createTexture();
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.texture);
+      gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, ...shape);
+      for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+        gl.texParameteri(gl.TEXTURE_2D_ARRAY, filter, gl.NEAREST); // half floats and floats alike
+      }
+    }
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.texture);
+    pictures.forEach(({ data }, k) => {
+      const [format, type] = [c === 1 ? gl.RED : gl.RGB, half ? gl.HALF_FLOAT : gl.FLOAT];
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, w, h, 1, format, type, data);
+    });
+    Object.assign(this, { shape, pictures, h, w, grey: c === 1 });
+  }
+
+  clear() {
+    gl.deleteTexture(this.texture);
+  }
+
+  // The values of one pixel of the weighted sum.
+  at(row, col, weights) {
+    return this.pictures.map((p, k) => p.at(row, col).map((v) => v * weights[k])).reduce((a, b) => a.map((v, i) => v + b[i]));
+  }
+}
+
+// `look`: white (the value shown as white), logarithmic, mode (0 natural, 1 heat, 2 signed), weights; and
+// optionally others and wipe (0 to 1: left of it the sum by `others`), deviation (Layers) to overlay.
+export function draw(canvas, layers, look) {
+  const { h, w } = layers;
+  if (surface.width < w || surface.height < h) {
+    surface.width = Math.max(w, surface.width);
+    surface.height = Math.max(h, surface.height);
+  }
+  if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+  const scaled = (weights, of) => Float32Array.from({ length: LAYERS }, (_, k) => ((weights?.[k] ?? 0) * (of.pictures[k]?.scale ?? 0)) / look.white);
+  gl.viewport(0, 0, w, h);
+  gl.uniform1fv(uniforms.weights, scaled(look.weights, layers));
+  gl.uniform1fv(uniforms.others, scaled(look.others, layers));
+  gl.uniform1fv(uniforms.spreads, scaled(look.weights, look.deviation ?? layers));
+  gl.uniform1f(uniforms.wipe, look.others ? look.wipe * w : 0);
+  gl.uniform1i(uniforms.layers, layers.pictures.length);
+  gl.uniform1i(uniforms.mode, look.mode);
+  gl.uniform1i(uniforms.height, h);
+  gl.uniform1i(uniforms.grey, layers.grey);
+  gl.uniform1i(uniforms.logarithmic, look.logarithmic);
+  gl.uniform1i(uniforms.uncertain, Boolean(look.deviation));
+  gl.uniform1i(uniforms.deviation, 1);
+  gl.activeTexture(gl.TEXTURE1);
+  gl.bindTexture(gl.TEXTURE_2D_ARRAY, (look.deviation ?? layers).texture);
+  gl.activeTexture(gl.TEXTURE0);
+  gl.bindTexture(gl.TEXTURE_2D_ARRAY, layers.texture);
+  gl.drawArrays(gl.TRIANGLES, 0, 3);
+  canvas.getContext("2d").drawImage(surface, 0, surface.height - h, w, h, 0, 0, w, h);
+  canvas.dataset.frame = Number(canvas.dataset.frame ?? 0) + 1;
+}

@@ -1,0 +1,192 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// The page: connection, tabs, the bar "Display", files that are opened or dropped.
+
+import { bounces } from "./bounces.js";
+import { compensate } from "./compensate.js";
+import { Connection } from "./connection.js";
+import { supported } from "./gl.js";
+import { each, look } from "./panel.js";
+import { probe } from "./probe.js";
+import { relight } from "./relight.js";
+
+const $ = (id) => document.getElementById(id);
+const VIEWS = { probe, bounces, relight, compensate };
+const connection = new Connection();
+const app = { $, connection, ask, press, choices, open: null, hello: null };
+const views = {};
+let current = null;
+
+// The answer to a question; null where a newer one replaced it, or where it was refused, which is shown.
+async function ask(kind, fields, arrays) {
+  try {
+    const answer = await connection.ask(kind, fields, arrays);
+    if (answer) say("");
+    return answer;
+  } catch (error) {
+    say(error.message);
+    return null;
+  }
+}
+
+function say(text) {
+  $("banner").hidden = !text;
+  if ($("banner").textContent !== text) $("banner").textContent = text;
+}
+
+function press(button, on) {
+  button.setAttribute("aria-pressed", on);
+}
+
+connection.addEventListener("open", async ({ detail: hello }) => {
+  if (app.hello && String([app.hello.grid, app.hello.camera_grid]) !== String([hello.grid, hello.camera_grid])) {
+    location.reload(); // another T
+    return;
+  }
+  const first = !app.hello;
+  app.hello = hello;
+  say("");
+  $("title").textContent = document.title = hello.title;
+  $("facts").textContent = [`${hello.grid.join(" × ")} projector pixels`, hello.channels === 3 ? "colour" : "grey",
+    hello.compressed && `compressed, error ${(100 * hello.error).toPrecision(2)} %`, hello.device].filter(Boolean).join(" · ");
+  $("tab-bounces").disabled = !hello.square;
+  $("tab-bounces").title = hello.square ? "" : "Bounces need a camera grid equal to the projector’s";
+  await known();
+  if (first) {
+    for (const name in VIEWS) views[name] = VIEWS[name](app);
+    addEventListener("hashchange", route);
+    route();
+  } else views[current].start();
+});
+
+connection.addEventListener("lost", () => {
+  document.body.dataset.state = "lost";
+  say("Not connected; trying again…");
+});
+connection.addEventListener("refused", ({ detail }) => say(detail));
+connection.addEventListener("busy", () => { document.body.dataset.state = "busy"; });
+connection.addEventListener("idle", () => {
+  document.body.dataset.state = "ready";
+  $("progress").hidden = true;
+});
+connection.addEventListener("progress", ({ detail: { done, total } }) => {
+  $("progress").hidden = false;
+  $("progress").firstElementChild.style.width = `${(100 * done) / total}%`;
+  $("progress").setAttribute("aria-valuenow", Math.round((100 * done) / total));
+});
+
+// ---- views
+
+const tabs = [...$("tabs").children];
+
+function route() {
+  const wanted = location.hash.slice(1);
+  const name = views[wanted] && !$(`tab-${wanted}`).disabled ? wanted : "probe";
+  if (name === current) return;
+  if (current) views[current].stop?.();
+  current = name;
+  for (const tab of tabs) {
+    const chosen = tab.id === `tab-${name}`;
+    tab.setAttribute("aria-selected", chosen);
+    tab.tabIndex = chosen ? 0 : -1;
+    $(tab.getAttribute("aria-controls")).hidden = !chosen;
+  }
+  views[name].start();
+  each((panel) => panel.redraw());
+}
+
+const visit = (tab) => {
+  location.hash = tab.id.slice(4);
+  tab.focus();
+};
+$("tabs").addEventListener("click", ({ target }) => target.role === "tab" && visit(target));
+$("tabs").addEventListener("keydown", ({ key }) => {
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[key], open = tabs.filter((tab) => !tab.hidden && !tab.disabled);
+  if (step) visit(open[(open.indexOf(document.activeElement) + step + open.length) % open.length]);
+});
+
+// ---- display
+
+function expose(stops) {
+  look.stops = Math.min(Math.max(stops, -8), 8);
+  $("stops").value = look.stops;
+  $("stops-value").textContent = (look.stops > 0 ? "+" : "") + look.stops;
+  each((panel) => panel.redrawSoon());
+}
+
+function logarithmic() {
+  look.logarithmic = !look.logarithmic;
+  press($("logarithmic"), look.logarithmic);
+  each((panel) => panel.redraw());
+}
+
+$("stops").oninput = () => expose(Number($("stops").value));
+$("darker").onclick = () => expose(look.stops - 0.5);
+$("brighter").onclick = () => expose(look.stops + 0.5);
+$("logarithmic").onclick = logarithmic;
+$("mode").onchange = () => {
+  look.mode = Number($("mode").value);
+  each((panel) => panel.redraw());
+};
+$("white").onclick = () => {
+  expose(0);
+  each((panel) => panel.adapt());
+};
+addEventListener("keydown", (event) => {
+  if (event.target.tagName === "SELECT" || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.key === "+" || event.key === "=") expose(look.stops + 0.5);
+  else if (event.key === "-") expose(look.stops - 0.5);
+  else if (event.key.toLowerCase() === "l") logarithmic();
+});
+
+// ---- pictures
+
+async function known() {
+  const answer = await ask("pictures");
+  if (answer) app.pictures = answer.pictures;
+  for (const select of document.querySelectorAll("select[id$=source]")) choices(select);
+}
+
+// Fill a selection with the pictures that the server knows, after the `data-first` entry of its own.
+function choices(select, chosen = select.value) {
+  select.replaceChildren(...(select.dataset.first ? [new Option(select.dataset.first, "")] : []),
+    ...app.pictures.map(({ picture, name }) => new Option(name, picture)));
+  select.value = [...select.options].some(({ value }) => value === String(chosen)) ? chosen : select.options[0]?.value ?? "";
+}
+
+// Give a file to the view in sight: it takes it itself, or the server does, and the view gets its number.
+async function open(file) {
+  if (await views[current].take?.(file)) return;
+  document.body.dataset.state = "busy";
+  const answer = await fetch(`picture?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
+  if (!answer.ok) say(`${file.name}: ${await answer.text()}`);
+  else {
+    const { picture } = await answer.json();
+    await known();
+    const select = $(`${current}-source`);
+    if (!select) return;
+    select.value = picture;
+    select.dispatchEvent(new Event("change"));
+  }
+}
+
+for (const input of document.querySelectorAll("input[type=file]")) {
+  input.onchange = () => {
+    if (input.files[0]) open(input.files[0]);
+    input.value = ""; // so that the same file can be opened again
+  };
+}
+addEventListener("dragover", (event) => {
+  event.preventDefault();
+  document.body.classList.add("dropping");
+});
+addEventListener("dragleave", () => document.body.classList.remove("dropping"));
+addEventListener("drop", (event) => {
+  event.preventDefault();
+  document.body.classList.remove("dropping");
+  if (event.dataTransfer.files[0] && current) open(event.dataTransfer.files[0]);
+});
+
+$("open-projector").onclick = (event) => {
+  if (window.open("projector", "ltcl-projector", "popup,width=960,height=600")) event.preventDefault();
+};
+if (!supported) say("This page needs WebGL 2, which this browser does not offer");

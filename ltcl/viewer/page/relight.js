@@ -1,0 +1,189 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Relight: paint on the projector's pattern, or let a picture, a video or a moving spot do it; the scene answers.
+
+import { Pixels } from "./messages.js";
+import { Panel } from "./panel.js";
+
+const UNDO = 30; // steps that can be undone
+
+export function relight({ $, ask, press, hello }) {
+  const [h, w] = hello.grid;
+  const canvas = () => pattern.canvas;
+  const pattern = new Panel($("relight-pattern"), { title: "Projector’s pattern", grid: hello.grid, act: heard });
+  const seen = new Panel($("relight-seen"), { title: "What the camera sees", grid: hello.camera_grid });
+  const paint = canvas().getContext("2d", { willReadFrequently: true });
+  const past = [], video = document.createElement("video");
+  let erasing = false, last = null, changed = false, sending = false, motion = null;
+  Object.assign(video, { muted: true, loop: true, playsInline: true });
+  paint.lineCap = "round";
+  const size = $("relight-size"), source = $("relight-source");
+  size.max = Math.max(8, Math.round(Math.max(h, w) / 3));
+  size.value = Math.max(1, Math.round(Math.max(h, w) / 10));
+  source.dataset.first = "none";
+  source.prepend(new Option(source.dataset.first, ""));
+  source.value = "";
+  pattern.values = (row, col) => [...paint.getImageData(col, row, 1, 1).data.slice(0, 3)].map(linear);
+
+  const linear = (code) => (code <= 10 ? code / 255 / 12.92 : ((code / 255 + 0.055) / 1.055) ** 2.4);
+
+  function codes() {
+    const rgba = paint.getImageData(0, 0, w, h).data, rgb = new Uint8Array(3 * h * w);
+    let grey = hello.channels === 1;
+    for (let i = 0, k = 0; i < rgba.length; i += 4, k += 3) {
+      rgb[k] = rgba[i];
+      rgb[k + 1] = rgba[i + 1];
+      rgb[k + 2] = rgba[i + 2];
+      grey &&= rgba[i] === rgba[i + 1] && rgba[i] === rgba[i + 2];
+    }
+    return grey ? new Pixels(rgb.filter((_, k) => k % 3 === 0), [h, w, 1], 1, "u1") : new Pixels(rgb, [h, w, 3], 1, "u1");
+  }
+
+  // Send what is painted when the last answer has come: there is never more than one pattern on its way.
+  async function send() {
+    changed = true;
+    canvas().dataset.frame = Number(canvas().dataset.frame ?? 0) + 1;
+    if (sending) return;
+    sending = true;
+    while (changed) {
+      changed = false;
+      const answer = await ask("relight", {}, { pattern: codes() });
+      if (answer) seen.show(answer.arrays.picture);
+    }
+    sending = false;
+    pattern.read();
+  }
+
+  function heard(kind, row, col, event) {
+    pattern.ring(kind === "leave" ? 0 : Number(size.value));
+    if (kind === "press") {
+      still();
+      remember();
+      last = [row, col];
+    }
+    if (kind === "release" || kind === "leave") last = null;
+    if ((kind !== "press" && kind !== "drag") || !last) return;
+    stroke(last, [row, col], event);
+    last = [row, col];
+  }
+
+  function stroke([fromRow, fromCol], [row, col]) {
+    paint.strokeStyle = erasing ? "#000" : $("relight-colour").value;
+    paint.lineWidth = Number(size.value);
+    paint.beginPath();
+    paint.moveTo(fromCol + 0.5, fromRow + 0.5);
+    paint.lineTo(col + 0.5, row + 0.5 + 1e-3); // a line without length is not drawn
+    paint.stroke();
+    send();
+  }
+
+  function remember() {
+    past.push(paint.getImageData(0, 0, w, h));
+    if (past.length > UNDO) past.shift();
+  }
+
+  function fill(colour) {
+    still();
+    remember();
+    paint.fillStyle = colour;
+    paint.fillRect(0, 0, w, h);
+    send();
+  }
+
+  // Stop what moves: the spot or the video.
+  function still() {
+    cancelAnimationFrame(motion);
+    motion = null;
+    video.pause();
+    press($("relight-spot"), false);
+  }
+
+  function animate(frame) {
+    still();
+    const step = (now) => {
+      motion = requestAnimationFrame(step);
+      if (!changed) frame(now / 1000); // the last one is on its way
+    };
+    motion = requestAnimationFrame(step);
+  }
+
+  function spot(seconds) {
+    const x = w * (0.5 + 0.4 * Math.sin(1.1 * seconds)), y = h * (0.5 + 0.4 * Math.sin(1.7 * seconds));
+    const glow = paint.createRadialGradient(x, y, 0, x, y, Number(size.value));
+    glow.addColorStop(0, $("relight-colour").value);
+    glow.addColorStop(1, "#000");
+    paint.fillStyle = glow;
+    paint.fillRect(0, 0, w, h);
+    send();
+  }
+
+  // Fill the pattern with a picture or a frame, cut to its shape.
+  function cover(image, width, height) {
+    const scale = Math.max(w / width, h / height);
+    paint.imageSmoothingQuality = "high";
+    paint.drawImage(image, (w - scale * width) / 2, (h - scale * height) / 2, scale * width, scale * height);
+    send();
+  }
+
+  async function take(file) {
+    if (file.type.startsWith("video/")) {
+      URL.revokeObjectURL(video.src);
+      video.src = URL.createObjectURL(file);
+      await video.play();
+      animate(() => cover(video, video.videoWidth, video.videoHeight));
+      video.play();
+      return true;
+    }
+    const bitmap = await createImageBitmap(file).catch(() => null); // EXR and the like: the server reads them
+    if (!bitmap) return false;
+    still();
+    remember();
+    cover(bitmap, bitmap.width, bitmap.height);
+    return true;
+  }
+
+  // What the server has as its pattern, as codes.
+  function shown(light) {
+    const image = paint.createImageData(w, h), code = (v) => 255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055);
+    for (let i = 0; i < h * w; i++) {
+      for (let k = 0; k < 3; k++) image.data[4 * i + k] = Math.round(code(light.number(i * light.c + (light.c === 3 ? k : 0))));
+      image.data[4 * i + 3] = 255;
+    }
+    paint.putImageData(image, 0, 0);
+    canvas().dataset.frame = Number(canvas().dataset.frame ?? 0) + 1;
+  }
+
+  async function start(fields = {}) {
+    const answer = await ask("relight", fields);
+    if (!answer) return;
+    seen.show(answer.arrays.picture);
+    shown(answer.arrays.pattern);
+    pattern.read();
+  }
+
+  const tool = (eraser) => {
+    erasing = eraser;
+    press($("relight-brush"), !eraser);
+    press($("relight-eraser"), eraser);
+  };
+  $("relight-brush").onclick = () => tool(false);
+  $("relight-eraser").onclick = () => tool(true);
+  $("relight-fill").onclick = () => fill($("relight-colour").value);
+  $("relight-clear").onclick = () => fill("#000");
+  $("relight-undo").onclick = () => {
+    still();
+    if (past.length) paint.putImageData(past.pop(), 0, 0);
+    send();
+  };
+  $("relight-spot").onclick = () => {
+    if ($("relight-spot").getAttribute("aria-pressed") === "true") return still();
+    remember();
+    animate(spot);
+    press($("relight-spot"), true);
+  };
+  source.onchange = () => {
+    still();
+    remember();
+    if (source.value) start({ picture: source.value });
+  };
+  return { start: () => start(), stop: still, take };
+}
