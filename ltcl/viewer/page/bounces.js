@@ -16,7 +16,7 @@ export function bounces({ $, ask, press, hello }) {
 
   async function separate() {
     const count = Number($("bounces-count").value);
-    const of = source.value ? { of: "picture", picture: source.value } : { of: "pattern" };
+    const of = source.value ? { of: "picture", picture: Number(source.value) } : { of: "pattern" };
     asked = JSON.stringify([of, count]);
     const answer = await ask("bounces", { ...of, count });
     if (!answer) return;
@@ -42,7 +42,7 @@ export function bounces({ $, ask, press, hello }) {
     const white = picture.white() || 1, layers = new Layers(), brighter = mix.white / white;
     title.prepend(name);
     title.firstElementChild.textContent = [share !== undefined && `${(100 * share).toPrecision(2)} % of the light`,
-      brighter > 1.5 && `shown ${brighter.toPrecision(2)} × brighter`].filter(Boolean).join(", ");
+      brighter > 1.5 && `shown ${brighter < 10 ? brighter.toFixed(1) : Math.round(brighter)}× brighter`].filter(Boolean).join(", ");
     layers.set([picture]);
     draw(canvas, layers, { white, mode: 0, logarithmic: false, weights: [1] });
     layers.clear();

@@ -16,11 +16,12 @@ export function compensate({ $, ask, hello }) {
   const pattern = panel("pattern", "Pattern", hello.grid);
   const reach = panel("reach", "Out of reach", hello.camera_grid);
   const line = document.createElement("span"), source = $("compensate-source");
-  line.className = "line";
+  Object.assign(line, { className: "line", hidden: true });
   wipe.sheet.append(line);
   wipe.others = [0, 1];
 
   function part(share) {
+    line.hidden = false;
     wipe.wipe = share;
     line.style.left = `${100 * share}%`;
     wipe.redrawSoon();
@@ -37,7 +38,7 @@ export function compensate({ $, ask, hello }) {
     $("compensate-low-value").textContent = low.value;
     $("compensate-high-value").textContent = high.value;
     if (!auto.checked) $("compensate-gain-value").textContent = gain.value;
-    const answer = await ask("compensate", { picture: source.value, gain: auto.checked ? "auto" : Number(gain.value), bounds: [Number(low.value), Number(high.value)] });
+    const answer = await ask("compensate", { picture: Number(source.value), gain: auto.checked ? "auto" : Number(gain.value), bounds: [Number(low.value), Number(high.value)] });
     if (!answer) return;
     const { arrays } = answer, white = arrays.target.white();
     wipe.note = "without ◂ ▸ with compensation";
@@ -54,10 +55,10 @@ export function compensate({ $, ask, hello }) {
   }
 
   function report(answer) {
-    $("compensate-report").hidden = false;
+    $("compensate-more").hidden = false;
     const lines = { Error: percent(answer.error), Gain: answer.gain.toPrecision(3), Clipped: percent(answer.clipped),
       Method: `${answer.method}, ${answer.products} products, ${answer.seconds.toPrecision(2)} s` };
-    $("compensate-numbers").replaceChildren(...Object.entries(lines).flatMap(([name, value]) => {
+    $("compensate-report").replaceChildren(...Object.entries(lines).flatMap(([name, value]) => {
       const [term, text] = [document.createElement("dt"), document.createElement("dd")];
       [term.textContent, text.textContent] = [name, value];
       return [term, text];

@@ -4,12 +4,13 @@
 import { decode, encode } from "./messages.js";
 
 const LONGEST_WAIT = 5000; // ms between two tries
+const AT_ONCE = { bounces: Infinity, compensate: Infinity }; // a newer one of these ends the one under way
 
 export class Connection extends EventTarget {
   // Events: "open" (with the server's greeting as detail), "lost", "busy", "idle", and one per push, by its name.
   constructor() {
     super();
-    this.waiting = new Map(); // by the kind of question: [the one under way, the newest after it]
+    this.kinds = new Map(); // of questions under way: those that were sent, and the newest after them
     this.questions = 0;
     this.tries = 0;
     this.connect();
@@ -22,8 +23,8 @@ export class Connection extends EventTarget {
     this.socket.binaryType = "arraybuffer";
     this.socket.onmessage = ({ data }) => this.receive(decode(data));
     this.socket.onclose = () => {
-      for (const [now, next] of this.waiting.values()) for (const each of [now, next]) each?.answer(null);
-      this.waiting.clear();
+      for (const { sent, next } of this.kinds.values()) for (const each of [...sent, next]) each?.answer(null);
+      this.kinds.clear();
       this.tell("lost");
       setTimeout(() => this.connect(), Math.min(LONGEST_WAIT, 250 * 2 ** this.tries++));
     };
@@ -33,41 +34,42 @@ export class Connection extends EventTarget {
     this.dispatchEvent(new CustomEvent(name, { detail }));
   }
 
-  // The answer, or null where a newer question of this kind took its place or the connection was lost:
-  // one question of a kind is under way at a time, so that painting never queues. Errors are thrown.
+  // The answer, or null where a newer question of this kind took its place or the connection was lost.
+  // Errors are thrown. Painting never queues: a question waits here while two are under way.
   ask(kind, fields = {}, arrays = {}) {
     if (this.socket.readyState !== WebSocket.OPEN) return Promise.resolve(null);
     return new Promise((answer, fail) => {
-      const question = { id: ++this.questions, kind, fields, arrays, answer, fail };
-      const pair = this.waiting.get(kind);
-      if (pair) {
-        pair[1]?.answer(null);
-        pair[1] = question;
-      } else this.send(question);
+      const queue = this.kinds.get(kind) ?? { sent: [], next: null };
+      this.kinds.set(kind, queue);
+      queue.next?.answer(null);
+      queue.next = { id: ++this.questions, kind, fields, arrays, answer, fail };
+      this.send(queue);
+      this.tell("busy");
     });
   }
 
-  send(question) {
-    this.waiting.set(question.kind, [question, null]);
-    this.socket.send(encode({ id: question.id, do: question.kind, ...question.fields }, question.arrays));
-    this.tell("busy");
+  send(queue) {
+    if (!queue.next || queue.sent.length >= (AT_ONCE[queue.next.kind] ?? 2)) return;
+    const { id, kind, fields, arrays } = queue.next;
+    this.socket.send(encode({ id, do: kind, ...fields }, arrays));
+    queue.sent.push(queue.next);
+    queue.next = null;
   }
 
   receive(message) {
-    const pair = this.waiting.get(message.do);
+    const queue = this.kinds.get(message.do), at = queue?.sent.findIndex(({ id }) => id === message.id) ?? -1;
     if (message.do === "hello") {
       this.tries = 0;
       this.tell("open", message);
-    } else if (!pair || pair[0].id !== message.id) {
-      if (message.error) this.tell("refused", message.error);
-      this.tell(message.do, message);
-    } else {
-      const [{ answer, fail }, next] = pair;
-      this.waiting.delete(message.do);
-      if (next) this.send(next);
-      if (message.error) fail(new Error(message.error));
-      else answer(message);
-      if (!this.waiting.size) this.tell("idle");
+    } else if (at < 0) this.tell(message.do, message);
+    else {
+      const [question, ...older] = queue.sent.splice(0, at + 1).reverse();
+      older.forEach((each) => each.answer(null)); // the server took a newer one in their place
+      this.send(queue);
+      if (!queue.sent.length) this.kinds.delete(message.do);
+      if (typeof message.error === "string") question.fail(new Error(message.error)); // a number is a result's
+      else question.answer(message);
+      if (!this.kinds.size) this.tell("idle");
     }
   }
 }

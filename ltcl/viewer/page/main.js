@@ -62,16 +62,16 @@ connection.addEventListener("lost", () => {
   document.body.dataset.state = "lost";
   say("Not connected; trying again…");
 });
-connection.addEventListener("refused", ({ detail }) => say(detail));
 connection.addEventListener("busy", () => { document.body.dataset.state = "busy"; });
 connection.addEventListener("idle", () => {
   document.body.dataset.state = "ready";
   $("progress").hidden = true;
 });
-connection.addEventListener("progress", ({ detail: { done, total } }) => {
+connection.addEventListener("progress", ({ detail: { residual } }) => {
+  const share = Math.min(Math.max(-Math.log10(residual) / 3, 0.03), 1); // of the way to the usual tolerance
   $("progress").hidden = false;
-  $("progress").firstElementChild.style.width = `${(100 * done) / total}%`;
-  $("progress").setAttribute("aria-valuenow", Math.round((100 * done) / total));
+  $("progress").firstElementChild.style.width = `${100 * share}%`;
+  $("progress").setAttribute("aria-valuenow", Math.round(100 * share));
 });
 
 // ---- views

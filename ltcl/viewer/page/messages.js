@@ -19,8 +19,8 @@ export class Pixels {
     return Array.from({ length: this.c }, (_, k) => this.number((row * this.w + col) * this.c + k));
   }
 
-  // What to show as white: nearly all pixels are below it. One lit pixel alone would leave the rest black.
-  white() {
+  // What to show as white: that share of pixels is below it. The brightest one would often leave the rest black.
+  white(share = 0.99) {
     const n = this.h * this.w, step = Math.max(1, Math.floor(n / 4096)), light = [];
     for (let i = 0; i < n; i += step) {
       let most = 0;
@@ -28,7 +28,7 @@ export class Pixels {
       light.push(most);
     }
     light.sort((a, b) => a - b);
-    return light[Math.floor(0.99 * (light.length - 1))] || light[light.length - 1];
+    return light[Math.floor(share * (light.length - 1))] || light[light.length - 1];
   }
 }
 

@@ -29,10 +29,12 @@ export function probe({ $, ask, press, hello }) {
     const { panel, kind, array, other } = sides[source];
     panel.ring();
     const answer = await ask(kind, { pixel: panel.cursor });
-    if (answer && sides[source].kind === kind) sides[other].panel.show(answer.arrays[array]);
+    if (!answer || sides[source].kind !== kind) return;
+    const light = answer.arrays[array];
+    sides[other].panel.show(light, [1], light.white(0.95)); // what was lit directly is far brighter than the rest
   }
 
-  // From now on the ring is in the picture of this side, which shows the light that is there now.
+  // From now on the ring is in the picture of this side, which shows the scene (or, of another grid, the pattern).
   function turn(name) {
     source = name;
     held = false;
@@ -47,11 +49,11 @@ export function probe({ $, ask, press, hello }) {
   }
 
   async function start() {
-    const { panel, array, other } = sides[source];
-    sides[other].panel.note = source === "projector" ? "light of the ring’s pixel" : "its share of the ring’s light";
+    const { panel, other } = sides[source];
+    sides[other].panel.note = source === "projector" ? "what the ring’s pixel lights" : "where the ring’s light comes from";
     look();
     const now = await ask("relight");
-    if (now && sides[source].panel === panel) panel.show(now.arrays[array === "picture" ? "pattern" : "picture"]);
+    if (now && sides[source].panel === panel) panel.show(now.arrays[source === "camera" || hello.square ? "picture" : "pattern"]);
   }
 
   $("probe-forward").onclick = () => turn("projector");

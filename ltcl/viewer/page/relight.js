@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Relight: paint on the projector's pattern, or let a picture, a video or a moving spot do it; the scene answers.
 
+import { draw, Layers } from "./gl.js";
 import { Pixels } from "./messages.js";
 import { Panel } from "./panel.js";
 
@@ -141,15 +142,13 @@ export function relight({ $, ask, press, hello }) {
     return true;
   }
 
-  // What the server has as its pattern, as codes.
+  // What the server has as its pattern, as codes. All white is how it begins, and leaves nothing to paint.
   function shown(light) {
-    const image = paint.createImageData(w, h), code = (v) => 255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055);
-    for (let i = 0; i < h * w; i++) {
-      for (let k = 0; k < 3; k++) image.data[4 * i + k] = Math.round(code(light.number(i * light.c + (light.c === 3 ? k : 0))));
-      image.data[4 * i + 3] = 255;
-    }
-    paint.putImageData(image, 0, 0);
-    canvas().dataset.frame = Number(canvas().dataset.frame ?? 0) + 1;
+    const layers = new Layers();
+    layers.set([light]);
+    draw(canvas(), layers, { white: 1, mode: 0, logarithmic: false, weights: [1] });
+    layers.clear();
+    if (light.data.every((stored) => stored === light.data[0])) spot(2);
   }
 
   async function start(fields = {}) {
@@ -183,7 +182,7 @@ export function relight({ $, ask, press, hello }) {
   source.onchange = () => {
     still();
     remember();
-    if (source.value) start({ picture: source.value });
+    if (source.value) start({ picture: Number(source.value) });
   };
   return { start: () => start(), stop: still, take };
 }
