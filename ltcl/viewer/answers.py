@@ -187,11 +187,11 @@ class Scene:
                 "device": report.device(self.T.device),
             }
             return report.dumps(known | facts).encode()
-        what, encoding = getattr(c, name.split(".")[0], None), "auto"
-        if name == "pattern.png":
-            what = c.pattern / np.float32(max(facts["bounds"][1], 0.0) or 1.0)
-        elif name == "codes.png":
-            what, encoding = self._codes(c.pattern, max(facts["bounds"][1], 0.0) or 1.0) / 255, "linear"
+        white, encoding = max(float(facts["bounds"][1]), 0.0) or 1.0, "auto"
+        if name == "codes.png":
+            what, encoding = self._codes(c.pattern, white) / np.float32(255), "linear"
+        else:
+            what = c.pattern / np.float32(white) if name == "pattern.png" else getattr(c, name[:-4])
         with TemporaryDirectory() as folder:
             images.write(path := Path(folder) / name, what, encoding=encoding)
             return path.read_bytes()

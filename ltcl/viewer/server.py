@@ -13,11 +13,11 @@ import asyncio
 import contextlib
 import html
 import ipaddress
+import itertools
 import secrets
 import socket
 import threading
 import time
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,8 @@ PATIENCE, LIFETIME = 5.0, 60.0  # seconds for a client to read an answer, or to 
 _UNSENT = 2  # answers that wait for the network while the next one is computed
 _PERIOD = 0.1  # seconds between two reports of progress
 _HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
-    "media-src blob:; connect-src 'self' ws://{}; base-uri 'none'; form-action 'none'; "
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; media-src blob:; connect-src 'self' ws://{}; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'self' http://127.0.0.1:* http://localhost:*",  # notebooks
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -55,13 +55,13 @@ class _Superseded(Exception):
 
 
 class Client:
-    """A socket, with questions that wait, by what they ask, and messages that are to be sent, by their keys."""
+    """A socket: questions that wait, by what they ask, and messages to be sent, by their keys."""
 
     def __init__(self, socket: WebSocket) -> None:
         self.socket, self.loop, self.changed = socket, asyncio.get_running_loop(), asyncio.Event()
         self.waiting: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
         self.unsent: dict[Any, str | bytes] = {}
-        self.projects = self.closed = False
+        self.projects, self.closed, self.turn = False, False, 0
 
     def post(self, key: Any, message: str | bytes) -> None:
         """Send a message, in place of one with this key that still waits; from any thread."""
@@ -85,7 +85,7 @@ class Client:
             worker.wake()
 
     async def receive(self, worker: Worker) -> None:
-        """Take questions until the socket is closed, none while answers pile up; InputError for no question."""
+        """Take questions to the end, none while answers pile up; InputError for what is no question."""
         while (event := await self.socket.receive())["type"] == "websocket.receive":
             header, arrays = messages.decode(event.get("text") or event.get("bytes") or b"")
             self.waiting[header["do"]] = header, arrays
@@ -99,8 +99,8 @@ class Worker(threading.Thread):
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(name="ltcl viewer", daemon=True)
-        self.scene, self.clients, self.ended = scene, deque[Client](), False
-        self._shown, self._work = scene.pattern, threading.Event()
+        self.scene, self.clients, self.ended = scene, list[Client](), False
+        self._shown, self._work, self._turns = scene.pattern, threading.Event(), itertools.count(1)
 
     def wake(self) -> None:
         """Look for questions."""
@@ -115,13 +115,11 @@ class Worker(threading.Thread):
                 pass
 
     def _answer_next(self, among: tuple[str, ...] = ()) -> bool:
-        """Answer a question of the client whose turn it is, if there is one."""
-        for client in list(self.clients):
+        """Answer a question of the client that waits longest for its turn, if there is one."""
+        for client in sorted(self.clients, key=lambda client: client.turn):
             for do in list(client.waiting) if len(client.unsent) < _UNSENT else ():
                 if not among or do in among:
-                    with contextlib.suppress(ValueError):  # it has gone
-                        self.clients.remove(client)
-                        self.clients.append(client)
+                    client.turn = next(self._turns)
                     self._answer(client, *client.waiting.pop(do))
                     return True
         return False
@@ -135,8 +133,8 @@ class Worker(threading.Thread):
             if self.ended or client.closed or do in client.waiting:
                 raise _Superseded
             if (now := time.monotonic()) > reported + _PERIOD:
-                facts = {"do": "progress", "id": number, "step": do, "done": iteration, "residual": residual}
-                client.post("progress", messages.encode(facts))
+                facts = {"step": do, "done": iteration, "total": None, "residual": residual}
+                client.post("progress", messages.encode({"do": "progress", "id": number, **facts}))
                 reported = now
             self._answer_next(QUICK)  # who only wants to look does not wait for the end of a solve
 
@@ -180,7 +178,7 @@ class _Socket(WebSocketsSansIOProtocol):
 
 
 class Viewer:
-    """A viewer that runs in threads of its own until `close`, or the end of a with block; `url` is its page."""
+    """A viewer in threads of its own until `close`, or the end of a with block; `url` is its page."""
 
     def __init__(self, scene: Scene, host: str, port: int) -> None:
         token, address = secrets.token_urlsafe(24), _address(host)
@@ -196,11 +194,8 @@ class Viewer:
         self.url, self._token = f"http://{name}:{self._port}/{token}/", token.encode()
         page = (Path(__file__).parent / "page").iterdir()
         self._files = {file.name: file.read_bytes() for file in page if file.suffix in TYPES}
-        self._worker, self._uploads, self._decoding = (
-            Worker(scene),
-            asyncio.Semaphore(UPLOADS),
-            asyncio.Lock(),
-        )
+        self._worker = Worker(scene)
+        self._uploads, self._decoding = asyncio.Semaphore(UPLOADS), asyncio.Lock()
         config = uvicorn.Config(
             self._application,
             interface="asgi3",
@@ -216,10 +211,8 @@ class Viewer:
             proxy_headers=False,
             timeout_graceful_shutdown=1,
         )
-        self._uvicorn, sockets = uvicorn.Server(config), [self._listening]
-        self._thread = threading.Thread(
-            target=self._uvicorn.run, args=(sockets,), name="ltcl server", daemon=True
-        )
+        self._uvicorn = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self._uvicorn.run, args=([self._listening],), daemon=True)
         self._worker.start()
         self._thread.start()
 
@@ -316,6 +309,7 @@ class Viewer:
             worker.clients.remove(client)
             for task in tasks:
                 task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _address(host: str) -> Any:
