@@ -1,75 +1,63 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`view`: a page in the browser in which light transport can be touched; `ltcl view` on the command line."""
+"""`view`: light transport in the browser, to be touched; `ltcl view` on the command line."""
 
 from __future__ import annotations
 
-import html
+import logging
 import webbrowser
 from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ltcl.errors import InputTypeError
+from ltcl.errors import InputError
 from ltcl.transport import Transport, require
 
-LOCAL = "127.0.0.1"
-
-
-class Viewer:
-    """A viewer that runs until `close`, which the end of a with block calls; `url` is its page."""
-
-    def __init__(
-        self,
-        T: Transport,
-        title: str,
-        pictures: Mapping[str, np.ndarray] = MappingProxyType({}),
-        setup: Any = None,
-        *,
-        host: str = LOCAL,
-        port: int = 0,
-    ) -> None:
-        try:
-            from ltcl.viewer.server import Server
-        except ImportError as error:
-            raise InputTypeError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
-        from ltcl.viewer.answers import Scene
-
-        self._server = Server(Scene(T, title, pictures, setup), host, port)
-        self.url, self.is_local = self._server.url, self._server.is_local
-
-    def wait(self) -> None:
-        """Until the viewer is closed."""
-        self._server.wait()
-
-    def close(self) -> None:
-        """End the server; pages say that they lost it."""
-        self._server.close()
-
-    def __enter__(self) -> Viewer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __repr__(self) -> str:
-        return f"<ltcl Viewer at {self.url}>"
-
-    def _repr_html_(self) -> str:
-        return f'<iframe src="{html.escape(self.url)}" style="width:100%;height:720px;border:0"></iframe>'
+if TYPE_CHECKING:
+    from ltcl.viewer.server import Viewer
 
 
 def view(
     T: Transport,
     picture: Any = None,
     *,
-    host: str = LOCAL,
+    host: str = "127.0.0.1",
     port: int = 0,
     open_browser: bool = True,
+    setup: Any = None,
+    title: str = "",
 ) -> Viewer:
-    """Show T in the browser."""
-    viewer = Viewer(require(T, square=False), repr(T)[1:-1], host=host, port=port)
+    """Show T in the browser: probe it, separate bounces, relight, compensate; feed a projector.
+
+    Parameters
+    ----------
+    T : Transport
+    picture : (h, w[, 3]), or a dict of them by names, optional
+        Linear light: targets of compensations, pictures to separate or relight with.
+    host, port : str, int
+        Address to listen on. Beyond this machine whoever has the URL can look and compute.
+    setup : ltcl.acquisition.Setup, optional
+        Of a measured T: projector windows then show its codes, else sRGB.
+
+    Returns a `Viewer`: its `url`, `close()`, a with block; a notebook shows it as a frame. InputError for an
+    address that cannot be had, or without the extra `view`.
+
+    Examples
+    --------
+    >>> import ltcl
+    >>> T = ltcl.scenes.dihedral(4, albedo=0.5).transport()
+    >>> with ltcl.view(T, open_browser=False) as viewer:
+    ...     viewer.url.startswith("http://127.0.0.1:")
+    True
+    """
+    require(T, square=False)
+    try:
+        from ltcl.viewer.server import Scene, Viewer
+    except ImportError as error:
+        raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
+    pictures = picture if isinstance(picture, Mapping) else {} if picture is None else {"picture": picture}
+    viewer = Viewer(Scene(T, title or repr(T).strip("<>"), pictures, setup), host, port)
+    if not viewer.is_local:
+        text = "%s is open to the network, unencrypted: whoever has the URL can look and compute"
+        logging.getLogger(__name__).warning(text, viewer.url)
     if open_browser:
         webbrowser.open(viewer.url)
     return viewer

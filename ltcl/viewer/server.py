@@ -2,190 +2,172 @@
 """The viewer's server: who may ask, whose turn it is, and what is sent to whom.
 
 Addresses begin with a random token. Whoever lacks it, or comes from another origin or under another host's
-name (DNS rebinding), gets 403 whatever else is asked. Pages ask through one WebSocket each. One thread
-computes, since the device is one; connections take turns; what one of them asks again takes the place of what
-waits. One that does not read its answers is closed, and delays nobody.
+name (DNS rebinding), gets 403 whatever is asked for. A page asks through one WebSocket. One thread computes,
+since the device is one; clients take turns, and what one asks again replaces what it has waiting. A client
+that does not read its answers is closed, and delays nobody.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import html
 import ipaddress
+import itertools
 import secrets
 import socket
 import threading
 import time
-from collections import deque
 from pathlib import Path
 from typing import Any
 
 import uvicorn
-from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import Response
-from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.responses import JSONResponse, Response
+from starlette.websockets import WebSocket
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
+from ltcl import checks
 from ltcl.errors import InputError, LtclError
 from ltcl.viewer import messages
-from ltcl.viewer.answers import QUICK, Scene
+from ltcl.viewer.answers import LARGEST_FILE, QUICK, Scene
 
-TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
-SOCKETS, CONNECTIONS = 32, 256
-PATIENCE, LIFETIME = 5.0, 60.0  # seconds for a socket to read an answer; for a request without a socket
+TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json"}
+TYPES |= {".png": "image/png", ".exr": "image/x-exr"}
+SOCKETS, CONNECTIONS, UPLOADS = 32, 256, 4
+PATIENCE, LIFETIME = 5.0, 60.0  # seconds for a client to read an answer, or to ask; of what is no socket
 _UNSENT = 2  # answers that wait for the network while the next one is computed
-_PROGRESS = 0.1  # seconds between two reports
-_FRAMES = "'self' http://127.0.0.1:* http://localhost:*"  # notebooks
-_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; media-src 'self' blob:; "
-    "connect-src 'self' ws://{}; base-uri 'none'; form-action 'none'; frame-ancestors " + _FRAMES
-)
+_PERIOD = 0.1  # seconds between two reports of progress
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob:; media-src blob:; connect-src 'self' ws://{}; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'self' http://127.0.0.1:* http://localhost:*",  # notebooks
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
 
 
-class Superseded(Exception):
-    """What is computed is not wanted any more."""
+class _Superseded(Exception):
+    """Nobody waits for what is computed any more."""
 
 
 class Client:
-    """One socket: questions that wait, by what they ask, and messages that are to be sent, by their keys."""
+    """A socket: questions that wait, by what they ask, and messages to be sent, by their keys."""
 
     def __init__(self, socket: WebSocket) -> None:
-        self.socket, self.loop = socket, asyncio.get_running_loop()
+        self.socket, self.loop, self.changed = socket, asyncio.get_running_loop(), asyncio.Event()
         self.waiting: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
         self.unsent: dict[Any, str | bytes] = {}
-        self.news, self.room = asyncio.Event(), asyncio.Event()
-        self.projects = self.closed = False
+        self.projects, self.closed, self.turn = False, False, 0
 
     def post(self, key: Any, message: str | bytes) -> None:
-        """Send a message in place of one with this key that was not sent yet; from any thread."""
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            self.loop.call_soon_threadsafe(self._post, key, message)
+        """Send a message, in place of one with this key that still waits; from any thread."""
 
-    def _post(self, key: Any, message: str | bytes) -> None:
-        self.unsent[key] = message
-        self.news.set()
+        def put() -> None:
+            self.unsent[key] = message
+            self.changed.set()
+
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self.loop.call_soon_threadsafe(put)
 
     async def send(self, worker: Worker) -> None:
-        """Send what there is, for ever; TimeoutError where the other side does not read."""
+        """Send what there is, until TimeoutError: the other side does not read."""
         while True:
-            await self.news.wait()
-            self.news.clear()
-            while self.unsent:
-                message = self.unsent.pop(next(iter(self.unsent)))
-                sent = self.socket.send_text if isinstance(message, str) else self.socket.send_bytes
-                await asyncio.wait_for(sent(message), PATIENCE)
-                self.room.set()
-                worker.wake()
+            if not self.unsent:
+                self.changed.clear()
+                await self.changed.wait()
+            message = self.unsent.pop(next(iter(self.unsent)))
+            kind = "text" if isinstance(message, str) else "bytes"
+            await asyncio.wait_for(self.socket.send({"type": "websocket.send", kind: message}), PATIENCE)
+            worker.wake()
 
     async def receive(self, worker: Worker) -> None:
-        """Take questions, for ever; none while answers pile up."""
-        while True:
-            event = await self.socket.receive()
-            if event["type"] == "websocket.disconnect":
-                return
+        """Take questions to the end, none while answers pile up; InputError for what is no question."""
+        while (event := await self.socket.receive())["type"] == "websocket.receive":
             header, arrays = messages.decode(event.get("text") or event.get("bytes") or b"")
-            worker.ask(self, header, arrays)
-            while len(self.unsent) > 4 * _UNSENT:
-                self.room.clear()
-                await self.room.wait()
+            self.waiting[header["do"]] = header, arrays
+            worker.wake()
+            while len(self.unsent) > 2 * _UNSENT or len(self.waiting) > 2 * len(QUICK):
+                await asyncio.sleep(_PERIOD)
 
 
 class Worker(threading.Thread):
-    """The thread that computes, one question at a time, clients in turn."""
+    """The thread that computes: one question at a time, clients in turn."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(name="ltcl viewer", daemon=True)
-        self.scene, self.clients, self.ended = scene, deque[Client](), False
-        self._changed = threading.Condition()
+        self.scene, self.clients, self.ended = scene, list[Client](), False
+        self._shown, self._work, self._turns = scene.pattern, threading.Event(), itertools.count(1)
 
     def wake(self) -> None:
-        """Look again for what can be done."""
-        with self._changed:
-            self._changed.notify()
-
-    def ask(self, client: Client, header: dict[str, Any], arrays: dict[str, Any]) -> None:
-        """Queue a question in place of one that asks for the same and waits."""
-        if header["do"] == "projector":
-            client.projects = True
-            client.post("show", self._shown())
-            return
-        with self._changed:
-            client.waiting[header["do"]] = header, arrays
-            self._changed.notify()
+        """Look for questions."""
+        self._work.set()
 
     def run(self) -> None:
         """Answer until the end."""
         while not self.ended:
-            with self._changed:
-                turn = self._take()
-                if turn is None:
-                    self._changed.wait()
-            if turn is not None:
-                self._answer(*turn)
+            self._work.wait()
+            self._work.clear()
+            while self._answer_next():
+                pass
 
-    def _take(self, among: tuple[str, ...] = ()) -> tuple[Client, dict[str, Any], dict[str, Any]] | None:
-        for client in list(self.clients):
-            if len(client.unsent) < _UNSENT:
-                for do in client.waiting:
-                    if not among or do in among:
-                        self.clients.remove(client)
-                        self.clients.append(client)
-                        return client, *client.waiting.pop(do)
-        return None
+    def _answer_next(self, among: tuple[str, ...] = ()) -> bool:
+        """Answer a question of the client that waits longest for its turn, if there is one."""
+        for client in sorted(self.clients, key=lambda client: client.turn):
+            for do in list(client.waiting) if len(client.unsent) < _UNSENT else ():
+                if not among or do in among:
+                    client.turn = next(self._turns)
+                    self._answer(client, *client.waiting.pop(do))
+                    return True
+        return False
 
     def _answer(self, client: Client, header: dict[str, Any], arrays: dict[str, Any]) -> None:
-        own, asked = {"id": header.pop("id"), "do": header.pop("do")}, header | arrays
-        pattern, reported = self.scene.pattern, 0.0
+        number, do = header.pop("id"), header.pop("do")
+        reported = time.monotonic()
 
         def between(iteration: int, residual: float) -> None:
             nonlocal reported
-            if self.ended or client.closed or own["do"] in client.waiting:
-                raise Superseded
-            if time.monotonic() > reported + _PROGRESS:
-                reported = time.monotonic()
-                step = {"id": own["id"], "do": "progress", "step": own["do"], "done": iteration}
-                client.post("progress", messages.encode(step | {"residual": residual}))
-            with self._changed:  # who only wants to look does not wait for the end of a solve
-                turn = self._take(QUICK)
-            if turn is not None:
-                self._answer(*turn)
+            if self.ended or client.closed or do in client.waiting:
+                raise _Superseded
+            if (now := time.monotonic()) > reported + _PERIOD:
+                facts = {"step": do, "done": iteration, "total": None, "residual": residual}
+                client.post("progress", messages.encode({"do": "progress", "id": number, **facts}))
+                reported = now
+            self._answer_next(QUICK)  # who only wants to look does not wait for the end of a solve
 
         try:
-            facts, pictures = self.scene.answer(own["do"], asked, between)
-            message = messages.encode(own | facts, pictures)
-        except Superseded:
+            facts, pictures = self.scene.answer(do, header | arrays, between)
+        except _Superseded:
             return
-        except LtclError as error:
-            message = messages.encode(own | {"error": " ".join(str(error).split())})
         except Exception as error:  # noqa: BLE001 - the next question may go well
-            message = messages.encode(own | {"error": f"internal error: {type(error).__name__}: {error}"})
-        client.post(("answer", own["id"]), message)
-        if self.scene.pattern is not pattern:
-            windows = [each for each in self.clients if each.projects]
-            shown = self._shown() if windows else ""
-            for window in windows:
-                window.post("show", shown)
-
-    def _shown(self) -> bytes:
-        return messages.encode({"do": "show"}, {"codes": self.scene.codes()})
+            kind = "" if isinstance(error, LtclError) else f"internal error: {type(error).__name__}: "
+            facts, pictures = {"error": kind + " ".join(str(error).split())}, {}
+        client.post(("answer", number), messages.encode({"id": number, "do": do, **facts}, pictures))
+        client.projects |= do == "projector"
+        if self.scene.pattern is not self._shown or do == "projector":
+            self._shown = self.scene.pattern
+            if windows := [each for each in list(self.clients) if each.projects]:
+                shown = messages.encode({"do": "show"}, {"codes": self.scene.codes()})
+                for window in windows:
+                    window.post("show", shown)
 
 
 class _Http(H11Protocol):
-    """Connections that stay silent, or hold on, give way to others."""
+    """Connections that stay silent, or last, give way to others."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
         self.loop.call_later(PATIENCE, lambda: self.scope is None and self._drop())
         self.loop.call_later(LIFETIME, self._drop)
-        if len(self.connections) > CONNECTIONS:
-            oldest = next((each for each in self.connections if isinstance(each, _Http)), self)
-            oldest.transport.abort()
+        plain = [each for each in self.connections if isinstance(each, _Http)]
+        if len(plain) > CONNECTIONS:
+            plain[0].transport.abort()
 
     def _drop(self) -> None:
-        if self in self.connections:  # and no socket
+        if self in self.connections:  # and has not become a socket
             self.transport.abort()
 
 
@@ -195,42 +177,33 @@ class _Socket(WebSocketsSansIOProtocol):
         self.app_state = {"abort": transport.abort}  # which, unlike close, does not wait for a reader
 
 
-class Server:
-    """The application, and uvicorn in a thread of its own; `url` has the token."""
+class Viewer:
+    """A viewer in threads of its own until `close`, or the end of a with block; `url` is its page."""
 
     def __init__(self, scene: Scene, host: str, port: int) -> None:
-        self.scene, self.worker, self.token = scene, Worker(scene), secrets.token_urlsafe(24)
-        self._files = {
-            file.name: (TYPES[file.suffix], file.read_bytes())
-            for file in (Path(__file__).parent / "page").iterdir()
-            if file.suffix in TYPES
-        }
-        self._host, address = host.lower(), ipaddress_of(host)
-        self.is_local = self._host == "localhost" or (address is not None and address.is_loopback)
+        token, address = secrets.token_urlsafe(24), _address(host)
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._listening = socket.create_server((host, port), family=family)
-        except OSError as error:
-            raise InputError(f"host is {host!r} and port {port}: {error.strerror or error}") from None
-        self.port = self._listening.getsockname()[1]
-        shown = socket.gethostname() if address is not None and address.is_unspecified else host
-        self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self.port}/{self.token}/"
-        routes = [
-            Route("/", self._file),
-            Route("/{name}", self._file),
-            WebSocketRoute("/socket", self._socket),
-        ]
-        self._application = Starlette(routes=routes)
-        self._application.router.redirect_slashes = False
-        T = scene.T
+            self._listening = socket.create_server((host, checks.count("port", port, least=0)), family=family)
+        except (OSError, OverflowError) as error:
+            raise InputError(f"host is {host!r}, port {port}: {error}; they must be free here") from None
+        self.is_local = host == "localhost" or (address is not None and address.is_loopback)
+        name = socket.gethostname() if address is not None and address.is_unspecified else host
+        name, self._port = f"[{name}]" if ":" in name else name, self._listening.getsockname()[1]
+        self._names = {"127.0.0.1", "localhost", "[::1]", name.lower()}
+        self.url, self._token = f"http://{name}:{self._port}/{token}/", token.encode()
+        page = (Path(__file__).parent / "page").iterdir()
+        self._files = {file.name: file.read_bytes() for file in page if file.suffix in TYPES}
+        self._worker = Worker(scene)
+        self._uploads, self._decoding = asyncio.Semaphore(UPLOADS), asyncio.Lock()
         config = uvicorn.Config(
-            self._guard,
+            self._application,
+            interface="asgi3",
             http=_Http,
             ws=_Socket,
-            ws_max_size=messages.largest(max(T.shape)),
+            ws_max_size=messages.largest(max(scene.T.shape)),
             ws_per_message_deflate=False,  # which takes longer than a loopback
             lifespan="off",
-            interface="asgi3",
             log_config=None,
             log_level="critical",
             access_log=False,
@@ -239,96 +212,108 @@ class Server:
             timeout_graceful_shutdown=1,
         )
         self._uvicorn = uvicorn.Server(config)
-        run = {"sockets": [self._listening]}
-        self._thread = threading.Thread(target=self._uvicorn.run, kwargs=run, name="ltcl server", daemon=True)
-        self.worker.start()
+        self._thread = threading.Thread(target=self._uvicorn.run, args=([self._listening],), daemon=True)
+        self._worker.start()
         self._thread.start()
 
     def wait(self) -> None:
-        """Until the server ends."""
+        """Until the viewer is closed."""
         while self._thread.is_alive():
             self._thread.join(0.5)  # which Ctrl-C interrupts on any system
 
     def close(self) -> None:
         """End it; pages say that they lost it."""
-        self.worker.ended = self._uvicorn.should_exit = True
-        self.worker.wake()
+        self._worker.ended = self._uvicorn.should_exit = True
+        self._worker.wake()
         self._thread.join()
 
-    async def _guard(self, scope: Any, receive: Any, send: Any) -> None:
-        """Everything passes here: 403 without a word about what there is, unless all is right."""
-        headers: dict[bytes, list[str]] = {}
-        for name, value in scope["headers"]:
-            headers.setdefault(name, []).append(value.decode("latin-1"))
-        hosts, origins = headers.get(b"host", []), headers.get(b"origin", [])
-        token, slash, name = scope["path"].removeprefix("/").partition("/")
-        is_own = secrets.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
-        is_own &= len(hosts) == 1 and self._is_host(hosts[0])
-        plain = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
-        is_own &= origins == [f"http://{''.join(hosts)}"] or (plain and not origins)
-        if not is_own:
-            if scope["type"] == "websocket":
-                await receive()
-                await send({"type": "websocket.close"})
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<ltcl Viewer at {self.url}>"
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{html.escape(self.url)}" style="width:100%;height:720px;border:0"></iframe>'
+
+    async def _application(self, scope: Any, receive: Any, send: Any) -> None:
+        """All requests pass here; those that may not get 403 and no word about what there is."""
+        named = [(name, value.decode("latin-1")) for name, value in scope["headers"]]
+        hosts, origins = ([value for name, value in named if name == key] for key in (b"host", b"origin"))
+        token, slash, path = scope["path"].removeprefix("/").partition("/")
+        reads = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
+        is_allowed = secrets.compare_digest(token.encode("utf-8", "replace"), self._token)
+        is_allowed &= len(hosts) == 1 and self._is_own(hosts[0])
+        is_allowed &= origins == [f"http://{hosts[0]}" if hosts else ""] or (reads and not origins)
+        if scope["type"] == "websocket":
+            websocket = WebSocket(scope, receive, send)
+            if is_allowed and path == "socket" and len(self._worker.clients) < SOCKETS:
+                await self._serve(websocket)
             else:
-                await Response("forbidden", 403)(scope, receive, send)
+                await websocket.close()
             return
-        policy = _POLICY.format(hosts[0])
-        safe = {"content-security-policy": policy, "x-content-type-options": "nosniff"}
-        safe |= {"referrer-policy": "no-referrer", "cache-control": "no-store"}
-        safe |= {"cross-origin-resource-policy": "same-origin"}
+        response = Response("forbidden", 403)
+        if is_allowed:
+            response = await self._respond(Request(scope, receive), path if slash else "/", reads)
+            response.headers.update({name: value.format(hosts[0]) for name, value in _HEADERS.items()})
+        await response(scope, receive, send)
 
-        async def safely(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                message["headers"] += [(name.encode(), value.encode()) for name, value in safe.items()]
-            await send(message)
+    def _is_own(self, host: str) -> bool:
+        """Whether a Host header has a name that no other site can give to this server."""
+        name, _, port = host.lower().rpartition(":")
+        known = name in self._names or (not self.is_local and _address(name.strip("[]")) is not None)
+        return known and port == str(self._port)
 
-        await self._application({**scope, "path": slash + name, "root_path": ""}, receive, safely)
+    async def _respond(self, request: Request, path: str, reads: bool) -> Response:
+        if path == "picture" and request.method == "POST":
+            return await self._upload(request)
+        name = {"": "index.html", "projector": "projector.html"}.get(path, path)
+        content = self._files.get(name)
+        if path.startswith("result/"):
+            name = path.removeprefix("result/")
+            content = await asyncio.to_thread(self._worker.scene.result, name)
+        if content is None or not reads:
+            return Response("not found", 404)
+        return Response(content, media_type=TYPES[Path(name).suffix])
 
-    def _is_host(self, name: str) -> bool:
-        """Whether a Host header means this server, by a name that no other site can give it."""
-        host, _, port = name.rpartition(":")
-        host = host.strip("[]").lower()
-        if port != str(self.port):
-            return False
-        address = ipaddress_of(host)
-        if self.is_local:
-            return host == "localhost" or (address is not None and address.is_loopback)
-        return address is not None or host in ("localhost", self._host, socket.gethostname().lower())
+    async def _upload(self, request: Request) -> Response:
+        name, content = request.query_params.get("name", "")[:255], bytearray()
+        async with self._uploads:
+            async for chunk in request.stream():
+                content += chunk
+                if len(content) > LARGEST_FILE:
+                    return JSONResponse({"error": f"{name!r} has more than {LARGEST_FILE} bytes"}, 413)
+            async with self._decoding:
+                try:
+                    return JSONResponse(await asyncio.to_thread(self._worker.scene.upload, name, content))
+                except LtclError as error:
+                    return JSONResponse({"error": " ".join(str(error).split())}, 400)
 
-    async def _file(self, request: Request) -> Response:
-        name = request.path_params.get("name", "index.html")
-        kind, content = self._files.get({"projector": "projector.html"}.get(name, name), (None, b"not found"))
-        return Response(content, 200 if kind else 404, media_type=kind or "text/plain")
-
-    async def _socket(self, socket: WebSocket) -> None:
-        if len(self.worker.clients) >= SOCKETS:
-            await socket.close()
-            return
-        await socket.accept()
-        client = Client(socket)
-        client._post("hello", messages.encode({"do": "hello", **self.scene.hello()}))
-        self.worker.clients.append(client)
-        tasks = [asyncio.ensure_future(each(self.worker)) for each in (client.receive, client.send)]
+    async def _serve(self, websocket: WebSocket) -> None:
+        await websocket.accept()
+        client, worker = Client(websocket), self._worker
+        client.post("hello", messages.encode({"do": "hello", **worker.scene.hello()}))
+        worker.clients.append(client)
+        tasks = [asyncio.ensure_future(each(worker)) for each in (client.receive, client.send)]
         try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                with contextlib.suppress(WebSocketDisconnect):
-                    task.result()
-        except TimeoutError:
-            socket.state.abort()
-        except InputError as error:
-            await asyncio.wait_for(socket.close(1008, str(error)[:100]), PATIENCE)
+            (ended, *_), _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            if isinstance(error := ended.exception(), InputError):
+                await asyncio.wait_for(websocket.close(1008, f"{error}"[:100]), PATIENCE)
+            elif error is not None:
+                websocket.state.abort()
         finally:
             client.closed = True
-            client.waiting.clear()
-            self.worker.clients.remove(client)
+            worker.clients.remove(client)
             for task in tasks:
                 task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def ipaddress_of(host: str) -> Any:
-    """The address that a text is, or None of a name."""
+def _address(host: str) -> Any:
+    """The IP address that a text is, or None."""
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host)
     return None
