@@ -94,16 +94,17 @@ class Scene:
         return {}, {"pattern": shape.pack(rows, T.grid)}
 
     def relight(self, pattern: Any = None, picture: Any = None) -> Reply:
-        """The picture under a pattern, linear light or sRGB codes, which the projector shows from now on."""
-        if (pattern is None) == (picture is None):
-            raise InputError("relight has both pattern and picture, or none; it must have one of them")
-        if pattern is None:
-            light = self._picture(picture)[2]
-        else:
+        """The picture under a pattern, linear light or sRGB codes, which the projector shows from now on; or now."""
+        if pattern is not None and picture is not None:
+            raise InputError("relight has both pattern and picture; it must have at most one of them")
+        if pattern is not None:
             light = to_linear(checks.shape("pattern", pattern, self.T.grid, (*self.T.grid, 3)), "auto")
-        seen = self.T @ light
-        self.pattern, self.white = light, 1.0
-        return {}, {"picture": seen}
+        else:
+            light = self.pattern if picture is None else self._picture(picture)[2]
+        seen = {"picture": self.T @ light}
+        if light is not self.pattern:
+            self.pattern, self.white = light, 1.0
+        return {}, seen if pattern is not None else seen | {"pattern": light}
 
     def bounces(self, callback: Callback, of: Any = "pattern", picture: Any = None, count: Any = 4) -> Reply:
         """Direct light and bounces of a picture, or of what the current pattern looks like."""
@@ -124,7 +125,7 @@ class Scene:
         self, callback: Callback, picture: Any, gain: Any = None, bounds: Any = (0, 1), method: Any = "auto"
     ) -> Reply:
         """The pattern under which the scene looks like a picture; the projector shows it from now on."""
-        name, desired, _ = self._picture(picture)
+        name, desired, shown = self._picture(picture)
         gain = ("auto" if self.setup else 1.0) if gain is None else gain
         settings = {"gain": gain, "bounds": bounds, "method": method}
         ambient, start = self.setup and self.setup.ambient, time.perf_counter()
@@ -139,7 +140,9 @@ class Scene:
         self.pattern, self.white = c.pattern, max(float(bounds[1]), 0.0) or 1.0
         self._compensation = c, {"picture": name, **settings, **facts, "solves": solves}
         names = ("pattern", "appearance", "target", "out_of_reach")
-        return facts, {name: getattr(c, name) for name in names}
+        plain = self.T @ shown  # what the picture itself makes as a pattern, as bright as the target
+        plain *= np.float32(c.target.mean() / max(plain.mean(), np.finfo(np.float32).tiny))
+        return facts, {name: getattr(c, name) for name in names} | {"uncompensated": plain}
 
     def pictures(self) -> Reply:
         """Names and numbers of the pictures that there are."""

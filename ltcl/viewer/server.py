@@ -34,7 +34,7 @@ from ltcl.viewer import messages
 from ltcl.viewer.answers import LARGEST_FILE, QUICK, Scene
 
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json"}
-TYPES |= {".png": "image/png", ".exr": "image/x-exr"}
+TYPES |= {".svg": "image/svg+xml", ".png": "image/png", ".exr": "image/x-exr"}
 SOCKETS, CONNECTIONS, UPLOADS = 32, 256, 4
 PATIENCE, LIFETIME = 5.0, 60.0  # seconds for a client to read an answer, or to ask; of what is no socket
 _UNSENT = 2  # answers that wait for the network while the next one is computed

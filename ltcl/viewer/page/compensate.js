@@ -19,6 +19,7 @@ export function compensate({ $, ask, hello }) {
   Object.assign(line, { className: "line", hidden: true });
   wipe.sheet.append(line);
   wipe.others = [0, 1];
+  reach.mode = 2;
 
   function part(share) {
     line.hidden = false;
@@ -45,7 +46,9 @@ export function compensate({ $, ask, hello }) {
     wipe.show([arrays.appearance, arrays.uncompensated], [1, 0], white);
     target.show(arrays.target, [1], white);
     pattern.show(arrays.pattern);
-    reach.show(arrays.out_of_reach, [1], white);
+    const missed = arrays.out_of_reach.white(0.999);
+    reach.show(arrays.out_of_reach, [1], Math.max(missed, white / 50));
+    reach.note = missed ? "red: too dark, blue: too bright" : "nothing";
     if (wipe.wipe === undefined) part(0.5);
     if (auto.checked) {
       gain.value = answer.gain;

@@ -61,7 +61,7 @@ export class Panel {
     if (!this.layers.pictures || !this.element.offsetParent) return; // an unseen view is drawn when it comes up
     const white = (this.white || 1) / 2 ** look.stops;
     const { wipe, others, deviation, weights } = this;
-    draw(this.canvas, this.layers, { white, ...look, weights, others, wipe, deviation });
+    draw(this.canvas, this.layers, { white, ...look, mode: this.mode ?? look.mode, weights, others, wipe, deviation });
     this.canvas.dataset.white = white;
     this.read();
   }

@@ -39,6 +39,8 @@ export function relight({ $, ask, press, hello }) {
     return grey ? new Pixels(rgb.filter((_, k) => k % 3 === 0), [h, w, 1], 1, "u1") : new Pixels(rgb, [h, w, 3], 1, "u1");
   }
 
+  const show = (light) => seen.show(light, [1], light.white(0.97)); // bounces are darker than what is lit
+
   // Send what is painted when the last answer has come: there is never more than one pattern on its way.
   async function send() {
     changed = true;
@@ -48,7 +50,7 @@ export function relight({ $, ask, press, hello }) {
     while (changed) {
       changed = false;
       const answer = await ask("relight", {}, { pattern: codes() });
-      if (answer) seen.show(answer.arrays.picture);
+      if (answer) show(answer.arrays.picture);
     }
     sending = false;
     pattern.read();
@@ -148,13 +150,13 @@ export function relight({ $, ask, press, hello }) {
     layers.set([light]);
     draw(canvas(), layers, { white: 1, mode: 0, logarithmic: false, weights: [1] });
     layers.clear();
-    if (light.data.every((stored) => stored === light.data[0])) spot(2);
+    if (light.data.every((stored) => stored === light.data[0])) spot(0.15);
   }
 
   async function start(fields = {}) {
     const answer = await ask("relight", fields);
     if (!answer) return;
-    seen.show(answer.arrays.picture);
+    show(answer.arrays.picture);
     shown(answer.arrays.pattern);
     pattern.read();
   }
