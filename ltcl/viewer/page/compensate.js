@@ -48,7 +48,7 @@ export function compensate({ $, ask, hello }) {
     pattern.show(arrays.pattern);
     const missed = arrays.out_of_reach.white(0.999);
     reach.show(arrays.out_of_reach, [1], Math.max(missed, white / 50));
-    reach.note = missed ? "red: too dark, blue: too bright" : "nothing";
+    reach.note = missed ? "" : "nothing";
     if (wipe.wipe === undefined) part(0.5);
     if (auto.checked) {
       gain.value = answer.gain;

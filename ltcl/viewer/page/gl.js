@@ -2,56 +2,62 @@
 // Draws linear light on canvases. One WebGL context serves them all: it draws at the size of the picture, one
 // fragment a pixel, and the result is copied to the canvas, which CSS enlarges without smoothing.
 
-const LAYERS = 10; // pictures that are summed at most
-
 const VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
-const FRAGMENT = `#version 300 es
-precision highp float;
+// Variants are #define: drawing in software pays for each branch, taken or not.
+const FRAGMENT = `precision highp float;
 precision highp sampler2DArray;
 uniform sampler2DArray light, deviation;
-uniform float weights[${LAYERS}], others[${LAYERS}], spreads[${LAYERS}]; // right, left of the wipe; of deviation
-uniform int layers, mode, height;
-uniform bool grey, logarithmic, uncertain;
+uniform float weights[LAYERS], others[LAYERS], spreads[LAYERS]; // right, left of the wipe; of deviation
+uniform int height;
 uniform float wipe;
 out vec4 colour;
 
 vec3 stored(sampler2DArray pictures, ivec2 at, int k) {
   vec3 value = texelFetch(pictures, ivec3(at, k), 0).rgb;
-  return grey ? value.rrr : value;
+  return GREY ? value.rrr : value;
 }
 vec3 heat(float t) { // fit of matplotlib's inferno by Matt Zucker (CC0)
   return clamp(vec3(0.0002, 0.0016, -0.0194) + t * (vec3(0.1065, 0.5639, 3.9327) + t * (vec3(11.6024, -3.9728, -15.9423)
     + t * (vec3(-41.7039, 17.4363, 44.3541) + t * (vec3(77.1629, -33.4023, -81.8073)
     + t * (vec3(-71.3194, 32.6260, 73.2095) + t * vec3(25.1311, -12.2426, -23.0703)))))), 0.0, 1.0);
 }
+float decades(float value) { return clamp(1.0 + 0.25 * log(max(value, 1e-9)) / log(10.0), 0.0, 1.0); }
 vec3 encoded(vec3 linear) { // sRGB
-  return mix(1.055 * pow(max(linear, 0.0031308), vec3(1.0 / 2.4)) - 0.055, 12.92 * linear, lessThan(linear, vec3(0.0031308)));
+  return mix(1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, 12.92 * linear, lessThan(linear, vec3(0.0031308)));
 }
 void main() {
   ivec2 at = ivec2(int(gl_FragCoord.x), height - 1 - int(gl_FragCoord.y)); // row 0 is at the top
-  bool left = gl_FragCoord.x < wipe;
   vec3 sum = vec3(0.0), variance = vec3(0.0);
-  for (int k = 0; k < layers; k++) {
-    float weight = left ? others[k] : weights[k];
-    if (weight == 0.0) continue;
-    sum += weight * stored(light, at, k);
-    if (uncertain) { vec3 sigma = spreads[k] * stored(deviation, at, k); variance += sigma * sigma; }
+  for (int k = 0; k < LAYERS; k++) {
+#if WIPE
+    sum += (gl_FragCoord.x < wipe ? others[k] : weights[k]) * stored(light, at, k);
+#else
+    sum += weights[k] * stored(light, at, k);
+#endif
+#if UNCERTAIN
+    vec3 sigma = spreads[k] * stored(deviation, at, k);
+    variance += sigma * sigma;
+#endif
   }
-  if (any(isnan(sum))) sum = vec3(0.0); // masked
+  if (isnan(sum.r)) sum = vec3(0.0); // masked
   float most = max(sum.r, max(sum.g, sum.b)), least = min(sum.r, min(sum.g, sum.b));
   float size = -least > most ? least : most; // with the sign of what is larger
-  vec3 shown = sum;
-  if (mode > 0) shown = vec3(mode == 1 ? most : size);
-  if (logarithmic) shown = sign(shown) * clamp(1.0 + log(max(abs(shown), 1e-9)) / log(10.0) / 4.0, 0.0, 1.0);
-  if (mode == 0) colour.rgb = logarithmic ? max(shown, 0.0) : encoded(clamp(shown, 0.0, 1.0));
-  else if (mode == 1) colour.rgb = heat(clamp(shown.r, 0.0, 1.0));
-  else colour.rgb = encoded(clamp(mix(vec3(0.0), shown.r < 0.0 ? vec3(0.1, 0.45, 1.0) : vec3(1.0, 0.35, 0.1), abs(shown.r)), 0.0, 1.0));
-  if (uncertain) {
-    float sigma = sqrt(max(variance.r, max(variance.g, variance.b)));
-    colour.rgb = mix(colour.rgb, vec3(1.0, 0.2, 0.75), 0.9 * clamp(sigma / max(abs(size), 1e-4), 0.0, 1.0));
-  }
+#if MODE == 0 && LOGARITHMIC
+  colour.rgb = vec3(decades(sum.r), decades(sum.g), decades(sum.b));
+#elif MODE == 0
+  colour.rgb = encoded(clamp(sum, 0.0, 1.0));
+#elif MODE == 1
+  colour.rgb = heat(LOGARITHMIC == 1 ? decades(most) : clamp(most, 0.0, 1.0));
+#else
+  float strength = LOGARITHMIC == 1 ? decades(abs(size)) : min(abs(size), 1.0);
+  colour.rgb = encoded(strength * (size < 0.0 ? vec3(0.1, 0.45, 1.0) : vec3(1.0, 0.35, 0.1)));
+#endif
+#if UNCERTAIN
+  float sigma = sqrt(max(variance.r, max(variance.g, variance.b)));
+  colour.rgb = mix(colour.rgb, vec3(1.0, 0.2, 0.75), 0.9 * clamp(sigma / max(abs(size), 1e-4), 0.0, 1.0));
+#endif
   colour.a = 1.0;
 }`;
 
@@ -59,23 +65,30 @@ const surface = document.createElement("canvas");
 const gl = surface.getContext("webgl2", { alpha: false, antialias: false, depth: false });
 export const supported = Boolean(gl);
 
-const uniforms = gl && build();
 surface.addEventListener("webglcontextlost", (event) => event.preventDefault());
 surface.addEventListener("webglcontextrestored", () => location.reload());
+gl?.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
 
-function build() {
-  const program = gl.createProgram();
-  for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-    const shader = gl.createShader(type);
-    gl.shaderSource(shader, source);
-    gl.compileShader(shader);
-    gl.attachShader(program, shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+const programs = new Map();
+
+// Use the variant of the shader with these numbers for its names; returns the places of its uniforms.
+function use(defines) {
+  const head = Object.entries(defines).map(([name, value]) => `#define ${name} ${value}`).join("\n");
+  if (!programs.has(head)) {
+    const program = gl.createProgram();
+    for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, `#version 300 es\n${head}\n${FRAGMENT}`]]) {
+      const shader = gl.createShader(type);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    }
+    gl.linkProgram(program);
+    const names = ["light", "deviation", "weights", "others", "spreads", "height", "wipe"];
+    programs.set(head, { program, ...Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)])) });
   }
-  gl.linkProgram(program);
-  gl.useProgram(program);
-  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-  return new Proxy({}, { get: (known, name) => (known[name] ??= gl.getUniformLocation(program, name)) });
+  gl.useProgram(programs.get(head).program);
+  return programs.get(head);
 }
 
 // Pictures of one size as the layers of one texture.
@@ -119,22 +132,23 @@ export function draw(canvas, layers, look) {
     surface.height = Math.max(h, surface.height);
   }
   if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
-  const scaled = (weights, of) => Float32Array.from({ length: LAYERS }, (_, k) => ((weights?.[k] ?? 0) * (of.pictures[k]?.scale ?? 0)) / look.white);
+  const uniforms = use({ LAYERS: layers.pictures.length, MODE: look.mode, LOGARITHMIC: Number(look.logarithmic),
+    GREY: layers.grey, WIPE: Number(Boolean(look.others)), UNCERTAIN: Number(Boolean(look.deviation)) });
+  const scaled = (weights, of) => of.pictures.map(({ scale }, k) => ((weights[k] ?? 0) * scale) / look.white);
   gl.viewport(0, 0, w, h);
-  gl.uniform1fv(uniforms.weights, scaled(look.weights, layers));
-  gl.uniform1fv(uniforms.others, scaled(look.others, layers));
-  gl.uniform1fv(uniforms.spreads, scaled(look.weights, look.deviation ?? layers));
-  gl.uniform1f(uniforms.wipe, look.others ? look.wipe * w : 0);
-  gl.uniform1i(uniforms.layers, layers.pictures.length);
-  gl.uniform1i(uniforms.mode, look.mode);
   gl.uniform1i(uniforms.height, h);
-  gl.uniform1i(uniforms.grey, layers.grey);
-  gl.uniform1i(uniforms.logarithmic, look.logarithmic);
-  gl.uniform1i(uniforms.uncertain, Boolean(look.deviation));
-  gl.uniform1i(uniforms.deviation, 1);
-  gl.activeTexture(gl.TEXTURE1);
-  gl.bindTexture(gl.TEXTURE_2D_ARRAY, (look.deviation ?? layers).texture);
-  gl.activeTexture(gl.TEXTURE0);
+  gl.uniform1fv(uniforms.weights, scaled(look.weights, layers));
+  if (look.others) {
+    gl.uniform1fv(uniforms.others, scaled(look.others, layers));
+    gl.uniform1f(uniforms.wipe, look.wipe * w);
+  }
+  if (look.deviation) {
+    gl.uniform1fv(uniforms.spreads, scaled(look.weights, look.deviation));
+    gl.uniform1i(uniforms.deviation, 1);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, look.deviation.texture);
+    gl.activeTexture(gl.TEXTURE0);
+  }
   gl.bindTexture(gl.TEXTURE_2D_ARRAY, layers.texture);
   gl.drawArrays(gl.TRIANGLES, 0, 3);
   canvas.getContext("2d").drawImage(surface, 0, surface.height - h, w, h, 0, 0, w, h);

@@ -14,7 +14,7 @@ export function relight({ $, ask, press, hello }) {
   const seen = new Panel($("relight-seen"), { title: "What the camera sees", grid: hello.camera_grid });
   const paint = canvas().getContext("2d", { willReadFrequently: true });
   const past = [], video = document.createElement("video");
-  let erasing = false, last = null, changed = false, sending = false, motion = null;
+  let erasing = false, last = null, changed = false, sending = 0, motion = null;
   Object.assign(video, { muted: true, loop: true, playsInline: true });
   paint.lineCap = "round";
   const size = $("relight-size"), source = $("relight-source");
@@ -41,18 +41,18 @@ export function relight({ $, ask, press, hello }) {
 
   const show = (light) => seen.show(light, [1], light.white(0.97)); // bounces are darker than what is lit
 
-  // Send what is painted when the last answer has come: there is never more than one pattern on its way.
+  // Send what is painted when an answer has come: one pattern is computed, and one on its way, but never more.
   async function send() {
     changed = true;
     canvas().dataset.frame = Number(canvas().dataset.frame ?? 0) + 1;
-    if (sending) return;
-    sending = true;
+    if (sending === 2) return;
+    sending++;
     while (changed) {
       changed = false;
       const answer = await ask("relight", {}, { pattern: codes() });
       if (answer) show(answer.arrays.picture);
     }
-    sending = false;
+    sending--;
     pattern.read();
   }
 
