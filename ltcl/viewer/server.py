@@ -3,8 +3,8 @@
 
 Addresses begin with a random token. Whoever lacks it, or comes from another origin or under another host's
 name (DNS rebinding), gets 403 whatever is asked for. A page asks through one WebSocket. One thread computes,
-since the device is one; clients take turns, and what one asks again replaces what it has waiting. A client
-that does not read its answers is closed, and delays nobody.
+since the device is one; clients take turns, and what one asks again takes the place of what it has waiting. A
+client that does not read its answers is closed, and delays nobody.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import asyncio
 import contextlib
 import html
 import ipaddress
-import itertools
 import secrets
 import socket
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,18 +26,16 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.websockets import WebSocket
 from uvicorn.protocols.http.h11_impl import H11Protocol
-from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from ltcl import checks
 from ltcl.errors import InputError, LtclError
 from ltcl.viewer import messages
-from ltcl.viewer.answers import LARGEST_FILE, QUICK, Scene
+from ltcl.viewer.answers import LARGEST_FILE, LONG, QUICK, Scene
 
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json"}
 TYPES |= {".svg": "image/svg+xml", ".png": "image/png", ".exr": "image/x-exr"}
-SOCKETS, CONNECTIONS, UPLOADS = 32, 256, 4
+SOCKETS, CONNECTIONS = 32, 256
 PATIENCE, LIFETIME = 5.0, 60.0  # seconds for a client to read an answer, or to ask; of what is no socket
-_UNSENT = 2  # answers that wait for the network while the next one is computed
 _PERIOD = 0.1  # seconds between two reports of progress
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -54,105 +52,113 @@ class _Superseded(Exception):
     """Nobody waits for what is computed any more."""
 
 
+class _Latest:
+    """What waits, by keys and in their order; a new value takes the place of one with its key."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, Any] = {}
+        self._ready = asyncio.Event()
+
+    def put(self, key: str, value: Any) -> None:
+        self.values[key] = value
+        self._ready.set()
+
+    async def get(self) -> Any:
+        while not self.values:
+            self._ready.clear()
+            await self._ready.wait()
+        return self.values.pop(next(iter(self.values)))
+
+
+class Turns:
+    """One computation at a time, first come, first served; a solve lets others by between its steps."""
+
+    def __init__(self) -> None:
+        self._turn, self._queue = asyncio.Lock(), 0
+
+    async def take(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        """`call` in a thread, when it is its turn; not to be cancelled, as the thread goes on."""
+        await self._wait()
+        try:
+            return await asyncio.to_thread(call, *arguments)
+        finally:
+            self._turn.release()
+
+    def let_by(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Wait, in the thread that computes, until those that wait had their turn."""
+        if self._queue:
+            self._turn.release()
+            asyncio.run_coroutine_threadsafe(self._wait(), loop).result()
+
+    async def _wait(self) -> None:
+        self._queue += 1
+        await self._turn.acquire()
+        self._queue -= 1
+
+
 class Client:
-    """A socket: questions that wait, by what they ask, and messages to be sent, by their keys."""
+    """A socket: questions that wait, by what they ask, and news to be sent, by what they tell."""
 
-    def __init__(self, socket: WebSocket) -> None:
-        self.socket, self.loop, self.changed = socket, asyncio.get_running_loop(), asyncio.Event()
-        self.waiting: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}
-        self.unsent: dict[Any, str | bytes] = {}
-        self.projects, self.closed, self.turn = False, False, 0
+    def __init__(self, socket: WebSocket, scene: Scene, turns: Turns, clients: list[Client]) -> None:
+        self.socket, self.scene, self.turns, self.clients = socket, scene, turns, clients
+        self.questions, self.news, self.loop = _Latest(), _Latest(), asyncio.get_running_loop()
+        self.projects = False
 
-    def post(self, key: Any, message: str | bytes) -> None:
-        """Send a message, in place of one with this key that still waits; from any thread."""
-
-        def put() -> None:
-            self.unsent[key] = message
-            self.changed.set()
-
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            self.loop.call_soon_threadsafe(put)
-
-    async def send(self, worker: Worker) -> None:
-        """Send what there is, until TimeoutError: the other side does not read."""
-        while True:
-            if not self.unsent:
-                self.changed.clear()
-                await self.changed.wait()
-            message = self.unsent.pop(next(iter(self.unsent)))
-            kind = "text" if isinstance(message, str) else "bytes"
-            await asyncio.wait_for(self.socket.send({"type": "websocket.send", kind: message}), PATIENCE)
-            worker.wake()
-
-    async def receive(self, worker: Worker) -> None:
-        """Take questions to the end, none while answers pile up; InputError for what is no question."""
+    async def receive(self) -> None:
+        """Take questions until the socket is closed; InputError for what is none."""
         while (event := await self.socket.receive())["type"] == "websocket.receive":
             header, arrays = messages.decode(event.get("text") or event.get("bytes") or b"")
-            self.waiting[header["do"]] = header, arrays
-            worker.wake()
-            while len(self.unsent) > 2 * _UNSENT or len(self.waiting) > 2 * len(QUICK):
-                await asyncio.sleep(_PERIOD)
+            do = checks.one_of("do", header["do"], (*QUICK, *LONG))
+            self.questions.put(do, (header.pop("id"), header.pop("do"), header | arrays))
 
+    async def answer(self) -> None:
+        """Answer one question after the other; what changes the pattern is news for projector windows."""
+        while True:
+            _, do, _ = question = await self.questions.get()
+            pattern = self.scene.pattern
+            message = await asyncio.shield(self.turns.take(self._computed, *question))
+            if message is not None:
+                await self.send(message)
+            self.projects |= do == "projector"
+            if self.scene.pattern is not pattern or do == "projector":
+                if windows := [client for client in self.clients if client.projects]:
+                    codes = await asyncio.to_thread(self.scene.codes, self.scene.pattern, self.scene.white)
+                    for client in windows:
+                        client.news.put("show", messages.encode({"do": "show"}, {"codes": codes}))
 
-class Worker(threading.Thread):
-    """The thread that computes: one question at a time, clients in turn."""
+    async def tell(self) -> None:
+        """Send news."""
+        while True:
+            await self.send(await self.news.get())
 
-    def __init__(self, scene: Scene) -> None:
-        super().__init__(name="ltcl viewer", daemon=True)
-        self.scene, self.clients, self.ended = scene, list[Client](), False
-        self._shown, self._work, self._turns = scene.pattern, threading.Event(), itertools.count(1)
+    async def send(self, message: str | bytes) -> None:
+        """TimeoutError where the other side does not read."""
+        kind = "text" if isinstance(message, str) else "bytes"
+        await asyncio.wait_for(self.socket.send({"type": "websocket.send", kind: message}), PATIENCE)
 
-    def wake(self) -> None:
-        """Look for questions."""
-        self._work.set()
-
-    def run(self) -> None:
-        """Answer until the end."""
-        while not self.ended:
-            self._work.wait()
-            self._work.clear()
-            while self._answer_next():
-                pass
-
-    def _answer_next(self, among: tuple[str, ...] = ()) -> bool:
-        """Answer a question of the client that waits longest for its turn, if there is one."""
-        for client in sorted(self.clients, key=lambda client: client.turn):
-            for do in list(client.waiting) if len(client.unsent) < _UNSENT else ():
-                if not among or do in among:
-                    client.turn = next(self._turns)
-                    self._answer(client, *client.waiting.pop(do))
-                    return True
-        return False
-
-    def _answer(self, client: Client, header: dict[str, Any], arrays: dict[str, Any]) -> None:
-        number, do = header.pop("id"), header.pop("do")
+    def _computed(self, number: float, do: str, asked: dict[str, Any]) -> str | bytes | None:
+        """The message that answers; None where it came too late. In a thread."""
         reported = time.monotonic()
 
         def between(iteration: int, residual: float) -> None:
             nonlocal reported
-            if self.ended or client.closed or do in client.waiting:
+            if self not in self.clients or do in self.questions.values:
                 raise _Superseded
             if (now := time.monotonic()) > reported + _PERIOD:
-                facts = {"step": do, "done": iteration, "total": None, "residual": residual}
-                client.post("progress", messages.encode({"do": "progress", "id": number, **facts}))
+                facts = {"id": number, "step": do, "done": iteration, "total": None, "residual": residual}
+                message = messages.encode({"do": "progress", **facts})
+                self.loop.call_soon_threadsafe(self.news.put, "progress", message)
                 reported = now
-            self._answer_next(QUICK)  # who only wants to look does not wait for the end of a solve
+            self.turns.let_by(self.loop)
 
         try:
-            facts, pictures = self.scene.answer(do, header | arrays, between)
+            facts, pictures = self.scene.answer(do, asked, between)
         except _Superseded:
-            return
+            return None
         except Exception as error:  # noqa: BLE001 - the next question may go well
             kind = "" if isinstance(error, LtclError) else f"internal error: {type(error).__name__}: "
             facts, pictures = {"error": kind + " ".join(str(error).split())}, {}
-        client.post(("answer", number), messages.encode({"id": number, "do": do, **facts}, pictures))
-        client.projects |= do == "projector"
-        if self.scene.pattern is not self._shown or do == "projector":
-            self._shown = self.scene.pattern
-            if windows := [each for each in list(self.clients) if each.projects]:
-                shown = messages.encode({"do": "show"}, {"codes": self.scene.codes()})
-                for window in windows:
-                    window.post("show", shown)
+        return messages.encode({"id": number, "do": do, **facts}, pictures)
 
 
 class _Http(H11Protocol):
@@ -160,10 +166,10 @@ class _Http(H11Protocol):
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
+        self.app_state = {"abort": transport.abort}  # of a socket, too: close would wait for its reader
         self.loop.call_later(PATIENCE, lambda: self.scope is None and self._drop())
         self.loop.call_later(LIFETIME, self._drop)
-        plain = [each for each in self.connections if isinstance(each, _Http)]
-        if len(plain) > CONNECTIONS:
+        if len(plain := [each for each in self.connections if isinstance(each, _Http)]) > CONNECTIONS:
             plain[0].transport.abort()
 
     def _drop(self) -> None:
@@ -171,49 +177,34 @@ class _Http(H11Protocol):
             self.transport.abort()
 
 
-class _Socket(WebSocketsSansIOProtocol):
-    def connection_made(self, transport: Any) -> None:
-        super().connection_made(transport)
-        self.app_state = {"abort": transport.abort}  # which, unlike close, does not wait for a reader
-
-
-class Viewer:
+class Viewer(contextlib.AbstractContextManager):
     """A viewer in threads of its own until `close`, or the end of a with block; `url` is its page."""
 
     def __init__(self, scene: Scene, host: str, port: int) -> None:
-        token, address = secrets.token_urlsafe(24), _address(host)
+        address = _address(host)
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._listening = socket.create_server((host, checks.count("port", port, least=0)), family=family)
+            self._listening = socket.create_server((host, port), family=family)
         except (OSError, OverflowError) as error:
             raise InputError(f"host is {host!r}, port {port}: {error}; they must be free here") from None
         self.is_local = host == "localhost" or (address is not None and address.is_loopback)
         name = socket.gethostname() if address is not None and address.is_unspecified else host
         name, self._port = f"[{name}]" if ":" in name else name, self._listening.getsockname()[1]
-        self._names = {"127.0.0.1", "localhost", "[::1]", name.lower()}
-        self.url, self._token = f"http://{name}:{self._port}/{token}/", token.encode()
+        self._names, self._token = (
+            {"127.0.0.1", "localhost", "[::1]", name.lower()},
+            secrets.token_urlsafe(24),
+        )
+        self.url = f"http://{name}:{self._port}/{self._token}/"
         page = (Path(__file__).parent / "page").iterdir()
         self._files = {file.name: file.read_bytes() for file in page if file.suffix in TYPES}
-        self._worker = Worker(scene)
-        self._uploads, self._decoding = asyncio.Semaphore(UPLOADS), asyncio.Lock()
-        config = uvicorn.Config(
-            self._application,
-            interface="asgi3",
-            http=_Http,
-            ws=_Socket,
-            ws_max_size=messages.largest(max(scene.T.shape)),
-            ws_per_message_deflate=False,  # which takes longer than a loopback
-            lifespan="off",
-            log_config=None,
-            log_level="critical",
-            access_log=False,
-            server_header=False,
-            proxy_headers=False,
-            timeout_graceful_shutdown=1,
-        )
-        self._uvicorn = uvicorn.Server(config)
+        self._scene, self._clients, self._turns, self._decoding = scene, [], Turns(), asyncio.Lock()
+        # Compression would take longer than a loopback.
+        settings: dict[str, Any] = {"interface": "asgi3", "lifespan": "off", "http": _Http}
+        settings |= {"ws": "websockets-sansio", "ws_max_size": messages.largest(max(scene.T.shape))}
+        settings |= {"ws_per_message_deflate": False, "timeout_graceful_shutdown": 1, "proxy_headers": False}
+        settings |= {"log_config": None, "log_level": "critical", "access_log": False, "server_header": False}
+        self._uvicorn = uvicorn.Server(uvicorn.Config(self._application, **settings))
         self._thread = threading.Thread(target=self._uvicorn.run, args=([self._listening],), daemon=True)
-        self._worker.start()
         self._thread.start()
 
     def wait(self) -> None:
@@ -223,12 +214,8 @@ class Viewer:
 
     def close(self) -> None:
         """End it; pages say that they lost it."""
-        self._worker.ended = self._uvicorn.should_exit = True
-        self._worker.wake()
+        self._uvicorn.should_exit = True
         self._thread.join()
-
-    def __enter__(self) -> Viewer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -245,12 +232,12 @@ class Viewer:
         hosts, origins = ([value for name, value in named if name == key] for key in (b"host", b"origin"))
         token, slash, path = scope["path"].removeprefix("/").partition("/")
         reads = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
-        is_allowed = secrets.compare_digest(token.encode("utf-8", "replace"), self._token)
+        is_allowed = secrets.compare_digest(token.encode("utf-8", "replace"), self._token.encode())
         is_allowed &= len(hosts) == 1 and self._is_own(hosts[0])
-        is_allowed &= origins == [f"http://{hosts[0]}" if hosts else ""] or (reads and not origins)
+        is_allowed &= origins == [f"http://{host}" for host in hosts] or (reads and not origins)
         if scope["type"] == "websocket":
             websocket = WebSocket(scope, receive, send)
-            if is_allowed and path == "socket" and len(self._worker.clients) < SOCKETS:
+            if is_allowed and path == "socket" and len(self._clients) < SOCKETS:
                 await self._serve(websocket)
             else:
                 await websocket.close()
@@ -269,35 +256,32 @@ class Viewer:
 
     async def _respond(self, request: Request, path: str, reads: bool) -> Response:
         if path == "picture" and request.method == "POST":
-            return await self._upload(request)
+            name, length = (
+                request.query_params.get("name", "")[:255],
+                request.headers.get("content-length", ""),
+            )
+            try:
+                checks.count("content-length", int(length) if length.isdecimal() else None, most=LARGEST_FILE)
+                content = await request.body()
+                async with self._decoding:
+                    return JSONResponse(await asyncio.to_thread(self._scene.upload, name[:255], content))
+            except LtclError as error:
+                return JSONResponse({"error": " ".join(str(error).split())}, 400)
         name = {"": "index.html", "projector": "projector.html"}.get(path, path)
         content = self._files.get(name)
         if path.startswith("result/"):
             name = path.removeprefix("result/")
-            content = await asyncio.to_thread(self._worker.scene.result, name)
+            content = await asyncio.to_thread(self._scene.result, name)
         if content is None or not reads:
             return Response("not found", 404)
         return Response(content, media_type=TYPES[Path(name).suffix])
 
-    async def _upload(self, request: Request) -> Response:
-        name, content = request.query_params.get("name", "")[:255], bytearray()
-        async with self._uploads:
-            async for chunk in request.stream():
-                content += chunk
-                if len(content) > LARGEST_FILE:
-                    return JSONResponse({"error": f"{name!r} has more than {LARGEST_FILE} bytes"}, 413)
-            async with self._decoding:
-                try:
-                    return JSONResponse(await asyncio.to_thread(self._worker.scene.upload, name, content))
-                except LtclError as error:
-                    return JSONResponse({"error": " ".join(str(error).split())}, 400)
-
     async def _serve(self, websocket: WebSocket) -> None:
         await websocket.accept()
-        client, worker = Client(websocket), self._worker
-        client.post("hello", messages.encode({"do": "hello", **worker.scene.hello()}))
-        worker.clients.append(client)
-        tasks = [asyncio.ensure_future(each(worker)) for each in (client.receive, client.send)]
+        client = Client(websocket, self._scene, self._turns, self._clients)
+        client.news.put("hello", messages.encode({"do": "hello", **self._scene.hello()}))
+        self._clients.append(client)
+        tasks = [asyncio.ensure_future(each()) for each in (client.receive, client.answer, client.tell)]
         try:
             (ended, *_), _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             if isinstance(error := ended.exception(), InputError):
@@ -305,8 +289,7 @@ class Viewer:
             elif error is not None:
                 websocket.state.abort()
         finally:
-            client.closed = True
-            worker.clients.remove(client)
+            self._clients.remove(client)
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)

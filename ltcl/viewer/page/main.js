@@ -61,6 +61,7 @@ connection.addEventListener("open", async ({ detail: hello }) => {
 connection.addEventListener("lost", () => {
   document.body.dataset.state = "lost";
   say("Not connected; trying again…");
+  fetch(location.pathname, { method: "HEAD" }).then(({ ok }) => ok || say("The viewer was started again, with another address: open that one"), () => {});
 });
 connection.addEventListener("busy", () => { document.body.dataset.state = "busy"; });
 connection.addEventListener("idle", () => {
