@@ -4,7 +4,7 @@
 import { Panel } from "./panel.js";
 
 const DOWNLOADS = { "pattern.exr": "pattern, linear", "pattern.png": "pattern", "codes.png": "projector codes", "appearance.exr": "appearance, linear", "report.json": "report" };
-const percent = (share) => `${(100 * share).toPrecision(3)} %`;
+const percent = (share) => (share && share < 1e-5 ? "below 0.001 %" : `${(100 * share).toPrecision(3)} %`);
 
 export function compensate({ $, ask, hello }) {
   const panel = (name, title, grid, act) => new Panel($(`compensate-${name}`), { title, grid, act });
