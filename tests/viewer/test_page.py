@@ -64,7 +64,7 @@ def page(browser: Browser, viewer: Any) -> Iterator[Page]:
     with browser.new_context(viewport={"width": 1280, "height": 800}) as context:
         page, wrong = context.new_page(), []
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
+        page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
         visit(page, viewer, "probe")
         yield page
         assert [text for text in wrong if "400 (Bad Request)" not in text] == []  # a refused upload
