@@ -53,9 +53,9 @@ def encode(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = 
 
 def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays, float32 or uint8, of a question; InputError where it is none."""
-    is_binary = isinstance(message, bytes)
-    start = 4 + int.from_bytes(message[:4], "little") if is_binary else 0
-    text = message[4:start] if is_binary else message.encode("utf-8", "replace")
+    data = b"" if isinstance(message, str) else message
+    start = 4 + int.from_bytes(data[:4], "little") if data else 0
+    text = message.encode("utf-8", "replace") if isinstance(message, str) else data[4:start]
     checks.count("length of the header", len(text), most=LARGEST_HEADER)
     try:
         header, arrays = json.loads(text), {}
@@ -63,7 +63,7 @@ def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]
         checks.number("id", header["id"])
         for entry in header.pop("arrays", []):
             h, w, c = (checks.count("shape", n, most=1 << 24) for n in entry["shape"])
-            values = np.frombuffer(message, DTYPES[entry["dtype"]], h * w * c, start).reshape(h, w, c)
+            values = np.frombuffer(data, DTYPES[entry["dtype"]], h * w * c, start).reshape(h, w, c)
             start += values.nbytes + -values.nbytes % 4
             if values.dtype != np.uint8:
                 scale = np.float32(checks.number("scale", entry["scale"], most=1e38))
@@ -74,6 +74,6 @@ def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]
         raise
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"message is none: {type(error).__name__}: {error}") from None
-    if is_binary and start != len(message):
-        raise InputError(f"message has {len(message)} bytes; header and arrays must have as many: {start}")
+    if start != len(data):
+        raise InputError(f"message has {len(data)} bytes; header and arrays must have as many: {start}")
     return header, arrays

@@ -2,8 +2,8 @@
 """The viewer's server: who may ask, whose turn it is, and what is sent to whom.
 
 Addresses begin with a random token. Whoever lacks it, or comes from another origin or under another host's
-name (DNS rebinding), gets 403 whatever is asked for. A page asks through one WebSocket. One thread computes,
-since the device is one; clients take turns, and what one asks again takes the place of what it has waiting. A
+name (DNS rebinding), gets 403 whatever is asked for. A page asks through one WebSocket. The device computes
+one thing at a time: clients take turns, and what one asks again takes the place of what it has waiting. A
 client that does not read its answers is closed, and delays nobody.
 """
 
@@ -18,13 +18,14 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import uvicorn
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ltcl import checks
@@ -52,102 +53,97 @@ class _Superseded(Exception):
     """Nobody waits for what is computed any more."""
 
 
-class _Latest:
-    """What waits, by keys and in their order; a new value takes the place of one with its key."""
-
-    def __init__(self) -> None:
-        self.values: dict[str, Any] = {}
-        self._ready = asyncio.Event()
-
-    def put(self, key: str, value: Any) -> None:
-        self.values[key] = value
-        self._ready.set()
-
-    async def get(self) -> Any:
-        while not self.values:
-            self._ready.clear()
-            await self._ready.wait()
-        return self.values.pop(next(iter(self.values)))
-
-
 class Turns:
     """One computation at a time, first come, first served; a solve lets others by between its steps."""
 
     def __init__(self) -> None:
         self._turn, self._queue = asyncio.Lock(), 0
+        self._solves, self._threads = asyncio.Semaphore(SOCKETS), ThreadPoolExecutor(2 * SOCKETS)
 
-    async def take(self, call: Callable[..., Any], *arguments: Any) -> Any:
-        """`call` in a thread, when it is its turn; not to be cancelled, as the thread goes on."""
-        await self._wait()
-        try:
-            return await asyncio.to_thread(call, *arguments)
-        finally:
-            self._turn.release()
+    async def take(self, is_long: bool, call: Callable[..., Any], *arguments: Any) -> Any:
+        """`call` in a thread, when it is its turn; not to be cancelled, as the thread would go on."""
+        async with self._solves if is_long else contextlib.nullcontext():
+            await self._wait()
+            try:
+                return await asyncio.get_running_loop().run_in_executor(self._threads, call, *arguments)
+            finally:
+                self._turn.release()
 
     def let_by(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Wait, in the thread that computes, until those that wait had their turn."""
+        """In the thread that computes: wait until those that wait had their turn."""
         if self._queue:
-            self._turn.release()
-            asyncio.run_coroutine_threadsafe(self._wait(), loop).result()
+            asyncio.run_coroutine_threadsafe(self._wait(again=True), loop).result()
 
-    async def _wait(self) -> None:
+    async def _wait(self, again: bool = False) -> None:
+        if again:
+            self._turn.release()
         self._queue += 1
         await self._turn.acquire()
         self._queue -= 1
 
 
 class Client:
-    """A socket: questions that wait, by what they ask, and news to be sent, by what they tell."""
+    """A socket, its questions that wait, by what they ask, and whether it is a projector window."""
 
     def __init__(self, socket: WebSocket, scene: Scene, turns: Turns, clients: list[Client]) -> None:
         self.socket, self.scene, self.turns, self.clients = socket, scene, turns, clients
-        self.questions, self.news, self.loop = _Latest(), _Latest(), asyncio.get_running_loop()
-        self.projects = False
+        self.questions: dict[str, tuple[float, dict[str, Any]]] = {}
+        self.busy, self.tasks, self.loop = set[str](), asyncio.TaskGroup(), asyncio.get_running_loop()
+        self.changed, self.projects = asyncio.Event(), False
 
     async def receive(self) -> None:
-        """Take questions until the socket is closed; InputError for what is none."""
+        """Take questions until WebSocketDisconnect, or InputError for what is none."""
         while (event := await self.socket.receive())["type"] == "websocket.receive":
             header, arrays = messages.decode(event.get("text") or event.get("bytes") or b"")
-            do = checks.one_of("do", header["do"], (*QUICK, *LONG))
-            self.questions.put(do, (header.pop("id"), header.pop("do"), header | arrays))
+            do = checks.one_of("do", header.pop("do"), (*QUICK, *LONG))
+            self.questions[do] = header.pop("id"), header | arrays
+            if do not in self.busy:
+                self.busy.add(do)
+                self.tasks.create_task(self.answer(do))
+        raise WebSocketDisconnect
 
-    async def answer(self) -> None:
-        """Answer one question after the other; what changes the pattern is news for projector windows."""
-        while True:
-            _, do, _ = question = await self.questions.get()
-            pattern = self.scene.pattern
-            message = await asyncio.shield(self.turns.take(self._computed, *question))
-            if message is not None:
+    async def answer(self, do: str) -> None:
+        """Answer questions of a kind while there are any; projector windows look for a new pattern."""
+        while do in self.questions:
+            number, asked = self.questions.pop(do)
+            turn = self.turns.take(do in LONG, self._compute, number, do, asked)
+            if (message := await asyncio.shield(turn)) is not None:
                 await self.send(message)
-            self.projects |= do == "projector"
-            if self.scene.pattern is not pattern or do == "projector":
-                if windows := [client for client in self.clients if client.projects]:
-                    codes = await asyncio.to_thread(self.scene.codes, self.scene.pattern, self.scene.white)
-                    for client in windows:
-                        client.news.put("show", messages.encode({"do": "show"}, {"codes": codes}))
+            for client in self.clients:
+                client.changed.set()
+        self.busy.remove(do)
+        if do == "projector" and not self.projects:
+            self.projects = True
+            self.tasks.create_task(self.show())
 
-    async def tell(self) -> None:
-        """Send news."""
+    async def show(self) -> None:
+        """Send the codes of every new pattern to a projector window."""
+        shown = None
         while True:
-            await self.send(await self.news.get())
+            if shown is not (pattern := self.scene.pattern):
+                codes = await asyncio.to_thread(self.scene.codes, pattern, self.scene.white)
+                await self.send(messages.encode({"do": "show"}, {"codes": codes}))
+                shown = pattern
+            await self.changed.wait()
+            self.changed.clear()
 
     async def send(self, message: str | bytes) -> None:
         """TimeoutError where the other side does not read."""
         kind = "text" if isinstance(message, str) else "bytes"
         await asyncio.wait_for(self.socket.send({"type": "websocket.send", kind: message}), PATIENCE)
 
-    def _computed(self, number: float, do: str, asked: dict[str, Any]) -> str | bytes | None:
+    def _compute(self, number: float, do: str, asked: dict[str, Any]) -> str | bytes | None:
         """The message that answers; None where it came too late. In a thread."""
         reported = time.monotonic()
 
         def between(iteration: int, residual: float) -> None:
             nonlocal reported
-            if self not in self.clients or do in self.questions.values:
+            if self not in self.clients or do in self.questions:
                 raise _Superseded
             if (now := time.monotonic()) > reported + _PERIOD:
                 facts = {"id": number, "step": do, "done": iteration, "total": None, "residual": residual}
                 message = messages.encode({"do": "progress", **facts})
-                self.loop.call_soon_threadsafe(self.news.put, "progress", message)
+                asyncio.run_coroutine_threadsafe(self.send(message), self.loop)
                 reported = now
             self.turns.let_by(self.loop)
 
@@ -166,7 +162,7 @@ class _Http(H11Protocol):
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self.app_state = {"abort": transport.abort}  # of a socket, too: close would wait for its reader
+        self.app_state = {"abort": transport.abort}  # of its socket, too: close would wait for a reader
         self.loop.call_later(PATIENCE, lambda: self.scope is None and self._drop())
         self.loop.call_later(LIFETIME, self._drop)
         if len(plain := [each for each in self.connections if isinstance(each, _Http)]) > CONNECTIONS:
@@ -181,30 +177,27 @@ class Viewer(contextlib.AbstractContextManager):
     """A viewer in threads of its own until `close`, or the end of a with block; `url` is its page."""
 
     def __init__(self, scene: Scene, host: str, port: int) -> None:
-        address = _address(host)
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._listening = socket.create_server((host, port), family=family)
+            listening = socket.create_server((host, port), family=family)
         except (OSError, OverflowError) as error:
             raise InputError(f"host is {host!r}, port {port}: {error}; they must be free here") from None
-        self.is_local = host == "localhost" or (address is not None and address.is_loopback)
-        name = socket.gethostname() if address is not None and address.is_unspecified else host
-        name, self._port = f"[{name}]" if ":" in name else name, self._listening.getsockname()[1]
-        self._names, self._token = (
-            {"127.0.0.1", "localhost", "[::1]", name.lower()},
-            secrets.token_urlsafe(24),
-        )
+        address, self._port = listening.getsockname()[:2]
+        self.is_local = ipaddress.ip_address(address).is_loopback
+        name = socket.gethostname() if ipaddress.ip_address(address).is_unspecified else host
+        name, self._token = f"[{name}]" if ":" in name else name, secrets.token_urlsafe(24)
+        self._names = {"127.0.0.1", "localhost", "[::1]", name.lower()}
         self.url = f"http://{name}:{self._port}/{self._token}/"
         page = (Path(__file__).parent / "page").iterdir()
         self._files = {file.name: file.read_bytes() for file in page if file.suffix in TYPES}
-        self._scene, self._clients, self._turns, self._decoding = scene, [], Turns(), asyncio.Lock()
-        # Compression would take longer than a loopback.
+        self._scene, self._clients = scene, list[Client]()
+        self._turns, self._decoding = Turns(), asyncio.Lock()
         settings: dict[str, Any] = {"interface": "asgi3", "lifespan": "off", "http": _Http}
         settings |= {"ws": "websockets-sansio", "ws_max_size": messages.largest(max(scene.T.shape))}
         settings |= {"ws_per_message_deflate": False, "timeout_graceful_shutdown": 1, "proxy_headers": False}
         settings |= {"log_config": None, "log_level": "critical", "access_log": False, "server_header": False}
         self._uvicorn = uvicorn.Server(uvicorn.Config(self._application, **settings))
-        self._thread = threading.Thread(target=self._uvicorn.run, args=([self._listening],), daemon=True)
+        self._thread = threading.Thread(target=self._uvicorn.run, args=([listening],), daemon=True)
         self._thread.start()
 
     def wait(self) -> None:
@@ -230,10 +223,12 @@ class Viewer(contextlib.AbstractContextManager):
         """All requests pass here; those that may not get 403 and no word about what there is."""
         named = [(name, value.decode("latin-1")) for name, value in scope["headers"]]
         hosts, origins = ([value for name, value in named if name == key] for key in (b"host", b"origin"))
+        own = scope["server"][0]  # the address that was connected to; as its names, no other site can have it
+        own = {f"{name}:{self._port}" for name in (*self._names, f"[{own}]" if ":" in own else own)}
         token, slash, path = scope["path"].removeprefix("/").partition("/")
         reads = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
         is_allowed = secrets.compare_digest(token.encode("utf-8", "replace"), self._token.encode())
-        is_allowed &= len(hosts) == 1 and self._is_own(hosts[0])
+        is_allowed &= len(hosts) == 1 and hosts[0].lower() in own
         is_allowed &= origins == [f"http://{host}" for host in hosts] or (reads and not origins)
         if scope["type"] == "websocket":
             websocket = WebSocket(scope, receive, send)
@@ -248,20 +243,11 @@ class Viewer(contextlib.AbstractContextManager):
             response.headers.update({name: value.format(hosts[0]) for name, value in _HEADERS.items()})
         await response(scope, receive, send)
 
-    def _is_own(self, host: str) -> bool:
-        """Whether a Host header has a name that no other site can give to this server."""
-        name, _, port = host.lower().rpartition(":")
-        known = name in self._names or (not self.is_local and _address(name.strip("[]")) is not None)
-        return known and port == str(self._port)
-
     async def _respond(self, request: Request, path: str, reads: bool) -> Response:
         if path == "picture" and request.method == "POST":
-            name, length = (
-                request.query_params.get("name", "")[:255],
-                request.headers.get("content-length", ""),
-            )
+            name, length = request.query_params.get("name", ""), request.headers.get("content-length", "")
             try:
-                checks.count("content-length", int(length) if length.isdecimal() else None, most=LARGEST_FILE)
+                checks.count("length", int(length) if length.isdecimal() else None, most=LARGEST_FILE)
                 content = await request.body()
                 async with self._decoding:
                     return JSONResponse(await asyncio.to_thread(self._scene.upload, name[:255], content))
@@ -277,26 +263,16 @@ class Viewer(contextlib.AbstractContextManager):
         return Response(content, media_type=TYPES[Path(name).suffix])
 
     async def _serve(self, websocket: WebSocket) -> None:
-        await websocket.accept()
         client = Client(websocket, self._scene, self._turns, self._clients)
-        client.news.put("hello", messages.encode({"do": "hello", **self._scene.hello()}))
         self._clients.append(client)
-        tasks = [asyncio.ensure_future(each()) for each in (client.receive, client.answer, client.tell)]
         try:
-            (ended, *_), _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            if isinstance(error := ended.exception(), InputError):
-                await asyncio.wait_for(websocket.close(1008, f"{error}"[:100]), PATIENCE)
-            elif error is not None:
-                websocket.state.abort()
+            await websocket.accept()
+            async with client.tasks:
+                await client.send(messages.encode({"do": "hello", **self._scene.hello()}))
+                await client.receive()
+        except* InputError as errors:
+            await asyncio.wait_for(websocket.close(1008, f"{errors.exceptions[0]}"[:100]), PATIENCE)
+        except* (TimeoutError, WebSocketDisconnect):
+            websocket.state.abort()
         finally:
             self._clients.remove(client)
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def _address(host: str) -> Any:
-    """The IP address that a text is, or None."""
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host)
-    return None
