@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Bounces: a picture as a sum of direct light and bounces, mixed by sliders in the shader, without the server.
+// Bounces: a picture as a sum of direct light and bounces, which sliders mix in the shader.
 
 import { Layers, draw } from "./gl.js";
 import { look, Panel } from "./panel.js";
@@ -9,40 +9,37 @@ const SECONDS = 1.2; // of a step of the film
 export function bounces({ $, ask, press, hello }) {
   const mix = new Panel($("bounces-mix"), { title: "Mixed light", grid: hello.camera_grid });
   const deviation = new Layers(), stack = $("bounces-stack"), source = $("bounces-source");
-  let sliders = [], film = null, asked = "";
-  source.dataset.first = "what the projector shows now";
-  source.replaceChildren(new Option(source.dataset.first, ""), ...source.options);
+  let sliders = [], film = null;
   if (source.options.length > 1) source.selectedIndex = 1;
 
   async function separate() {
     const count = Number($("bounces-count").value);
     const of = source.value ? { of: "picture", picture: Number(source.value) } : { of: "pattern" };
-    asked = JSON.stringify([of, count]);
     const answer = await ask("bounces", { ...of, count });
     if (!answer) return;
     const names = ["direct", ...Array.from({ length: count }, (_, k) => `bounce_${k + 1}`), "rest"];
     const pictures = names.map((name) => answer.arrays[name]);
-    const known = names.map((name) => answer.arrays[`${name}_std`]).filter(Boolean);
-    mix.show(pictures, pictures.map(() => 1), pictures.reduce((sum, picture) => sum + picture.white(), 0));
-    if (known.length) deviation.set(names.map((name, k) => answer.arrays[`${name}_std`] ?? nothing(pictures[k])));
-    $("bounces-noise").hidden = $("bounces-pink").hidden = !known.length;
-    sliders = pictures.map((picture, k) => row(picture, k, answer.shares?.[k]));
+    const known = "direct_std" in answer.arrays;
+    mix.show(pictures, names.map(() => 1), pictures.reduce((sum, picture) => sum + picture.white(), 0));
+    if (known) deviation.set(names.map((name, k) => answer.arrays[`${name}_std`] ?? nothing(pictures[k])));
+    $("bounces-noise").hidden = $("bounces-pink").hidden = !known;
+    sliders = pictures.map((picture, k) => row(picture, k, answer.shares[k]));
     stack.replaceChildren(...sliders.map(({ element }) => element));
     mixed();
   }
 
+  // Of the rest.
   const nothing = ({ data, h, w, c, dtype }) => ({ data: data.slice().fill(0), h, w, c, dtype, scale: 1 });
 
   function row(picture, k, share) {
-    const name = k === 0 ? "Direct light" : k === mix.weights.length - 1 ? "All further bounces" : `Bounce ${k}`;
-    const element = document.createElement("div");
-    element.className = "bounce";
-    element.innerHTML = `<canvas role="img"></canvas><b><span></span></b><output>1</output><input type="range" min="-1" max="3" step="0.05" value="1">`;
+    const last = mix.weights.length - 1;
+    const name = k === 0 ? "Direct light" : k === last ? "All further bounces" : `Bounce ${k}`;
+    const element = $("bounce").content.firstElementChild.cloneNode(true);
     const [canvas, title, output, slider] = element.children;
-    const white = picture.white() || 1, layers = new Layers(), brighter = mix.white / white;
-    title.prepend(name);
-    title.firstElementChild.textContent = [share !== undefined && `${(100 * share).toPrecision(2)} % of the light`,
-      brighter > 1.5 && `shown ${brighter < 10 ? brighter.toFixed(1) : Math.round(brighter)}× brighter`].filter(Boolean).join(", ");
+    const white = picture.white() || 1, layers = new Layers(), times = mix.white / white;
+    title.firstElementChild.textContent = name;
+    title.lastElementChild.textContent = `${(100 * share).toPrecision(2)} % of the light` +
+      (times > 1.5 ? `, shown ${times < 10 ? times.toFixed(1) : Math.round(times)}× brighter` : "");
     layers.set([picture]);
     draw(canvas, layers, { white, mode: 0, logarithmic: false, weights: [1] });
     layers.clear();

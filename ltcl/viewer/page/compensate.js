@@ -3,14 +3,12 @@
 
 import { Panel } from "./panel.js";
 
-const DOWNLOADS = { "pattern.exr": "pattern, linear", "pattern.png": "pattern", "codes.png": "projector codes", "appearance.exr": "appearance, linear", "report.json": "report" };
 const percent = (share) => (share && share < 1e-5 ? "below 0.001 %" : `${(100 * share).toPrecision(3)} %`);
 
 export function compensate({ $, ask, hello }) {
   const panel = (name, title, grid, act) => new Panel($(`compensate-${name}`), { title, grid, act });
-  const wipe = panel("wipe", "Predicted appearance", hello.camera_grid, (kind, row, col) => {
-    if (kind !== "press" && kind !== "drag" && !(kind === "hover" && wipe.canvas.matches(":focus-visible"))) return;
-    part((col + 0.5) / hello.camera_grid[1]);
+  const wipe = panel("wipe", "Predicted appearance", hello.camera_grid, (kind, row, col, event) => {
+    if (kind === "press" || kind === "drag" || event?.key) part((col + 0.5) / hello.camera_grid[1]);
   });
   const target = panel("target", "Desired", hello.camera_grid);
   const pattern = panel("pattern", "Pattern", hello.grid);
@@ -39,7 +37,8 @@ export function compensate({ $, ask, hello }) {
     $("compensate-low-value").textContent = low.value;
     $("compensate-high-value").textContent = high.value;
     if (!auto.checked) $("compensate-gain-value").textContent = gain.value;
-    const answer = await ask("compensate", { picture: Number(source.value), gain: auto.checked ? "auto" : Number(gain.value), bounds: [Number(low.value), Number(high.value)] });
+    const bounds = [low, high].map(({ value }) => Number(value)), level = auto.checked ? "auto" : Number(gain.value);
+    const answer = await ask("compensate", { picture: Number(source.value), gain: level, bounds });
     if (!answer) return;
     const { arrays } = answer, white = arrays.target.white();
     wipe.note = "without ◂ ▸ with compensation";
@@ -59,24 +58,22 @@ export function compensate({ $, ask, hello }) {
 
   function report(answer) {
     $("compensate-more").hidden = false;
-    const lines = { Error: percent(answer.error), Gain: answer.gain.toPrecision(3), Clipped: percent(answer.clipped),
-      Method: `${answer.method}, ${answer.products} products, ${answer.seconds.toPrecision(2)} s` };
+    const lines = {
+      Error: percent(answer.error), Gain: answer.gain.toPrecision(3), Clipped: percent(answer.clipped),
+      Method: `${answer.method}, ${answer.products} products, ${answer.seconds.toPrecision(2)} s`,
+    };
     $("compensate-report").replaceChildren(...Object.entries(lines).flatMap(([name, value]) => {
       const [term, text] = [document.createElement("dt"), document.createElement("dd")];
       [term.textContent, text.textContent] = [name, value];
       return [term, text];
     }));
-    const logs = answer.residuals.filter((r) => r > 0).map(Math.log10), top = Math.max(...logs, 0), low = Math.min(...logs, -1);
-    $("compensate-residuals").firstElementChild.setAttribute("points",
-      logs.map((v, k) => `${(100 * k) / Math.max(logs.length - 1, 1)},${1 + (28 * (top - v)) / (top - low)}`).join(" "));
-    $("compensate-downloads").replaceChildren(...Object.entries(DOWNLOADS).map(([name, text]) => {
-      const link = document.createElement("a");
-      Object.assign(link, { href: `result/${name}`, download: name, textContent: text });
-      return link;
-    }));
+    const logs = answer.residuals.filter((residual) => residual > 0).map(Math.log10);
+    const top = Math.max(...logs, 0), low = Math.min(...logs, -1), step = 100 / Math.max(logs.length - 1, 1);
+    const points = logs.map((log, k) => `${step * k},${1 + (28 * (top - log)) / (top - low)}`);
+    $("compensate-residuals").firstElementChild.setAttribute("points", points.join(" "));
   }
 
-  for (const name of ["source", "auto", "gain", "low", "high"]) $(`compensate-${name}`).addEventListener("input", solve);
-  source.addEventListener("change", solve);
+  for (const name of ["auto", "gain", "low", "high"]) $(`compensate-${name}`).oninput = solve;
+  source.onchange = solve;
   return { start: solve };
 }

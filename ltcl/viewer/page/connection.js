@@ -7,7 +7,7 @@ const LONGEST_WAIT = 5000; // ms between two tries
 const AT_ONCE = { bounces: Infinity, compensate: Infinity }; // a newer one of these ends the one under way
 
 export class Connection extends EventTarget {
-  // Events: "open" (with the server's greeting as detail), "lost", "busy", "idle", and one per push, by its name.
+  // Events: "open" (its detail is what the server says of T), "lost", "busy", "idle", and pushes by name.
   constructor() {
     super();
     this.kinds = new Map(); // of questions under way: those that were sent, and the newest after them
@@ -23,7 +23,7 @@ export class Connection extends EventTarget {
     this.socket.binaryType = "arraybuffer";
     this.socket.onmessage = ({ data }) => this.receive(decode(data));
     this.socket.onclose = () => {
-      for (const { sent, next } of this.kinds.values()) for (const each of [...sent, next]) each?.answer(null);
+      for (const { sent, next } of this.kinds.values()) [...sent, next].forEach((each) => each?.answer(null));
       this.kinds.clear();
       this.tell("lost");
       setTimeout(() => this.connect(), Math.min(LONGEST_WAIT, 250 * 2 ** this.tries++));
@@ -67,7 +67,7 @@ export class Connection extends EventTarget {
       older.forEach((each) => each.answer(null)); // the server took a newer one in their place
       this.send(queue);
       if (!queue.sent.length) this.kinds.delete(message.do);
-      if (typeof message.error === "string") question.fail(new Error(message.error)); // a number is a result's
+      if (typeof message.error === "string") question.fail(new Error(message.error)); // numbers are results
       else question.answer(message);
       if (!this.kinds.size) this.tell("idle");
     }

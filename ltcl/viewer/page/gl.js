@@ -19,9 +19,10 @@ vec3 stored(sampler2DArray pictures, ivec2 at, int k) {
   return GREY ? value.rrr : value;
 }
 vec3 heat(float t) { // fit of matplotlib's inferno by Matt Zucker (CC0)
-  return clamp(vec3(0.0002, 0.0016, -0.0194) + t * (vec3(0.1065, 0.5639, 3.9327) + t * (vec3(11.6024, -3.9728, -15.9423)
-    + t * (vec3(-41.7039, 17.4363, 44.3541) + t * (vec3(77.1629, -33.4023, -81.8073)
-    + t * (vec3(-71.3194, 32.6260, 73.2095) + t * vec3(25.1311, -12.2426, -23.0703)))))), 0.0, 1.0);
+  return clamp(vec3(0.0002, 0.0016, -0.0194) + t * (vec3(0.1065, 0.5639, 3.9327)
+    + t * (vec3(11.6024, -3.9728, -15.9423) + t * (vec3(-41.7039, 17.4363, 44.3541)
+    + t * (vec3(77.1629, -33.4023, -81.8073) + t * (vec3(-71.3194, 32.6260, 73.2095)
+    + t * vec3(25.1311, -12.2426, -23.0703)))))), 0.0, 1.0);
 }
 float decades(float value) { return clamp(1.0 + 0.25 * log(max(value, 1e-9)) / log(10.0), 0.0, 1.0); }
 vec3 encoded(vec3 linear) { // sRGB
@@ -75,8 +76,8 @@ const programs = new Map();
 function use(defines) {
   const head = Object.entries(defines).map(([name, value]) => `#define ${name} ${value}`).join("\n");
   if (!programs.has(head)) {
-    const program = gl.createProgram();
-    for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, `#version 300 es\n${head}\n${FRAGMENT}`]]) {
+    const program = gl.createProgram(), variant = `#version 300 es\n${head}\n${FRAGMENT}`;
+    for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, variant]]) {
       const shader = gl.createShader(type);
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
@@ -84,8 +85,9 @@ function use(defines) {
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
     }
     gl.linkProgram(program);
-    const names = ["light", "deviation", "weights", "others", "spreads", "height", "wipe"];
-    programs.set(head, { program, ...Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)])) });
+    const names = ["deviation", "weights", "others", "spreads", "height", "wipe"];
+    const places = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
+    programs.set(head, { program, ...places });
   }
   gl.useProgram(programs.get(head).program);
   return programs.get(head);
@@ -95,7 +97,8 @@ function use(defines) {
 export class Layers {
   set(pictures) {
     const { h, w, c, dtype } = pictures[0], half = dtype === "f2";
-    const shape = [c === 1 ? (half ? gl.R16F : gl.R32F) : half ? gl.RGB16F : gl.RGB32F, w, h, pictures.length];
+    const stored = c === 1 ? (half ? gl.R16F : gl.R32F) : half ? gl.RGB16F : gl.RGB32F;
+    const shape = [stored, w, h, pictures.length];
     if (String(shape) !== String(this.shape)) {
       gl.deleteTexture(this.texture ?? null);
       this.texture = gl.createTexture();
@@ -119,7 +122,8 @@ export class Layers {
 
   // The values of one pixel of the weighted sum.
   at(row, col, weights) {
-    return this.pictures.map((p, k) => p.at(row, col).map((v) => v * weights[k])).reduce((a, b) => a.map((v, i) => v + b[i]));
+    const each = this.pictures.map((picture, k) => picture.at(row, col).map((value) => weights[k] * value));
+    return each.reduce((sum, values) => sum.map((value, channel) => value + values[channel]));
   }
 }
 
@@ -132,8 +136,10 @@ export function draw(canvas, layers, look) {
     surface.height = Math.max(h, surface.height);
   }
   if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
-  const uniforms = use({ LAYERS: layers.pictures.length, MODE: look.mode, LOGARITHMIC: Number(look.logarithmic),
-    GREY: layers.grey, WIPE: Number(Boolean(look.others)), UNCERTAIN: Number(Boolean(look.deviation)) });
+  const uniforms = use({
+    LAYERS: layers.pictures.length, GREY: layers.grey, MODE: look.mode, LOGARITHMIC: Number(look.logarithmic),
+    WIPE: Number(Boolean(look.others)), UNCERTAIN: Number(Boolean(look.deviation)),
+  });
   const scaled = (weights, of) => of.pictures.map(({ scale }, k) => ((weights[k] ?? 0) * scale) / look.white);
   gl.viewport(0, 0, w, h);
   gl.uniform1i(uniforms.height, h);

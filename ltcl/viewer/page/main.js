@@ -12,7 +12,8 @@ import { relight } from "./relight.js";
 const $ = (id) => document.getElementById(id);
 const VIEWS = { probe, bounces, relight, compensate };
 const connection = new Connection();
-const app = { $, connection, ask, press, choices, open: null, hello: null };
+const press = (button, on) => button.setAttribute("aria-pressed", on);
+const app = { $, ask, press };
 const views = {};
 let current = null;
 
@@ -33,21 +34,15 @@ function say(text) {
   if ($("banner").textContent !== text) $("banner").textContent = text;
 }
 
-function press(button, on) {
-  button.setAttribute("aria-pressed", on);
-}
-
 connection.addEventListener("open", async ({ detail: hello }) => {
-  if (app.hello && String([app.hello.grid, app.hello.camera_grid]) !== String([hello.grid, hello.camera_grid])) {
-    location.reload(); // another T
-    return;
-  }
-  const first = !app.hello;
+  const first = !app.hello, grids = (of) => String([of.grid, of.camera_grid]);
+  if (!first && grids(app.hello) !== grids(hello)) location.reload(); // another T
   app.hello = hello;
   say("");
   $("title").textContent = document.title = hello.title;
-  $("facts").textContent = [`${hello.grid.join(" × ")} projector pixels`, hello.channels === 3 ? "colour" : "grey",
-    hello.compressed && `compressed, error ${(100 * hello.error).toPrecision(2)} %`, hello.device].filter(Boolean).join(" · ");
+  const compressed = hello.compressed && `compressed, error ${(100 * hello.error).toPrecision(2)} %`;
+  const facts = [`${hello.grid.join(" × ")} projector pixels`, hello.channels === 3 ? "colour" : "grey"];
+  $("facts").textContent = [...facts, compressed, hello.device].filter(Boolean).join(" · ");
   $("tab-bounces").disabled = !hello.square;
   $("tab-bounces").title = hello.square ? "" : "Bounces need a camera grid equal to the projector’s";
   await known();
@@ -61,7 +56,9 @@ connection.addEventListener("open", async ({ detail: hello }) => {
 connection.addEventListener("lost", () => {
   document.body.dataset.state = "lost";
   say("Not connected; trying again…");
-  fetch(location.pathname, { method: "HEAD" }).then(({ ok }) => ok || say("The viewer was started again, with another address: open that one"), () => {});
+  fetch(location.pathname, { method: "HEAD" }).then(({ ok }) => {
+    if (!ok) say("The viewer was started again, with another address: open that one");
+  }, () => {});
 });
 connection.addEventListener("busy", () => { document.body.dataset.state = "busy"; });
 connection.addEventListener("idle", () => {
@@ -69,7 +66,7 @@ connection.addEventListener("idle", () => {
   $("progress").hidden = true;
 });
 connection.addEventListener("progress", ({ detail: { residual } }) => {
-  const share = Math.min(Math.max(-Math.log10(residual) / 3, 0.03), 1); // of the way to the usual tolerance
+  const share = Math.min(Math.max(-Math.log10(residual) / 3 || 0, 0.03), 1); // of the way to 1e-3
   $("progress").hidden = false;
   $("progress").firstElementChild.style.width = `${100 * share}%`;
   $("progress").setAttribute("aria-valuenow", Math.round(100 * share));
@@ -101,42 +98,37 @@ const visit = (tab) => {
 };
 $("tabs").addEventListener("click", ({ target }) => target.role === "tab" && visit(target));
 $("tabs").addEventListener("keydown", ({ key }) => {
-  const step = { ArrowRight: 1, ArrowLeft: -1 }[key], open = tabs.filter((tab) => !tab.hidden && !tab.disabled);
-  if (step) visit(open[(open.indexOf(document.activeElement) + step + open.length) % open.length]);
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[key];
+  const open = tabs.filter((tab) => !tab.hidden && !tab.disabled), at = open.indexOf(document.activeElement);
+  if (step) visit(open[(at + step + open.length) % open.length]);
 });
 
 // ---- display
 
-function expose(stops) {
-  look.stops = Math.min(Math.max(stops, -8), 8);
+function display(change) {
+  Object.assign(look, change);
+  look.stops = Math.min(Math.max(look.stops, -8), 8);
   $("stops").value = look.stops;
   $("stops-value").textContent = (look.stops > 0 ? "+" : "") + look.stops;
+  press($("logarithmic"), look.logarithmic);
   each((panel) => panel.redrawSoon());
 }
 
-function logarithmic() {
-  look.logarithmic = !look.logarithmic;
-  press($("logarithmic"), look.logarithmic);
-  each((panel) => panel.redraw());
-}
-
-$("stops").oninput = () => expose(Number($("stops").value));
-$("darker").onclick = () => expose(look.stops - 0.5);
-$("brighter").onclick = () => expose(look.stops + 0.5);
+const brighter = () => display({ stops: look.stops + 0.5 });
+const darker = () => display({ stops: look.stops - 0.5 });
+const logarithmic = () => display({ logarithmic: !look.logarithmic });
+const KEYS = { "+": brighter, "=": brighter, "-": darker, l: logarithmic, L: logarithmic };
+$("stops").oninput = () => display({ stops: Number($("stops").value) });
+$("mode").onchange = () => display({ mode: Number($("mode").value) });
+$("darker").onclick = darker;
+$("brighter").onclick = brighter;
 $("logarithmic").onclick = logarithmic;
-$("mode").onchange = () => {
-  look.mode = Number($("mode").value);
-  each((panel) => panel.redraw());
-};
 $("white").onclick = () => {
-  expose(0);
-  each((panel) => panel.adapt());
+  each((panel) => { panel.white = panel.measured; });
+  display({ stops: 0 });
 };
-addEventListener("keydown", (event) => {
-  if (event.target.tagName === "SELECT" || event.ctrlKey || event.metaKey || event.altKey) return;
-  if (event.key === "+" || event.key === "=") expose(look.stops + 0.5);
-  else if (event.key === "-") expose(look.stops - 0.5);
-  else if (event.key.toLowerCase() === "l") logarithmic();
+addEventListener("keydown", ({ key, target, ctrlKey, metaKey, altKey }) => {
+  if (target.tagName !== "SELECT" && !ctrlKey && !metaKey && !altKey) KEYS[key]?.();
 });
 
 // ---- pictures
@@ -144,14 +136,12 @@ addEventListener("keydown", (event) => {
 async function known() {
   const answer = await ask("pictures");
   if (answer) app.pictures = answer.pictures;
-  for (const select of document.querySelectorAll("select[id$=source]")) choices(select);
-}
-
-// Fill a selection with the pictures that the server knows, after the `data-first` entry of its own.
-function choices(select, chosen = select.value) {
-  select.replaceChildren(...(select.dataset.first ? [new Option(select.dataset.first, "")] : []),
-    ...app.pictures.map(({ picture, name }) => new Option(name, picture)));
-  select.value = [...select.options].some(({ value }) => value === String(chosen)) ? chosen : select.options[0]?.value ?? "";
+  for (const select of document.querySelectorAll("select[id$=source]")) {
+    const chosen = select.value, first = select.dataset.first ? [new Option(select.dataset.first, "")] : [];
+    select.replaceChildren(...first, ...app.pictures.map(({ picture, name }) => new Option(name, picture)));
+    select.value = chosen;
+    if (select.selectedIndex < 0) select.selectedIndex = 0;
+  }
 }
 
 // Give a file to the view in sight: it takes it itself, or the server does, and the view gets its number.

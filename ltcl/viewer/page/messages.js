@@ -19,7 +19,7 @@ export class Pixels {
     return Array.from({ length: this.c }, (_, k) => this.number((row * this.w + col) * this.c + k));
   }
 
-  // What to show as white: that share of pixels is below it. The brightest one would often leave the rest black.
+  // What to show as white: this share of pixels is darker. The brightest would often leave the rest black.
   white(share = 0.99) {
     const n = this.h * this.w, step = Math.max(1, Math.floor(n / 4096)), light = [];
     for (let i = 0; i < n; i += step) {
@@ -49,7 +49,8 @@ export function encode(header, arrays = {}) {
   });
   const json = new TextEncoder().encode(JSON.stringify({ ...header, arrays: list }));
   const start = padded(4 + json.length);
-  const bytes = new Uint8Array(names.reduce((sum, name) => sum + padded(arrays[name].data.byteLength), start));
+  const size = names.reduce((sum, name) => sum + padded(arrays[name].data.byteLength), start);
+  const bytes = new Uint8Array(size);
   new DataView(bytes.buffer).setUint32(0, start - 4, true);
   bytes.fill(32, 4, start).set(json, 4);
   let offset = start;

@@ -8,7 +8,7 @@ const panels = new Set();
 export const each = (change) => panels.forEach(change);
 
 const STEPS = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
-const HYSTERESIS = 6; // white follows a picture only when it is brighter, or darker by this factor: no flicker
+const HYSTERESIS = 6; // white follows a picture that is brighter, or darker by this factor: no flicker
 
 export class Panel {
   // `element` is an empty <figure>. `grid` is [h, w]. `act(kind, row, col, event)` hears what pointer and
@@ -17,12 +17,10 @@ export class Panel {
     Object.assign(this, { element, grid, act, layers: new Layers(), white: 0, zoom: 1 });
     this.cursor = grid.map((n) => n >> 1);
     element.classList.add("panel");
-    element.innerHTML = `<figcaption><span class="title"></span><span class="note"></span><span class="zoom">
-      <button type="button" aria-label="Zoom out" title="Zoom out">−</button><button type="button" aria-label="Zoom in" title="Zoom in">+</button>
-      </span></figcaption><div class="frame"><div class="sheet"><canvas tabindex="0" role="application"
-      aria-roledescription="picture"></canvas><span class="cursor" hidden></span></div></div><output class="values"></output>`;
+    element.append(document.getElementById("panel").content.cloneNode(true));
     const find = (selector) => element.querySelector(selector);
-    Object.assign(this, { canvas: find("canvas"), frame: find(".frame"), sheet: find(".sheet"), mark: find(".cursor"), output: find(".values") });
+    Object.assign(this, { canvas: find("canvas"), frame: find(".frame"), sheet: find(".sheet") });
+    Object.assign(this, { mark: find(".cursor"), output: find(".values") });
     find(".title").textContent = title;
     this.canvas.id = `${element.id}-canvas`;
     this.output.id = `${element.id}-values`;
@@ -47,21 +45,15 @@ export class Panel {
     this.layers.set([pictures].flat());
     this.weights = weights;
     this.measured = white ?? this.layers.pictures[0].white();
-    const { white: now, measured } = this;
-    if (measured > now || measured < now / HYSTERESIS) this.white = measured;
-    this.redraw();
-  }
-
-  adapt() {
-    this.white = this.measured;
+    if (this.measured > this.white || this.measured < this.white / HYSTERESIS) this.white = this.measured;
     this.redraw();
   }
 
   redraw() {
-    if (!this.layers.pictures || !this.element.offsetParent) return; // an unseen view is drawn when it comes up
+    if (!this.layers.pictures || !this.element.offsetParent) return; // hidden ones are drawn later
     const white = (this.white || 1) / 2 ** look.stops;
-    const { wipe, others, deviation, weights } = this;
-    draw(this.canvas, this.layers, { white, ...look, mode: this.mode ?? look.mode, weights, others, wipe, deviation });
+    const { wipe, others, deviation, weights, mode = look.mode } = this;
+    draw(this.canvas, this.layers, { ...look, white, mode, weights, others, wipe, deviation });
     this.canvas.dataset.white = white;
     this.read();
   }
@@ -99,11 +91,10 @@ export class Panel {
       else this.point(fingers.size ? "drag" : "hover", event);
     });
     const up = (event) => {
-      if (fingers.delete(event.pointerId) && !fingers.size && !grip) this.act("release", ...this.cursor, event);
+      if (fingers.delete(event.pointerId) && !fingers.size && !grip) this.act("release", ...this.cursor);
       grip = null;
     };
-    canvas.addEventListener("pointerup", up);
-    canvas.addEventListener("pointercancel", up);
+    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, up);
     canvas.addEventListener("pointerleave", () => this.act("leave", ...this.cursor));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     this.frame.addEventListener("wheel", (event) => {
@@ -125,7 +116,7 @@ export class Panel {
     if (step) {
       const far = event.shiftKey ? 10 : 1;
       this.moveTo(...this.cursor.map((at, axis) => at + far * step[axis]));
-      this.mark.scrollIntoView?.({ block: "nearest", inline: "nearest" });
+      this.mark.scrollIntoView({ block: "nearest", inline: "nearest" });
       this.act(this.pressed ? "drag" : "hover", ...this.cursor, event);
     } else if (!event.repeat) {
       this.pressed = true; // arrow keys drag until the key is released
@@ -155,11 +146,15 @@ export class Panel {
     style.width = `max(12px, ${(size / w) * 100}%)`;
   }
 
+  values(row, col) {
+    return this.layers.pictures ? this.layers.at(row, col, this.weights) : [];
+  }
+
   read() {
     const [row, col] = this.cursor;
-    const values = this.values ? this.values(row, col) : this.layers.pictures ? this.layers.at(row, col, this.weights) : [];
-    const names = values.length === 3 ? ["R ", "G ", "B "] : [""];
-    const text = values.map((v, k) => `${names[k]}${Math.abs(v) < 1e-3 && v ? v.toExponential(2) : v.toFixed(4)}`);
+    const names = ["R ", "G ", "B "];
+    const format = (v) => (Math.abs(v) < 1e-3 && v ? v.toExponential(2) : v.toFixed(4));
+    const text = this.values(row, col).map((v, k, all) => (all.length === 3 ? names[k] : "") + format(v));
     this.output.textContent = `row ${row}, column ${col}   ${text.join("   ")}`;
   }
 

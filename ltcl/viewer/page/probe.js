@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Probe: what a projector pixel lights (its column of T), or where a camera pixel's light comes from (its row).
+// Probe: what a projector pixel lights (a column of T), or where a camera pixel's light comes from (a row).
 
 import { Panel } from "./panel.js";
 
@@ -31,10 +31,10 @@ export function probe({ $, ask, press, hello }) {
     const answer = await ask(kind, { pixel: panel.cursor });
     if (!answer || sides[source].kind !== kind) return;
     const light = answer.arrays[array];
-    sides[other].panel.show(light, [1], light.white(0.95)); // what was lit directly is far brighter than the rest
+    sides[other].panel.show(light, [1], light.white(0.95)); // direct light is far brighter
   }
 
-  // From now on the ring is in the picture of this side, which shows the scene (or, of another grid, the pattern).
+  // From now on the ring is on this side, which shows the scene, or the pattern where that has another grid.
   function turn(name) {
     source = name;
     held = false;
@@ -50,10 +50,12 @@ export function probe({ $, ask, press, hello }) {
 
   async function start() {
     const { panel, other } = sides[source];
-    sides[other].panel.note = source === "projector" ? "what the ring’s pixel lights" : "where the ring’s light comes from";
+    const forward = source === "projector";
+    sides[other].panel.note = forward ? "what the ring’s pixel lights" : "where its light comes from";
     look();
     const now = await ask("relight");
-    if (now && sides[source].panel === panel) panel.show(now.arrays[source === "camera" || hello.square ? "picture" : "pattern"]);
+    if (!now || sides[source].panel !== panel) return;
+    panel.show(now.arrays[forward && !hello.square ? "pattern" : "picture"]);
   }
 
   $("probe-forward").onclick = () => turn("projector");

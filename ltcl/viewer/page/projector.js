@@ -18,7 +18,7 @@ connection.addEventListener("open", async ({ detail }) => {
   await connection.ask("projector");
   document.body.dataset.state = "ready";
 });
-connection.addEventListener("lost", () => { document.body.dataset.state = "lost"; }); // the last pattern stays
+connection.addEventListener("lost", () => { document.body.dataset.state = "lost"; }); // the pattern stays
 connection.addEventListener("show", ({ detail: { arrays: { codes } } }) => {
   if (canvas.width !== codes.w || canvas.height !== codes.h) {
     [canvas.width, canvas.height] = [codes.w, codes.h];

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: BSD-3-Clause
-// Relight: paint on the projector's pattern, or let a picture, a video or a moving spot do it; the scene answers.
+// Relight: paint on the projector's pattern, or let a picture, a video or a moving spot do it.
 
 import { draw, Layers } from "./gl.js";
 import { Pixels } from "./messages.js";
@@ -10,7 +10,7 @@ const UNDO = 30; // steps that can be undone
 export function relight({ $, ask, press, hello }) {
   const [h, w] = hello.grid;
   const canvas = () => pattern.canvas;
-  const pattern = new Panel($("relight-pattern"), { title: "Projector’s pattern", grid: hello.grid, act: heard });
+  const pattern = new Panel($("relight-pattern"), { title: "Projector’s pattern", grid: [h, w], act });
   const seen = new Panel($("relight-seen"), { title: "What the camera sees", grid: hello.camera_grid });
   const paint = canvas().getContext("2d", { willReadFrequently: true });
   const past = [], video = document.createElement("video");
@@ -20,9 +20,6 @@ export function relight({ $, ask, press, hello }) {
   const size = $("relight-size"), source = $("relight-source");
   size.max = Math.max(8, Math.round(Math.max(h, w) / 3));
   size.value = Math.max(1, Math.round(Math.max(h, w) / 10));
-  source.dataset.first = "none";
-  source.prepend(new Option(source.dataset.first, ""));
-  source.value = "";
   pattern.values = (row, col) => [...paint.getImageData(col, row, 1, 1).data.slice(0, 3)].map(linear);
 
   const linear = (code) => (code <= 10 ? code / 255 / 12.92 : ((code / 255 + 0.055) / 1.055) ** 2.4);
@@ -36,12 +33,12 @@ export function relight({ $, ask, press, hello }) {
       rgb[k + 2] = rgba[i + 2];
       grey &&= rgba[i] === rgba[i + 1] && rgba[i] === rgba[i + 2];
     }
-    return grey ? new Pixels(rgb.filter((_, k) => k % 3 === 0), [h, w, 1], 1, "u1") : new Pixels(rgb, [h, w, 3], 1, "u1");
+    return new Pixels(grey ? rgb.filter((_, k) => k % 3 === 0) : rgb, [h, w, grey ? 1 : 3], 1, "u1");
   }
 
   const show = (light) => seen.show(light, [1], light.white(0.97)); // bounces are darker than what is lit
 
-  // Send what is painted when an answer has come: one pattern is computed, and one on its way, but never more.
+  // Send what is painted when an answer has come: one pattern is computed, one on its way, never more.
   async function send() {
     changed = true;
     canvas().dataset.frame = Number(canvas().dataset.frame ?? 0) + 1;
@@ -56,52 +53,45 @@ export function relight({ $, ask, press, hello }) {
     pattern.read();
   }
 
-  function heard(kind, row, col, event) {
+  function act(kind, row, col) {
     pattern.ring(kind === "leave" ? 0 : Number(size.value));
     if (kind === "press") {
-      still();
-      remember();
+      begin();
       last = [row, col];
-    }
-    if (kind === "release" || kind === "leave") last = null;
-    if ((kind !== "press" && kind !== "drag") || !last) return;
-    stroke(last, [row, col], event);
-    last = [row, col];
-  }
-
-  function stroke([fromRow, fromCol], [row, col]) {
+    } else if (kind !== "drag") last = null;
+    if (!last) return;
     paint.strokeStyle = erasing ? "#000" : $("relight-colour").value;
     paint.lineWidth = Number(size.value);
     paint.beginPath();
-    paint.moveTo(fromCol + 0.5, fromRow + 0.5);
+    paint.moveTo(last[1] + 0.5, last[0] + 0.5);
     paint.lineTo(col + 0.5, row + 0.5 + 1e-3); // a line without length is not drawn
     paint.stroke();
     send();
+    last = [row, col];
   }
 
-  function remember() {
-    past.push(paint.getImageData(0, 0, w, h));
-    if (past.length > UNDO) past.shift();
-  }
-
-  function fill(colour) {
-    still();
-    remember();
-    paint.fillStyle = colour;
-    paint.fillRect(0, 0, w, h);
-    send();
-  }
-
-  // Stop what moves: the spot or the video.
+  // Stop what moves, the spot or the video.
   function still() {
     cancelAnimationFrame(motion);
-    motion = null;
     video.pause();
     press($("relight-spot"), false);
   }
 
-  function animate(frame) {
+  // Before something else is painted.
+  function begin() {
     still();
+    past.push(paint.getImageData(0, 0, w, h));
+    if (past.length > UNDO) past.shift();
+  }
+
+  function fill(style) {
+    paint.fillStyle = style;
+    paint.fillRect(0, 0, w, h);
+    send();
+  }
+
+  function animate(frame) {
+    begin();
     const step = (now) => {
       motion = requestAnimationFrame(step);
       if (!changed) frame(now / 1000); // the last one is on its way
@@ -114,9 +104,7 @@ export function relight({ $, ask, press, hello }) {
     const glow = paint.createRadialGradient(x, y, 0, x, y, Number(size.value));
     glow.addColorStop(0, $("relight-colour").value);
     glow.addColorStop(1, "#000");
-    paint.fillStyle = glow;
-    paint.fillRect(0, 0, w, h);
-    send();
+    fill(glow);
   }
 
   // Fill the pattern with a picture or a frame, cut to its shape.
@@ -133,13 +121,11 @@ export function relight({ $, ask, press, hello }) {
       video.src = URL.createObjectURL(file);
       await video.play();
       animate(() => cover(video, video.videoWidth, video.videoHeight));
-      video.play();
       return true;
     }
     const bitmap = await createImageBitmap(file).catch(() => null); // EXR and the like: the server reads them
     if (!bitmap) return false;
-    still();
-    remember();
+    begin();
     cover(bitmap, bitmap.width, bitmap.height);
     return true;
   }
@@ -168,8 +154,12 @@ export function relight({ $, ask, press, hello }) {
   };
   $("relight-brush").onclick = () => tool(false);
   $("relight-eraser").onclick = () => tool(true);
-  $("relight-fill").onclick = () => fill($("relight-colour").value);
-  $("relight-clear").onclick = () => fill("#000");
+  for (const [name, style] of [["fill", () => $("relight-colour").value], ["clear", () => "#000"]]) {
+    $(`relight-${name}`).onclick = () => {
+      begin();
+      fill(style());
+    };
+  }
   $("relight-undo").onclick = () => {
     still();
     if (past.length) paint.putImageData(past.pop(), 0, 0);
@@ -177,13 +167,11 @@ export function relight({ $, ask, press, hello }) {
   };
   $("relight-spot").onclick = () => {
     if ($("relight-spot").getAttribute("aria-pressed") === "true") return still();
-    remember();
     animate(spot);
     press($("relight-spot"), true);
   };
   source.onchange = () => {
-    still();
-    remember();
+    begin();
     if (source.value) start({ picture: Number(source.value) });
   };
   return { start: () => start(), stop: still, take };
