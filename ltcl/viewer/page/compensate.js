@@ -37,7 +37,8 @@ export function compensate({ $, ask, hello }) {
     $("compensate-low-value").textContent = low.value;
     $("compensate-high-value").textContent = high.value;
     if (!auto.checked) $("compensate-gain-value").textContent = gain.value;
-    const bounds = [low, high].map(({ value }) => Number(value)), level = auto.checked ? "auto" : Number(gain.value);
+    const bounds = [low, high].map(({ value }) => Number(value));
+    const level = auto.checked ? "auto" : Number(gain.value);
     const answer = await ask("compensate", { picture: Number(source.value), gain: level, bounds });
     if (!answer) return;
     const { arrays } = answer, white = arrays.target.white();
