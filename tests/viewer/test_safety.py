@@ -49,7 +49,7 @@ class Running:
         with connection, contextlib.suppress(OSError):  # it may be closed before all is sent
             connection.sendall(data)
             connection.settimeout(2)
-            while (part := connection.recv(1 << 16)) and b"\r\n\r\n" not in received:
+            while b"\r\n\r\n" not in received and (part := connection.recv(1 << 16)):
                 received += part
         return received
 

@@ -385,9 +385,9 @@ def test_a_viewer_in_a_notebook_is_a_frame(colour):
 def test_an_address_that_cannot_be_had_is_refused(colour):
     with ltcl.view(colour, open_browser=False) as viewer:
         port = int(viewer.url.split(":")[2].split("/")[0])
-        for settings in ({"port": port}, {"port": -1}, {"port": 1 << 17}, {"host": "256.1.1.1"}):
+        for host, wrong in (("127.0.0.1", port), ("127.0.0.1", -1), ("127.0.0.1", 1 << 17), ("256.1.1.1", 0)):
             with pytest.raises(errors.InputError, match="port"):
-                ltcl.view(colour, open_browser=False, **settings)
+                ltcl.view(colour, host=host, port=wrong, open_browser=False)
 
 
 def test_the_command_runs_until_ctrl_c(tmp_path):
