@@ -163,10 +163,13 @@ class _Http(H11Protocol):
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
         self.app_state = {"abort": transport.abort}  # of its socket, too: close would wait for a reader
+        self.since = time.monotonic()
         self.loop.call_later(PATIENCE, lambda: self.scope is None and self._drop())
         self.loop.call_later(LIFETIME, self._drop)
-        if len(plain := [each for each in self.connections if isinstance(each, _Http)]) > CONNECTIONS:
-            plain[0].transport.abort()
+        plain = [each for each in self.connections if isinstance(each, _Http)]
+        plain = [each for each in plain if not each.transport.is_closing()]
+        if len(plain) > CONNECTIONS:
+            min(plain, key=lambda each: (each.scope is not None, each.since)).transport.abort()
 
     def _drop(self) -> None:
         if self in self.connections:  # and has not become a socket
@@ -179,8 +182,9 @@ class Viewer(contextlib.AbstractContextManager):
     def __init__(self, scene: Scene, host: str, port: int) -> None:
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            listening = socket.create_server((host, port), family=family)
-        except (OSError, OverflowError) as error:
+            place = host, checks.count("port", port, least=0, most=65535)
+            listening = socket.create_server(place, family=family)
+        except OSError as error:
             raise InputError(f"host is {host!r}, port {port}: {error}; they must be free here") from None
         address, self._port = listening.getsockname()[:2]
         self.is_local = ipaddress.ip_address(address).is_loopback
