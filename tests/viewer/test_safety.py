@@ -20,6 +20,7 @@ import pytest
 import scipy.sparse
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 import ltcl
 from ltcl.viewer import server
@@ -421,7 +422,7 @@ def test_one_that_does_not_read_delays_nobody_and_is_closed(monkeypatch, device)
         small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         small.connect(("127.0.0.1", int(page.origin.split(":")[2])))
         address = viewer.url.replace("http", "ws", 1) + "socket"
-        with connect(address, sock=small, origin=page.origin, max_queue=1) as deaf:
+        with connect(address, sock=small, origin=Origin(page.origin), max_queue=1) as deaf:
             for number in range(40):
                 with contextlib.suppress(ConnectionClosed):
                     deaf.send(json.dumps({"id": number, "do": "column", "pixel": [0, 0]}))
