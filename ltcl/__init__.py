@@ -75,13 +75,12 @@ __all__ = [
 ]
 
 _LAZY = ("acquisition", "batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib
+_FUNCTIONS = {"acquire": "acquisition", "view": "viewer"}
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return importlib.import_module(f"ltcl.{name}")
-    if name == "acquire":
-        return importlib.import_module("ltcl.acquisition").acquire
-    if name == "view":
-        return importlib.import_module("ltcl.viewer").view
+    if name in _FUNCTIONS:
+        return getattr(importlib.import_module(f"ltcl.{_FUNCTIONS[name]}"), name)
     raise AttributeError(f"module 'ltcl' has no attribute {name!r}")

@@ -27,11 +27,13 @@ def view(
 ) -> Answer:
     """Look at TRANSPORT in the browser: probe, bounces, relight, compensate, projector. Ctrl-C ends it."""
     from ltcl import images
-    from ltcl.acquisition import Setup
     from ltcl.viewer import view
 
-    T = options.load(context, transport)
-    setup = Setup.of(transport) if options.is_measured(transport) else None
+    T, setup = options.load(context, transport), None
+    if options.is_measured(transport):
+        from ltcl.acquisition import Setup  # which takes a second
+
+        setup = Setup.of(transport)
     pictures, title = {path.name: images.read(path) for path in picture or []}, transport.name
     address = {"host": host, "port": port, "open_browser": not no_browser}
     with view(T, pictures, setup=setup, title=title, **address) as viewer:

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from ltcl.viewer.server import Viewer
 
 
+_logger = logging.getLogger(__name__)
+
+
 def view(
     T: Transport,
     picture: Any = None,
@@ -27,18 +30,11 @@ def view(
 ) -> Viewer:
     """Show T in the browser: probe it, separate bounces, relight, compensate; feed a projector.
 
-    Parameters
-    ----------
-    T : Transport
-    picture : (h, w[, 3]), or a dict of them by names, optional
-        Linear light: targets of compensations, pictures to separate or relight with.
-    host, port : str, int
-        Address to listen on. Beyond this machine whoever has the URL can look and compute.
-    setup : ltcl.acquisition.Setup, optional
-        Of a measured T: projector windows then show its codes, else sRGB.
-
-    Returns a `Viewer`: its `url`, `close()`, a with block; a notebook shows it as a frame. InputError for an
-    address that cannot be had, or without the extra `view`.
+    `picture` is linear light (h, w[, 3]), or a dict of such by names, to compensate for, separate or relight
+    with. `host` and `port` are the address: beyond this machine whoever has the URL can look and compute.
+    `setup` is the `ltcl.acquisition.Setup` of a measured T, whose codes projector windows then show, else
+    sRGB. Returns a `Viewer`: its `url`, `close()`, a with block; a notebook shows it as a frame. InputError
+    for an address that cannot be had, or without the extra `view`.
 
     Examples
     --------
@@ -56,8 +52,7 @@ def view(
     pictures = picture if isinstance(picture, Mapping) else {} if picture is None else {"picture": picture}
     viewer = Viewer(Scene(T, title or repr(T).strip("<>"), pictures, setup), host, port)
     if not viewer.is_local:
-        text = "%s is open to the network, unencrypted: whoever has the URL can look and compute"
-        logging.getLogger(__name__).warning(text, viewer.url)
+        _logger.warning("%s is open to the network, unencrypted: whoever has it can compute", viewer.url)
     if open_browser:
         webbrowser.open(viewer.url)
     return viewer

@@ -117,8 +117,7 @@ class Scene:
         ambient = None if self.setup is None else self.setup.ambient
         c = compensate(self.T, desired, background=ambient, callback=callback, **asked)
         facts = {key: getattr(c, key) for key in ("error", "gain", "clipped", "gap", "transport_error")}
-        facts |= {"seconds": time.perf_counter() - start}
-        solves = report.solution(c.solution)
+        facts["seconds"], solves = time.perf_counter() - start, report.solution(c.solution)
         solves += [each for each in report.solution(c.limited) if each not in solves]
         facts["method"] = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
         facts["products"] = sum(solve["products"] for solve in solves)

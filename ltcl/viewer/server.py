@@ -18,7 +18,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -54,18 +53,17 @@ class _Superseded(Exception):
 
 
 class Turns:
-    """One computation at a time, first come, first served; a solve lets others by between its steps."""
+    """One computation at a time, first come, first served; a solve lets quick ones by between its steps."""
 
     def __init__(self) -> None:
-        self._turn, self._queue = asyncio.Lock(), 0
-        self._solves, self._threads = asyncio.Semaphore(SOCKETS), ThreadPoolExecutor(2 * SOCKETS)
+        self._turn, self._solve, self._queue = asyncio.Lock(), asyncio.Lock(), 0
 
     async def take(self, is_long: bool, call: Callable[..., Any], *arguments: Any) -> Any:
         """`call` in a thread, when it is its turn; not to be cancelled, as the thread would go on."""
-        async with self._solves if is_long else contextlib.nullcontext():
+        async with self._solve if is_long else contextlib.nullcontext():
             await self._wait()
             try:
-                return await asyncio.get_running_loop().run_in_executor(self._threads, call, *arguments)
+                return await asyncio.to_thread(call, *arguments)
             finally:
                 self._turn.release()
 
