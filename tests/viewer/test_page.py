@@ -96,7 +96,7 @@ def shows(page: Page, name: str, light: np.ndarray, *, logarithmic: bool = False
         codes, white = pixels(page, name)
         value = light / white
         if logarithmic:
-            expected = 1 + np.log10(np.maximum(value, 1e-9)) / 4
+            expected = 0.75 + np.log10(np.maximum(value, 1e-9)) / 4
         else:
             expected = to_srgb(np.clip(value, 0, 1))
         expected = 255 * np.clip(expected, 0, 1)

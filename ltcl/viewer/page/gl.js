@@ -24,7 +24,8 @@ vec3 heat(float t) { // fit of matplotlib's inferno by Matt Zucker (CC0)
     + t * (vec3(77.1629, -33.4023, -81.8073) + t * (vec3(-71.3194, 32.6260, 73.2095)
     + t * vec3(25.1311, -12.2426, -23.0703)))))), 0.0, 1.0);
 }
-float decades(float value) { return clamp(1.0 + 0.25 * log(max(value, 1e-9)) / log(10.0), 0.0, 1.0); }
+// Four decades, one of them beyond white: a logarithm is asked for to see highlights, too.
+float decades(float value) { return clamp(0.75 + 0.25 * log(max(value, 1e-9)) / log(10.0), 0.0, 1.0); }
 vec3 encoded(vec3 linear) { // sRGB
   return mix(1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, 12.92 * linear, lessThan(linear, vec3(0.0031308)));
 }

@@ -17,6 +17,7 @@ export class Panel {
     Object.assign(this, { element, grid, act, layers: new Layers(), white: 0, zoom: 1 });
     this.cursor = grid.map((n) => n >> 1);
     element.classList.add("panel");
+    element.parentElement.classList.toggle("wide", grid[1] > 2.3 * grid[0]); // pictures that are larger stacked
     element.append(document.getElementById("panel").content.cloneNode(true));
     const find = (selector) => element.querySelector(selector);
     Object.assign(this, { canvas: find("canvas"), frame: find(".frame"), sheet: find(".sheet") });
