@@ -22,7 +22,7 @@ from playwright.sync_api import Browser, Locator, Page, sync_playwright
 
 FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 FLAGS += ["--disable-component-update", "--disable-sync", "--disable-gpu", "--enable-unsafe-swiftshader"]
-PATIENCE = 20.0  # seconds, of what a loaded machine may take
+PATIENCE = 20.0  # seconds
 VIEWS = ("probe", "bounces", "relight", "compensate")
 ALBEDO = (0.8, 0.5, 0.3)
 

@@ -272,7 +272,6 @@ def test_a_measured_T_shows_the_codes_of_its_projector(device, tmp_path):
         ("row", {"pixel": "00"}, "pixel"),
         ("row", {}, "pixel"),
         ("row", {"pixel": [0, 0], "more": 1}, "more"),
-        ("relight", {}, "picture"),
         ("relight", {"pattern": [[1, 2]]}, "pattern"),
         ("bounces", {"count": 17}, "count"),
         ("bounces", {"of": "light"}, "of"),
