@@ -81,7 +81,7 @@ class Scene:
         return {}, {"pattern": shape.pack(rows, T.grid)}
 
     def relight(self, pattern: Any = None, picture: Any = None) -> Reply:
-        """The picture under a pattern, linear light or sRGB codes, shown from now on; or under that of now."""
+        """The picture under a pattern, linear light or sRGB codes, shown from now on; or the present."""
         if pattern is None:
             light = self.pattern if picture is None else self._picture(picture)[2]
         else:
