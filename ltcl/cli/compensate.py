@@ -29,14 +29,15 @@ _RESULTS = ("gain", "clipped", "error", "transport_error", "gap")
 _SHEET = 12  # pictures on a contact sheet, at most
 
 
-def _gain(text: str) -> float | str:
+def parse_gain(text: str) -> float | str:
+    """A number, or auto."""
     try:
         return "auto" if text == "auto" else float(text)
     except ValueError:
         raise typer.BadParameter(f"{text!r} is no gain; write a number, or auto") from None
 
 
-_GAIN = "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
+GAIN = "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
 _BACKGROUND = "Picture of the light that stays. Default: as measured, else none."
 _VIDEO = "Also a video of the patterns: .mkv or .avi, lossless; or .mp4, which changes their codes."
 _FPS = "Frames a second of that video. Default: as the source, else 25."
@@ -77,7 +78,7 @@ def compensate(
     picture: Annotated[
         list[Path] | None, argument("PICTURE...", "Pictures; or one folder or one video of frames.")
     ] = None,
-    gain: Annotated[str | None, option(_GAIN, parser=_gain, metavar="FACTOR")] = None,
+    gain: Annotated[str | None, option(GAIN, parser=parse_gain, metavar="FACTOR")] = None,
     loss: Annotated[float | None, option("Error that --gain auto may cost. Default: the least.")] = None,
     low: Annotated[float, option("Darkest light of the projector.")] = 0.0,
     high: Annotated[float, option("Brightest light of the projector.")] = 1.0,

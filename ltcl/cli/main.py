@@ -18,7 +18,7 @@ from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
 from ltcl.cli.compensate import compensate, relight, separate
 from ltcl.cli.doctor import demo, devices, doctor
 from ltcl.cli.files import analyze, compress, convert, denoise, info, invert
-from ltcl.cli.view import view
+from ltcl.cli.view import play, view
 from ltcl.errors import InputError, LtclError
 
 app = typer.Typer(
@@ -32,7 +32,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _FILES = (info, analyze, convert, compress, invert, denoise)
-for _command in (devices, doctor, demo, simulate, *_FILES, compensate, separate, relight, view, show):
+for _command in (devices, doctor, demo, simulate, *_FILES, compensate, separate, relight, view, play, show):
     app.command()(_command)
 app.add_typer(acquire, name="acquire")
 

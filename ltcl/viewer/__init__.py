@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import logging
-import webbrowser
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +13,13 @@ if TYPE_CHECKING:
     from ltcl.viewer.server import Viewer
 
 
-_logger = logging.getLogger(__name__)
+def serve(scene: Any, host: str = "127.0.0.1", port: int = 0, open_browser: bool = True) -> Viewer:
+    """A viewer of a scene, and a page of it; errors as of `view`."""
+    try:
+        from ltcl.viewer.server import Viewer
+    except ImportError as error:
+        raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
+    return Viewer(scene, host, port, open_browser)
 
 
 def view(
@@ -31,7 +35,8 @@ def view(
     """Show T in the browser: probe it, separate bounces, relight, compensate; feed a projector.
 
     `picture` is linear light (h, w[, 3]), or a dict of such by names, to compensate for, separate or relight
-    with. `host` and `port` are the address: beyond this machine whoever has the URL can look and compute.
+    with. `host` and `port` are the address: beyond this machine whoever has the URL can look and compute;
+    pages of a viewer that ended find the next one on the same `port`.
     `setup` is the `ltcl.acquisition.Setup` of a measured T, whose codes projector windows then show, else
     sRGB. Returns a `Viewer`: its `url`, `close()`, a with block; a notebook shows it as a frame. InputError
     for an address that cannot be had, or without the extra `view`.
@@ -44,15 +49,8 @@ def view(
     ...     viewer.url.startswith("http://127.0.0.1:")
     True
     """
+    from ltcl.viewer.answers import Scene
+
     require(T, square=False)
-    try:
-        from ltcl.viewer.server import Scene, Viewer
-    except ImportError as error:
-        raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
     pictures = picture if isinstance(picture, Mapping) else {} if picture is None else {"picture": picture}
-    viewer = Viewer(Scene(T, title or repr(T).strip("<>"), pictures, setup), host, port)
-    if not viewer.is_local:
-        _logger.warning("%s is open to the network, unencrypted: whoever has it can compute", viewer.url)
-    if open_browser:
-        webbrowser.open(viewer.url)
-    return viewer
+    return serve(Scene(T, title or repr(T).strip("<>"), pictures, setup), host, port, open_browser)

@@ -35,12 +35,15 @@ class Scene:
     """T and what is shown of it; methods take what a question holds, and raise LtclError for anything else.
 
     `setup` is the `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light that the
-    projector has now, of at most `white`.
+    projector has now, of at most `white`. `questions` may be asked, the largest of so many `pixels`.
     """
+
+    page = "index.html"
+    questions = (*QUICK, *LONG)
 
     def __init__(self, T: Transport, title: str, pictures: Mapping[str, np.ndarray], setup: Any) -> None:
         self.T, self.title, self.setup = T, title, setup
-        self.pattern, self.white = np.ones(T.grid, np.float32), 1.0
+        self.pattern, self.white, self.pixels = np.ones(T.grid, np.float32), 1.0, max(T.shape)
         entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
         self._shows_noise = T.is_square and (entries or T.measured_noise is not None)
         self._pictures: dict[int, tuple[str, np.ndarray, np.ndarray]] = {}  # for the camera, the projector
@@ -60,7 +63,7 @@ class Scene:
 
     def answer(self, do: str, asked: dict[str, Any], callback: Callback) -> Reply:
         """The answer to a question by name; `callback` is called between the steps of a solve."""
-        method = getattr(self, checks.one_of("do", do, (*QUICK, *LONG)))
+        method = getattr(self, checks.one_of("do", do, self.questions))
         try:
             bound = inspect.signature(method).bind(**asked, **({"callback": callback} if do in LONG else {}))
         except TypeError as error:

@@ -13,10 +13,14 @@ import asyncio
 import contextlib
 import html
 import ipaddress
+import logging
+import os
+import re
 import secrets
 import socket
 import threading
 import time
+import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,15 +32,20 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ltcl import checks
+from ltcl.device import tuning
 from ltcl.errors import InputError, LtclError
 from ltcl.viewer import messages
-from ltcl.viewer.answers import LARGEST_FILE, LONG, QUICK, Scene
+from ltcl.viewer.answers import LARGEST_FILE, LONG
 
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json"}
 TYPES |= {".svg": "image/svg+xml", ".png": "image/png", ".exr": "image/x-exr"}
 SOCKETS, CONNECTIONS = 32, 256
 PATIENCE, LIFETIME = 5.0, 60.0  # seconds for a client to read an answer, or to ask; of what is no socket
 _PERIOD = 0.1  # seconds between two reports of progress
+_LOOK = 1.0  # seconds between two looks into the folder of a scan
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # Windows has none
+_KEPT = 86400.0  # seconds for which the token of a port is used again
+_logger = logging.getLogger(__name__)
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' blob:; media-src blob:; connect-src 'self' ws://{}; base-uri 'none'; form-action 'none'; "
@@ -83,17 +92,17 @@ class Turns:
 class Client:
     """A socket, its questions that wait, by what they ask, and whether it is a projector window."""
 
-    def __init__(self, socket: WebSocket, scene: Scene, turns: Turns, clients: list[Client]) -> None:
+    def __init__(self, socket: WebSocket, scene: Any, turns: Turns, clients: list[Client]) -> None:
         self.socket, self.scene, self.turns, self.clients = socket, scene, turns, clients
         self.questions: dict[str, tuple[float, dict[str, Any]]] = {}
         self.busy, self.tasks, self.loop = set[str](), asyncio.TaskGroup(), asyncio.get_running_loop()
-        self.changed, self.projects = asyncio.Event(), False
+        self.changed, self.followed = asyncio.Event(), set[str]()
 
     async def receive(self) -> None:
         """Take questions until WebSocketDisconnect, or InputError for what is none."""
         while (event := await self.socket.receive())["type"] == "websocket.receive":
             header, arrays = messages.decode(event.get("text") or event.get("bytes") or b"")
-            do = checks.one_of("do", header.pop("do"), (*QUICK, *LONG))
+            do = checks.one_of("do", header.pop("do"), self.scene.questions)
             self.questions[do] = header.pop("id"), header | arrays
             if do not in self.busy:
                 self.busy.add(do)
@@ -110,9 +119,9 @@ class Client:
             for client in self.clients:
                 client.changed.set()
         self.busy.remove(do)
-        if do == "projector" and not self.projects:
-            self.projects = True
-            self.tasks.create_task(self.show())
+        if do in ("projector", "scan") and do not in self.followed:
+            self.followed.add(do)
+            self.tasks.create_task(self.show() if do == "projector" else self.watch())
 
     async def show(self) -> None:
         """Send the codes of every new pattern to a projector window."""
@@ -120,10 +129,20 @@ class Client:
         while True:
             if shown is not (pattern := self.scene.pattern):
                 codes = await asyncio.to_thread(self.scene.codes, pattern, self.scene.white)
-                await self.send(messages.encode({"do": "show"}, {"codes": codes}))
+                await self.send(messages.encode({"do": "show", "title": self.scene.title}, {"codes": codes}))
                 shown = pattern
             await self.changed.wait()
             self.changed.clear()
+
+    async def watch(self) -> None:
+        """Send what is new in the folder of a scan; and what its transport is, once there is one."""
+        seen, hello = 0, self.scene.hello()
+        while True:
+            facts, pictures, seen = await asyncio.to_thread(self.scene.news, seen)
+            await self.send(messages.encode({"do": "scan", **facts}, pictures))
+            if hello != (hello := self.scene.hello()):
+                await self.send(messages.encode({"do": "hello", **hello}))
+            await asyncio.sleep(_LOOK)
 
     async def send(self, message: str | bytes) -> None:
         """TimeoutError where the other side does not read."""
@@ -174,10 +193,29 @@ class _Http(H11Protocol):
             self.transport.abort()
 
 
+def _token(port: int) -> str:
+    """The token of the last viewer on a port that was named, so that its pages find the next one.
+
+    Its file is its owner's alone, and serves for a day on loopback. Pages that try again tell it to whatever
+    has the port: where users do not trust each other, close them, or name no port and get a new token.
+    """
+    opened = os.open(tuning.make_folder() / f"viewer-{port}", os.O_RDWR | os.O_CREAT | _NO_LINK, 0o600)
+    with open(opened, "r+", encoding="ascii", errors="replace") as file:
+        state, token = os.fstat(opened), file.read()
+        is_own = os.name != "posix" or (state.st_uid == os.getuid() and not state.st_mode & 0o077)
+        if not is_own or time.time() > state.st_mtime + _KEPT or not re.fullmatch(r"[\w-]{32}", token):
+            token = secrets.token_urlsafe(24)
+        if is_own:
+            file.seek(0)
+            file.truncate()
+            file.write(token)
+    return token
+
+
 class Viewer(contextlib.AbstractContextManager):
     """A viewer in threads of its own until `close`, or the end of a with block; `url` is its page."""
 
-    def __init__(self, scene: Scene, host: str, port: int) -> None:
+    def __init__(self, scene: Any, host: str, port: int, open_browser: bool) -> None:
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             place = host, checks.count("port", port, least=0, most=65535)
@@ -185,9 +223,10 @@ class Viewer(contextlib.AbstractContextManager):
         except OSError as error:
             raise InputError(f"host is {host!r}, port {port}: {error}; they must be free here") from None
         address, self._port = listening.getsockname()[:2]
-        self.is_local = ipaddress.ip_address(address).is_loopback
+        is_local = ipaddress.ip_address(address).is_loopback
         name = socket.gethostname() if ipaddress.ip_address(address).is_unspecified else host
-        name, self._token = f"[{name}]" if ":" in name else name, secrets.token_urlsafe(24)
+        name = f"[{name}]" if ":" in name else name
+        self._token = _token(port) if port and is_local else secrets.token_urlsafe(24)
         self._names = {"127.0.0.1", "localhost", "[::1]", name.lower()}
         self.url = f"http://{name}:{self._port}/{self._token}/"
         page = (Path(__file__).parent / "page").iterdir()
@@ -195,12 +234,21 @@ class Viewer(contextlib.AbstractContextManager):
         self._scene, self._clients = scene, list[Client]()
         self._turns, self._decoding = Turns(), asyncio.Lock()
         settings: dict[str, Any] = {"interface": "asgi3", "lifespan": "off", "http": _Http}
-        settings |= {"ws": "websockets-sansio", "ws_max_size": messages.largest(max(scene.T.shape))}
+        settings |= {"ws": "websockets-sansio", "ws_max_size": messages.largest(scene.pixels)}
         settings |= {"ws_per_message_deflate": False, "timeout_graceful_shutdown": 1, "proxy_headers": False}
         settings |= {"log_config": None, "log_level": "critical", "access_log": False, "server_header": False}
         self._uvicorn = uvicorn.Server(uvicorn.Config(self._application, **settings))
         self._thread = threading.Thread(target=self._uvicorn.run, args=([listening],), daemon=True)
         self._thread.start()
+        if not is_local:
+            _logger.warning("%s is open to the network, unencrypted: whoever has it can compute", self.url)
+        if open_browser:
+            webbrowser.open(self.url)
+
+    def refresh(self) -> None:
+        """Let projector windows look for a new pattern; from any thread."""
+        for client in [*self._clients]:
+            client.loop.call_soon_threadsafe(client.changed.set)
 
     def wait(self) -> None:
         """Until the viewer is closed."""
@@ -255,7 +303,7 @@ class Viewer(contextlib.AbstractContextManager):
                     return JSONResponse(await asyncio.to_thread(self._scene.upload, name[:255], content))
             except LtclError as error:
                 return JSONResponse({"error": " ".join(str(error).split())}, 400)
-        name = {"": "index.html", "projector": "projector.html"}.get(path, path)
+        name = {"": self._scene.page, "projector": "projector.html"}.get(path, path)
         content = self._files.get(name)
         if path.startswith("result/"):
             name = path.removeprefix("result/")

@@ -8,12 +8,13 @@ import { supported } from "./gl.js";
 import { each, look } from "./panel.js";
 import { probe } from "./probe.js";
 import { relight } from "./relight.js";
+import { scan } from "./scan.js";
 
 const $ = (id) => document.getElementById(id);
-const VIEWS = { probe, bounces, relight, compensate };
+const VIEWS = { probe, bounces, relight, compensate, scan };
 const connection = new Connection();
 const press = (button, on) => button.setAttribute("aria-pressed", on);
-const app = { $, ask, press };
+const app = { $, ask, press, connection };
 const views = {};
 let current = null;
 
@@ -41,13 +42,15 @@ connection.addEventListener("open", async ({ detail: hello }) => {
   say("");
   $("title").textContent = document.title = hello.title;
   const compressed = hello.compressed && `compressed, error ${(100 * hello.error).toPrecision(2)} %`;
-  const facts = [`${hello.grid.join(" × ")} projector pixels`, hello.channels === 3 ? "colour" : "grey"];
+  const facts = hello.grid ? [`${hello.grid.join(" × ")} projector pixels`, hello.channels === 3 ? "colour" : "grey"] : [];
   $("facts").textContent = [...facts, compressed, hello.device].filter(Boolean).join(" · ");
+  for (const tab of tabs) tab.hidden = !(tab.id === "tab-scan" ? hello.scan : hello.grid);
+  document.body.classList.toggle("empty", !hello.grid); // an acquisition that has no transport yet
   $("tab-bounces").disabled = !hello.square;
   $("tab-bounces").title = hello.square ? "" : "Bounces need a camera grid equal to the projector’s";
   await known();
   if (first) {
-    for (const name in VIEWS) views[name] = VIEWS[name](app);
+    for (const name in VIEWS) if (!$(`tab-${name}`).hidden) views[name] = VIEWS[name](app);
     addEventListener("hashchange", route);
     route();
   } else views[current].start();
@@ -78,7 +81,7 @@ const tabs = [...$("tabs").children];
 
 function route() {
   const wanted = location.hash.slice(1);
-  const name = views[wanted] && !$(`tab-${wanted}`).disabled ? wanted : "probe";
+  const name = views[wanted] && !$(`tab-${wanted}`).disabled ? wanted : Object.keys(views)[0];
   if (name === current) return;
   if (current) views[current].stop?.();
   current = name;

@@ -13,13 +13,16 @@ function fit() {
   canvas.style.height = `${(scale * canvas.height) / devicePixelRatio}px`;
 }
 
+let keys = false; // whether they are for what shows patterns one after the other
+
 connection.addEventListener("open", async ({ detail }) => {
-  document.title = `${detail.title}: projector`;
+  keys = Boolean(detail.keys);
   await connection.ask("projector");
   document.body.dataset.state = "ready";
 });
 connection.addEventListener("lost", () => { document.body.dataset.state = "lost"; }); // the pattern stays
-connection.addEventListener("show", ({ detail: { arrays: { codes } } }) => {
+connection.addEventListener("show", async ({ detail: { title, arrays: { codes } } }) => {
+  document.title = `${title}: projector`;
   if (canvas.width !== codes.w || canvas.height !== codes.h) {
     [canvas.width, canvas.height] = [codes.w, codes.h];
     fit();
@@ -31,6 +34,7 @@ connection.addEventListener("show", ({ detail: { arrays: { codes } } }) => {
   }
   context.putImageData(image, 0, 0);
   canvas.dataset.frame = Number(canvas.dataset.frame ?? 0) + 1;
+  await connection.ask("projector"); // it is drawn: the next one
 });
 
 async function full() {
@@ -39,7 +43,10 @@ async function full() {
 }
 addEventListener("resize", fit);
 addEventListener("click", full);
-addEventListener("keydown", ({ key, target }) => key.toLowerCase() === "f" && target !== hint && full());
+addEventListener("keydown", ({ key, target }) => {
+  if (key.toLowerCase() === "f" && target !== hint) full();
+  if (keys && [" ", "ArrowRight", "ArrowDown", "PageDown"].includes(key)) connection.ask("next");
+});
 addEventListener("fullscreenchange", () => {
   hint.hidden = Boolean(document.fullscreenElement);
   document.body.classList.toggle("quiet", hint.hidden);
