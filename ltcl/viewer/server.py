@@ -180,6 +180,8 @@ class _Http(H11Protocol):
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
         self.app_state = {"abort": transport.abort}  # of its socket, too: close would wait for a reader
+        # asyncio sets it for sockets of another making only; without it an answer after another waits 40 ms.
+        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.since = time.monotonic()
         self.loop.call_later(PATIENCE, lambda: self.scope is None and self._drop())
         self.loop.call_later(LIFETIME, self._drop)

@@ -114,21 +114,26 @@ def play(
         frames = np.stack([np.broadcast_to(each, (*each.shape[:2], 3)) for each in sample])
         gain = compensate(scene.T, frames, gain=gain, **settings).gain
     now, period, title = time.monotonic, 1.0 / (film.fps or 25.0), window.title
-    start = spent = due = 0.0  # when frame 0 was due; seconds for a frame; when the one on show was due
+    start = spent = 0.0  # when frame 0 was due; seconds that a frame takes to compute
+    due = sent = taken = 0.0  # of the frame on show: when it was due, and sent; seconds to send and draw it
     late, facts, shown = list[float](), dict[str, Any](), 0
     for frame in film:
-        if shown and start + (frame.number + 0.5) * period < now() + spent:
+        if shown and start + (frame.number + 0.5) * period < max(now() + spent, sent + taken):
             continue  # it would be late
         begun = now()
         pattern = compensate(scene.T, picture(frame), gain=gain, clamp=True, **settings).pattern
-        codes, spent = scene.codes(pattern, 1.0), now() - begun
-        time.sleep(max(start + frame.number * period - now(), 0.0) if shown else 0.0)
+        codes = scene.codes(pattern, 1.0)
+        if shown:  # kernels are built for the first
+            spent = now() - begun
+            time.sleep(max(start + frame.number * period - now(), 0.0))
         begun = now()
         drawn = window.show(codes)
         if shown and now() - begun < _PAUSE:
             late.append(drawn - due)
+            taken = drawn - sent
         else:  # the film waited for a window
             start = now() - frame.number * period
+        sent = now()
         due, shown = start + frame.number * period, shown + 1
         facts = {"shown": shown, "dropped": frame.number - shown, "gain": gain}
         facts |= {"frames_per_second": shown / (now() - start), "latency": median(late or [0.0])}
