@@ -221,14 +221,15 @@ class Viewer(contextlib.AbstractContextManager):
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             place = host, checks.count("port", port, least=0, most=65535)
+            token = _token(port) if port else ""
             listening = socket.create_server(place, family=family)
         except OSError as error:
             raise InputError(f"host is {host!r}, port {port}: {error}; they must be free here") from None
         address, self._port = listening.getsockname()[:2]
         is_local = ipaddress.ip_address(address).is_loopback
+        self._token = token if token and is_local else secrets.token_urlsafe(24)
         name = socket.gethostname() if ipaddress.ip_address(address).is_unspecified else host
         name = f"[{name}]" if ":" in name else name
-        self._token = _token(port) if port and is_local else secrets.token_urlsafe(24)
         self._names = {"127.0.0.1", "localhost", "[::1]", name.lower()}
         self.url = f"http://{name}:{self._port}/{self._token}/"
         page = (Path(__file__).parent / "page").iterdir()

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import shutil
+import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,8 +15,12 @@ import numpy as np
 import pytest
 
 import ltcl
+from ltcl.acquisition import FolderRig
 from ltcl.images import to_srgb
 from ltcl.images.pictures import to_linear
+from ltcl.viewer import serve
+from ltcl.viewer.scan import Scan
+from ltcl.viewer.window import Window
 
 pytest.importorskip("playwright", reason='playwright is not installed: pip install "ltcl[test]"')
 
@@ -412,13 +418,14 @@ def test_reload_and_resize_keep_the_view(page: Page, T: ltcl.Transport, picture:
 
 
 def test_server_is_killed_and_started_again(
-    browser: Browser, T: ltcl.Transport, monkeypatch: pytest.MonkeyPatch
+    browser: Browser, T: ltcl.Transport, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("secrets.token_urlsafe", lambda _: "the-same-address-as-before")
-    with browser.new_context() as context, ltcl.view(T, open_browser=False) as viewer:
+    monkeypatch.setenv("LTCL_CACHE", str(tmp_path))
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with browser.new_context() as context, ltcl.view(T, open_browser=False, port=port) as viewer:
         page = context.new_page()
         visit(page, viewer, "relight")
-        port = int(viewer.url.split(":")[2].split("/")[0])
         viewer.close()
         page.wait_for_selector("body[data-state=lost]")
         assert "trying again" in page.locator("#banner").inner_text()
@@ -428,9 +435,59 @@ def test_server_is_killed_and_started_again(
             page.locator("#relight-fill").click()
             shows(page, "relight-seen", T @ np.ones(T.grid, np.float32))
         page.wait_for_selector("body[data-state=lost]")
-        monkeypatch.setattr("secrets.token_urlsafe", lambda _: "another-address")
+        (tmp_path / f"viewer-{port}").unlink()
         with ltcl.view(T, open_browser=False, port=port):
             page.get_by_text("another address").wait_for()
+
+
+def test_an_acquisition_as_it_grows(page: Page, tmp_path: Path) -> None:
+    text = '[rig]\nkind = "folder"\nprojector_grid = [4, 6]\n[acquire]\ngeometry = "aligned"\n'
+    (tmp_path / "acquisition.toml").write_text(text)
+    rig, codes = FolderRig(tmp_path, (4, 6)), np.arange(240, dtype=np.uint8).reshape(12, 20)
+    rig.prepare([(np.ones((4, 6)), 0.5), (np.zeros((4, 6)), 0.5)])
+    first, second = (tmp_path / f"{shot.save_as}.png" for shot in rig.shots)
+    ltcl.images.write(first, codes / 255, encoding="linear", bits=8)
+    with serve(Scan(tmp_path, None), open_browser=False) as viewer:
+        visit(page, viewer, "scan")
+        page.get_by_text("photograph 1, 0.500 s").first.wait_for()
+        assert page.locator("#tabs button:visible").all_inner_texts() == ["Scan"]
+        assert page.locator("#open-projector").is_hidden()
+        assert "1 of about" in page.locator("#scan-facts").inner_text()
+        shown = page.evaluate(
+            """() => { const c = document.querySelector(".photograph canvas");
+            return [...c.getContext("2d").getImageData(0, 0, c.width, c.height).data]; }"""
+        )
+        np.testing.assert_array_equal(np.reshape(shown, (*codes.shape, 4))[..., 1], codes)
+        assert str(page.locator("#scan-histogram polyline").get_attribute("points")).count(",") == 32
+        assert page.locator("#scan-warnings li").count() == 0
+        second.write_bytes(b"no picture")
+        page.locator("#scan-warnings li").get_by_text("photograph 2").wait_for()
+        page.goto("about:blank")
+
+
+def test_projector_window_shows_patterns_next_by_key(page: Page) -> None:
+    patterns = [np.eye(4, 6), np.full((4, 6), 0.6)]
+    with Window("patterns", open_browser=False) as window:
+        page.goto(window.url)
+        shower = threading.Thread(target=lambda: [window.show(pattern) for pattern in patterns])
+        shower.start()
+        shower.join(PATIENCE)
+        window.wait(PATIENCE)
+        found = page.evaluate(
+            """() => { const c = document.getElementById("show");
+            return [...c.getContext("2d").getImageData(0, 0, c.width, c.height).data]; }"""
+        )
+        np.testing.assert_array_equal(np.reshape(found, (4, 6, 4))[..., 0], np.rint(255 * patterns[-1]))
+        assert not window.key_pressed()
+        for key in ("Space", "ArrowRight", "PageDown"):
+            page.keyboard.press(key)
+            deadline = time.monotonic() + PATIENCE
+            while not window.key_pressed():
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+        page.keyboard.press("x")
+        page.goto("about:blank")
+        assert not window.key_pressed()
 
 
 def test_two_pages_at_once(page: Page, viewer: Any, T: ltcl.Transport) -> None:

@@ -27,11 +27,8 @@ export function compensate({ $, ask, hello }) {
   }
 
   async function solve() {
-    if (!source.value) {
-      wipe.note = "open or drop the picture that the scene should look like";
-      return;
-    }
-    wipe.note = "solving…";
+    wipe.note = source.value ? "solving…" : "open or drop the picture that the scene should look like";
+    if (!source.value) return;
     const [auto, gain, low, high] = ["auto", "gain", "low", "high"].map((name) => $(`compensate-${name}`));
     gain.disabled = auto.checked;
     $("compensate-low-value").textContent = low.value;
@@ -63,11 +60,9 @@ export function compensate({ $, ask, hello }) {
       Error: percent(answer.error), Gain: answer.gain.toPrecision(3), Clipped: percent(answer.clipped),
       Method: `${answer.method}, ${answer.products} products, ${answer.seconds.toPrecision(2)} s`,
     };
-    $("compensate-report").replaceChildren(...Object.entries(lines).flatMap(([name, value]) => {
-      const [term, text] = [document.createElement("dt"), document.createElement("dd")];
-      [term.textContent, text.textContent] = [name, value];
-      return [term, text];
-    }));
+    const element = (tag, textContent) => Object.assign(document.createElement(tag), { textContent });
+    const entries = Object.entries(lines).flatMap(([name, text]) => [element("dt", name), element("dd", text)]);
+    $("compensate-report").replaceChildren(...entries);
     const logs = answer.residuals.filter((residual) => residual > 0).map(Math.log10);
     const top = Math.max(...logs, 0), low = Math.min(...logs, -1), step = 100 / Math.max(logs.length - 1, 1);
     const points = logs.map((log, k) => `${step * k},${1 + (28 * (top - log)) / (top - low)}`);

@@ -42,8 +42,9 @@ connection.addEventListener("open", async ({ detail: hello }) => {
   say("");
   $("title").textContent = document.title = hello.title;
   const compressed = hello.compressed && `compressed, error ${(100 * hello.error).toPrecision(2)} %`;
-  const facts = hello.grid ? [`${hello.grid.join(" × ")} projector pixels`, hello.channels === 3 ? "colour" : "grey"] : [];
-  $("facts").textContent = [...facts, compressed, hello.device].filter(Boolean).join(" · ");
+  const size = hello.grid && `${hello.grid.join(" × ")} projector pixels`;
+  const colours = hello.grid && (hello.channels === 3 ? "colour" : "grey");
+  $("facts").textContent = [size, colours, compressed, hello.device].filter(Boolean).join(" · ");
   for (const tab of tabs) tab.hidden = !(tab.id === "tab-scan" ? hello.scan : hello.grid);
   document.body.classList.toggle("empty", !hello.grid); // an acquisition that has no transport yet
   $("tab-bounces").disabled = !hello.square;
@@ -123,9 +124,7 @@ const logarithmic = () => display({ logarithmic: !look.logarithmic });
 const KEYS = { "+": brighter, "=": brighter, "-": darker, l: logarithmic, L: logarithmic };
 $("stops").oninput = () => display({ stops: Number($("stops").value) });
 $("mode").onchange = () => display({ mode: Number($("mode").value) });
-$("darker").onclick = darker;
-$("brighter").onclick = brighter;
-$("logarithmic").onclick = logarithmic;
+for (const [id, act] of Object.entries({ darker, brighter, logarithmic })) $(id).onclick = act;
 $("white").onclick = () => {
   each((panel) => { panel.white = panel.measured; });
   display({ stops: 0 });

@@ -7,20 +7,14 @@ const percent = (share) => `${(100 * share).toFixed(1)} %`;
 export function scan({ $, ask, press, connection }) {
   const list = $("scan-photographs");
 
-  function time(seconds) {
-    const [h, m, s] = [seconds / 3600, (seconds / 60) % 60, seconds % 60].map(Math.floor);
-    return h ? `${h} h ${m} min` : m ? `${m} min` : `${s} s`;
-  }
-
   function facts({ state, done, total, what, left, coverage, saturated }) {
-    $("scan-progress").max = total || 1;
-    $("scan-progress").value = done;
-    const ended = state === "final", begun = coverage !== undefined;
+    Object.assign($("scan-progress"), { max: total || 1, value: done });
+    const minutes = Math.round(left / 60), calibrated = coverage !== undefined;
     $("scan-facts").textContent = [
-      ended ? "finished" : `${done} of about ${total} ${what}`,
-      !ended && left !== null && `about ${time(left)} left`,
-      begun && `camera sees ${percent(coverage)} of the projector`,
-      begun && `${percent(saturated)} of the camera saturated`,
+      state === "final" ? "finished" : `${done} of about ${total} ${what}`,
+      left !== null && (minutes ? `about ${minutes} min left` : "less than a minute left"),
+      calibrated && `camera sees ${percent(coverage)} of the projector`,
+      calibrated && `${percent(saturated)} of the camera saturated`,
     ].filter(Boolean).join(" · ");
   }
 
@@ -33,29 +27,25 @@ export function scan({ $, ask, press, connection }) {
     $("scan-histogram").firstElementChild.setAttribute("points", points.join(" "));
   }
 
-  function add({ name, seconds, histogram }, pixels) {
+  function add({ name, seconds, histogram }, { w, h, c, data }) {
     [...list.children].find(({ dataset }) => dataset.name === name)?.remove(); // taken again
-    const button = $("photograph").content.cloneNode(true).firstElementChild;
-    const [canvas, caption] = button.children, context = canvas.getContext("2d");
-    [canvas.width, canvas.height, button.dataset.name] = [pixels.w, pixels.h, name];
-    const image = context.createImageData(pixels.w, pixels.h);
-    for (let i = 0; i < image.data.length; i++) {
-      image.data[i] = i % 4 === 3 ? 255 : pixels.data[(i >> 2) * pixels.c + (pixels.c === 3 ? i % 4 : 0)];
-    }
-    context.putImageData(image, 0, 0);
+    const button = $("photograph").content.cloneNode(true).firstElementChild, [canvas, caption] = button.children;
+    [canvas.width, canvas.height, button.dataset.name] = [w, h, name];
+    const code = (_, i) => (i % 4 > 2 ? 255 : data[(i >> 2) * c + (c > 1 ? i % 4 : 0)]);
+    const image = new ImageData(Uint8ClampedArray.from({ length: 4 * w * h }, code), w, h);
+    canvas.getContext("2d").putImageData(image, 0, 0);
     caption.textContent = seconds ? `${name}, ${seconds.toPrecision(3)} s` : name;
     if (histogram) button.onclick = () => choose(button, `Exposure of ${caption.textContent}`, histogram);
     list.prepend(button);
     if (list.children.length > SHOWN) list.lastElementChild.remove();
-    if (list.querySelector("[aria-pressed=true]") === null && histogram) button.click();
+    if (!list.querySelector("[aria-pressed=true]")) button.click();
   }
 
   connection.addEventListener("scan", ({ detail }) => {
     facts(detail);
     detail.photographs.forEach((each, k) => each.name && add(each, detail.arrays[k]));
-    const texts = detail.warnings.map((text) => Object.assign(document.createElement("li"), { textContent: text }));
-    $("scan-warnings").replaceChildren(...texts);
+    const item = (textContent) => Object.assign(document.createElement("li"), { textContent });
+    $("scan-warnings").replaceChildren(...detail.warnings.map(item));
   });
-  connection.addEventListener("lost", () => list.replaceChildren()); // the server sends them again
   return { start: () => ask("scan") };
 }
