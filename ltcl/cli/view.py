@@ -9,14 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from ltcl import compensation, images
+from ltcl import compensation
 from ltcl.cli import options
 from ltcl.cli.command import Answer, Context, command
 from ltcl.cli.compensate import GAIN, parse_gain
 from ltcl.cli.options import argument, option
 from ltcl.device import open_device
 from ltcl.errors import InputError
-from ltcl.images.frames import open_frames
 
 _SHOWN = f"{options.FORMATS} Or the folder of an acquisition."
 _HOST = "Address to listen on; beyond 127.0.0.1 whoever has the URL can look and compute."
@@ -56,6 +55,7 @@ def view(
     Of the folder of an acquisition, while it runs or afterwards: photographs as they come, their exposure,
     coverage, time left and warnings; and its transport as soon as that is finished.
     """
+    from ltcl import images
     from ltcl.viewer import serve
     from ltcl.viewer.answers import Scene
 
@@ -90,6 +90,7 @@ def play(
 
     Frames that would be late are dropped. An --inverse, or a compressed TRANSPORT, makes it fast.
     """
+    from ltcl.images.frames import open_frames
     from ltcl.viewer.answers import Scene
     from ltcl.viewer.window import Window, play
 

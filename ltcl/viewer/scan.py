@@ -54,7 +54,8 @@ class Scan(Scene):
         self.questions, self._pictures, self._compensation = ("scan", "pictures"), {}, None
         self._lock, self._looked = threading.Lock(), 0.0
         self._read: dict[Path, float] = {}  # when files that were read had been written
-        self._photographs: list[tuple[dict[str, Any], np.ndarray]] = []  # facts and previews
+        self._shown: dict[str, tuple[int, dict[str, Any], np.ndarray]] = {}  # photographs in order
+        self._count = 0  # of those that were ever shown
         self._warnings: dict[str, str] = {}
         self._facts: dict[str, Any] = {}
         self._kind: Any = None  # shape and type of the first photograph
@@ -93,9 +94,9 @@ class Scan(Scene):
                 except (LtclError, OSError) as error:  # files that change just now
                     self._warnings["folder"] = " ".join(str(error).split())
                 self._looked = time.monotonic()
-            new = self._photographs[max(seen, len(self._photographs) - _SHOWN) :]
+            new = [(f, preview) for number, f, preview in self._shown.values() if number > seen]
             facts = self._facts | {"warnings": [*self._warnings.values()], "photographs": [f for f, _ in new]}
-            return facts, {str(k): preview for k, (_, preview) in enumerate(new)}, len(self._photographs)
+            return facts, {str(k): preview for k, (_, preview) in enumerate(new)}, self._count
 
     def _look(self) -> None:
         self._warnings.pop("folder", None)
@@ -121,10 +122,10 @@ class Scan(Scene):
             self._facts["coverage"] = float(np.mean(c.resampling.coverage > 0))
             self._facts["saturated"] = 1.0 - float(np.mean(c.white.valid))
         end = time.monotonic() + _BUDGET
-        for file in sorted(files, key=lambda file: -file.time):
+        for place, file in enumerate(sorted(files, key=lambda file: -file.time)):
             if self._read.get(file.path) != file.time and time.monotonic() < end:
                 self._read[file.path] = file.time
-                self._open(file, store)
+                self._open(file, store, place < _SHOWN)
         if state == "final" and self.T is None:
             self._finish()
 
@@ -145,7 +146,7 @@ class Scan(Scene):
         for number, (written, path) in enumerate(times, 1):
             yield _File(path, written, number if store is None else int(path.stem[10:]))
 
-    def _open(self, file: _File, store: BlockStore | None) -> None:
+    def _open(self, file: _File, store: BlockStore | None, is_shown: bool) -> None:
         """Read a photograph or a batch: its preview, its histogram and what is wrong with it."""
         name, facts = f"photograph {file.number}", dict[str, Any]()
         self._warnings.pop(name, None)
@@ -167,9 +168,11 @@ class Scan(Scene):
         step = -(-max(codes.shape[:2]) // _SIDE)
         codes = codes[::step, ::step]
         preview = codes if codes.dtype == np.uint8 else np.rint(255 * codes.clip(0, 1)).astype(np.uint8)
-        self._photographs.append(({"name": name, "time": file.time, **facts}, preview))
-        if len(self._photographs) > _SHOWN:  # older ones leave their places
-            self._photographs[-1 - _SHOWN] = ({}, preview[:1, :1])
+        if is_shown:
+            self._count += 1
+            self._shown[name] = self._count, {"name": name, "time": file.time, **facts}, preview
+        if len(self._shown) > _SHOWN:
+            del self._shown[min(self._shown, key=lambda name: self._shown[name][1]["time"])]
 
     def _codes(self, name: str, file: _File) -> np.ndarray:
         """A photograph in [0, 1] of full scale; AcquisitionError, as `acquire` raises it."""

@@ -1,11 +1,10 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Scan: photographs of an acquisition as they come, their exposure, how far it is, and what is wrong.
 
-const SHOWN = 24; // photographs
 const percent = (share) => `${(100 * share).toFixed(1)} %`;
 
 export function scan({ $, ask, press, connection }) {
-  const list = $("scan-photographs");
+  const list = $("scan-photographs"), most = 24; // as many as the server keeps
 
   function facts({ state, done, total, what, left, coverage, saturated }) {
     Object.assign($("scan-progress"), { max: total || 1, value: done });
@@ -22,28 +21,29 @@ export function scan({ $, ask, press, connection }) {
   function choose(button, text, histogram) {
     for (const each of list.children) press(each, each === button);
     $("scan-exposure").textContent = text;
-    const height = (share) => Math.max(0, 30 + 7.5 * Math.log10(share + 1e-9)); // four decades
-    const points = histogram.map((share, k) => `${(100 * (k + 0.5)) / histogram.length},${30 - height(share)}`);
+    const depth = (share) => Math.min(30, -7.5 * Math.log10(share + 1e-9)); // four decades
+    const points = histogram.map((share, k) => `${(100 * (k + 0.5)) / histogram.length},${depth(share)}`);
     $("scan-histogram").firstElementChild.setAttribute("points", points.join(" "));
   }
 
-  function add({ name, seconds, histogram }, { w, h, c, data }) {
+  function add({ name, time, seconds, histogram }, { w, h, c, data }) {
     [...list.children].find(({ dataset }) => dataset.name === name)?.remove(); // taken again
     const button = $("photograph").content.cloneNode(true).firstElementChild, [canvas, caption] = button.children;
-    [canvas.width, canvas.height, button.dataset.name] = [w, h, name];
+    [canvas.width, canvas.height, button.dataset.name, button.dataset.time] = [w, h, name, time];
     const code = (_, i) => (i % 4 > 2 ? 255 : data[(i >> 2) * c + (c > 1 ? i % 4 : 0)]);
     const image = new ImageData(Uint8ClampedArray.from({ length: 4 * w * h }, code), w, h);
     canvas.getContext("2d").putImageData(image, 0, 0);
     caption.textContent = seconds ? `${name}, ${seconds.toPrecision(3)} s` : name;
     if (histogram) button.onclick = () => choose(button, `Exposure of ${caption.textContent}`, histogram);
-    list.prepend(button);
-    if (list.children.length > SHOWN) list.lastElementChild.remove();
-    if (!list.querySelector("[aria-pressed=true]")) button.click();
+    const chosen = list.querySelector("[aria-pressed=true]"), first = list.firstElementChild;
+    list.insertBefore(button, [...list.children].find(({ dataset }) => dataset.time < time) ?? null);
+    if (list.children.length > most) list.lastElementChild.remove();
+    if (button === list.firstElementChild && (!chosen || chosen === first)) button.click();
   }
 
   connection.addEventListener("scan", ({ detail }) => {
     facts(detail);
-    detail.photographs.forEach((each, k) => each.name && add(each, detail.arrays[k]));
+    detail.photographs.forEach((each, k) => add(each, detail.arrays[k]));
     const item = (textContent) => Object.assign(document.createElement("li"), { textContent });
     $("scan-warnings").replaceChildren(...detail.warnings.map(item));
   });
