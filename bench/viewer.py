@@ -54,7 +54,8 @@ PAINTING = """async (seconds) => {
   const seen = document.getElementById("relight-seen-canvas");
   pattern.setPointerCapture = () => {};
   const point = (kind, x, y) => pattern.dispatchEvent(new PointerEvent(kind, {
-    clientX: box.left + box.width * x, clientY: box.top + box.height * y, pointerId: 1, button: 0, bubbles: true,
+    clientX: box.left + box.width * x, clientY: box.top + box.height * y,
+    pointerId: 1, button: 0, bubbles: true,
   }));
   const first = Number(seen.dataset.frame), begun = performance.now();
   point("pointerdown", 0.5, 0.5);
@@ -89,10 +90,9 @@ def first_picture(browser: Browser, T: ltcl.Transport, folder: Path) -> float:
     ltcl.save(folder / "T.npz", T)
     begun = time.perf_counter()
     words = [sys.executable, "-m", "ltcl", "view", str(folder / "T.npz"), "--no-browser"]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:  # noqa: S603 - ours
         page = browser.new_page()
-        page.goto(next(line for line in process.stderr if line.startswith("http")).split()[0])
+        page.goto(next(line for line in process.stderr or [] if line.startswith("http")).split()[0])
         page.wait_for_selector("#probe-camera-canvas[data-frame]")
         spent = time.perf_counter() - begun
         page.close()
