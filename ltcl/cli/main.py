@@ -13,12 +13,12 @@ import typer
 from ltcl import __version__
 from ltcl.cli import ranks
 from ltcl.cli.acquire import app as acquire
-from ltcl.cli.acquire import show, simulate
+from ltcl.cli.acquire import simulate
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
 from ltcl.cli.compensate import compensate, relight, separate
 from ltcl.cli.doctor import demo, devices, doctor
 from ltcl.cli.files import analyze, compress, convert, denoise, info, invert
-from ltcl.cli.view import play, view
+from ltcl.cli.view import play, show, view
 from ltcl.errors import InputError, LtclError
 
 app = typer.Typer(

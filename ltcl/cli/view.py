@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl view`: light transport in the browser; `ltcl play`: a film, compensated as it runs."""
+"""`ltcl view`: light transport in the browser; `ltcl play`, `ltcl show`: films and patterns to a projector."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from ltcl.errors import InputError
 _SHOWN = f"{options.FORMATS} Or the folder of an acquisition."
 _HOST = "Address to listen on; beyond 127.0.0.1 whoever has the URL can look and compute."
 _PORT = "Port, where pages of the last viewer find this one. Default: a free one."
-_ADDRESS = ("host", "port", "no_browser")
+_BROWSER = "In a projector window of the browser, for any display."
+_ARRIVAL = "Next pattern when its photograph is in the folder of the acquisition."
 
 
 def _address_options(
@@ -32,7 +33,7 @@ def _address_options(
 
 
 def _address(context: Context) -> dict[str, Any]:
-    host, port, no_browser = (context.options[name] for name in _ADDRESS)
+    host, port, no_browser = (context.options[name] for name in ("host", "port", "no_browser"))
     return {"host": host, "port": port, "open_browser": not no_browser}
 
 
@@ -106,3 +107,32 @@ def play(
             facts = play(scene, source, window, factor, context.progress, **settings)
     line = "{shown} frames shown, {frames_per_second:.1f} a second, {latency:.3f} s late; {dropped} dropped"
     return Answer({"film": film, **facts}, [line.format(**facts)] if facts else [])
+
+
+@command()
+def show(
+    context: Context,
+    folder: Annotated[Path, argument("FOLDER", "Pictures, or an acquisition with its patterns.")],
+    display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
+    every: Annotated[float | None, option("Next picture after so many seconds.", metavar="SECONDS")] = None,
+    arrival: Annotated[bool, option(_ARRIVAL, "--arrival")] = False,
+    browser: Annotated[bool, option(_BROWSER, "--browser")] = False,
+) -> Answer:
+    """Show patterns full screen, next by key, timer or photograph; Escape ends it. Needs extra projector.
+
+    With --browser Ctrl-C ends it, and it needs extra view.
+    """
+    if every is not None and arrival:
+        raise InputError(f"--every is {every:g}, but --arrival is given; one of them decides what comes next")
+    from ltcl.acquisition import rigs
+    from ltcl.viewer.window import Window
+
+    def progress(shot: Any, done: int, total: int) -> None:
+        context.progress(f"photograph {shot.number}: {shot.seconds:g} s, {shot.save_as}", done, total)
+
+    advance = "arrival" if arrival else every or "key"
+    with Window(str(folder)) if browser else contextlib.nullcontext(display) as screen:
+        if isinstance(screen, Window):
+            typer.echo(f"{screen.url} shows {folder}", err=True)
+        count = rigs.show(folder, display=screen, advance=advance, progress=progress)
+    return Answer({"folder": folder, "shown": count}, [f"{count} pattern(s) were shown"])

@@ -122,10 +122,11 @@ class Scan(Scene):
             self._facts["coverage"] = float(np.mean(c.resampling.coverage > 0))
             self._facts["saturated"] = 1.0 - float(np.mean(c.white.valid))
         end = time.monotonic() + _BUDGET
-        for place, file in enumerate(sorted(files, key=lambda file: -file.time)):
+        newest = sorted(files, key=lambda file: -file.time)
+        for file in [*newest[-1:], *newest[:-1]]:  # the first photograph says what the others have to be
             if self._read.get(file.path) != file.time and time.monotonic() < end:
                 self._read[file.path] = file.time
-                self._open(file, store, place < _SHOWN)
+                self._open(file, store, file in newest[:_SHOWN])
         if state == "final" and self.T is None:
             self._finish()
 
