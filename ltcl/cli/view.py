@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`ltcl view`: light transport in the browser; `ltcl play`, `ltcl show`: films and patterns to a projector."""
+"""`ltcl view`: light transport in the browser; `ltcl play`, `ltcl show`: films and patterns projected."""
 
 from __future__ import annotations
 
