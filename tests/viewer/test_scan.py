@@ -13,7 +13,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ import pytest
 import ltcl
 from ltcl import errors, images
 from ltcl.acquisition import FolderRig, Project, rigs
+from ltcl.acquisition.agreement import ROUGH
+from ltcl.acquisition.radiometry import Response
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
 from ltcl.viewer import serve
@@ -86,6 +89,27 @@ def test_photographs_come_with_histograms_and_warnings(tmp_path: Path) -> None:
             late.send("column", pixel=[0, 0])
             with pytest.raises(Exception, match="1008"):
                 late.ask("pictures")
+
+
+def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
+    project(tmp_path, BY_HAND)
+    rig, codes = FolderRig(tmp_path, (4, 6)), 0.1 + 0.1 * random.random((20, 30))
+    rig.prepare(
+        [(pattern, t) for pattern in (np.eye(4, 6), np.ones((4, 6)), np.zeros((4, 6))) for t in (0.1, 0.4)]
+    )
+    for shot, factor in zip(rig.shots, (1, 4, 1, 1.5, 9, 9), strict=True):  # of 0.4 s: 4 times as bright
+        path = tmp_path / f"{shot.save_as}.png"
+        images.write(path, np.minimum(factor * codes, 1), encoding="linear")
+    scan = Scan(tmp_path, None)
+    valid = SimpleNamespace(valid=np.ones(6))
+    known: Any = {"exposures": (0.1, 0.4), "response": Response.identity(), "noise": ROUGH, "offset": 0.0}
+    known |= {"resampling": SimpleNamespace(coverage=np.ones(6)), "white": valid}
+    scan._calibration = cast(Any, SimpleNamespace(**known))
+    warnings = scan.news(0)[0]["warnings"]
+    for first, second in ((3, 4), (5, 6)):
+        assert sum(f"photograph {first} or photograph {second} " in text for text in warnings) == 1
+    assert sum(text.startswith("photograph 5: ") and "saturated" in text for text in warnings) == 1
+    assert len(warnings) == 3
 
 
 def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
