@@ -15,7 +15,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-SUFFIXES = {".py", ".cl", ".h", ".jpg", ".typed"}
+SUFFIXES = {".py", ".cl", ".h", ".jpg", ".typed", ".html", ".css", ".js", ".svg"}
 
 
 def checkout(*folders: str) -> set[str]:

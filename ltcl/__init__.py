@@ -34,6 +34,7 @@ from ltcl.transport import Transport
 if TYPE_CHECKING:
     from ltcl import acquisition, batch, images, operators, plots, scenes, solvers, theory
     from ltcl.acquisition import acquire
+    from ltcl.viewer import view
 
 __version__ = "0.1.0"
 __all__ = [
@@ -70,14 +71,16 @@ __all__ = [
     "solve",
     "solvers",
     "theory",
+    "view",
 ]
 
 _LAZY = ("acquisition", "batch", "images", "plots", "scenes")  # they bring OpenCV or matplotlib
+_FUNCTIONS = {"acquire": "acquisition", "view": "viewer"}
 
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return importlib.import_module(f"ltcl.{name}")
-    if name == "acquire":
-        return importlib.import_module("ltcl.acquisition").acquire
+    if name in _FUNCTIONS:
+        return getattr(importlib.import_module(f"ltcl.{_FUNCTIONS[name]}"), name)
     raise AttributeError(f"module 'ltcl' has no attribute {name!r}")

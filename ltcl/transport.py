@@ -28,13 +28,7 @@ logger = logging.getLogger(__name__)
 _SAME = 1e-6  # relative difference of first bounces that float32 does not resolve
 _ROUNDING = 1e-5  # of float32, in the products that show whether an inverse belongs to a transport
 _CANCELLATION = 0.5  # of diag(S) = 1 + diag(R): from here on, I + R has all digits of T F^-1
-_ON_DEVICE = (
-    "device",
-    "systems",
-    "operators",
-    "_inverses",
-    "reload",
-)  # attributes that do not leave this process
+_ON_DEVICE = ("device", "systems", "operators", "_inverses", "reload")  # do not leave this process
 
 
 class Transport:

@@ -36,7 +36,7 @@ LAYERS: list[set[str]] = [
     {"compensation", "compression", "separation", "relighting", "analysis", "denoising"}
     | {"scenes", "store", "acquisition", "report"},
     {"plots"},
-    {"batch", "demo"},
+    {"batch", "demo", "viewer"},
     {"cli"},
     {"__init__", "__main__"},
 ]

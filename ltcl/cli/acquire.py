@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Scans: `ltcl simulate` makes a folder for one; `ltcl acquire` plans, runs, reports; `ltcl show`."""
+"""Scans: `ltcl simulate` makes a folder for one; `ltcl acquire` plans, runs, reports."""
 
 from __future__ import annotations
 
@@ -173,7 +173,6 @@ _TOML = """\
 _TAKE = "Folder with the camera's own files: copied, in the order of their numbers, to what is missing."
 _Take = Annotated[Path | None, options.file(_TAKE, metavar="FOLDER")]
 _Overhead = Annotated[float, option("Seconds of each photograph beyond its exposure.", min=0.0)]
-_ARRIVAL = "Next pattern when its photograph is in the folder of the acquisition."
 
 _HELP = """Photograph a scene under patterns, and make its transport of the photographs, in
 DIR/transport.zarr. DIR has an acquisition.toml, which says what photographs, and how."""
@@ -326,24 +325,3 @@ def _report(context: Context, project: Project, device: Any) -> Answer:
         lines.append(f"relative error of T p, for patterns p that were not scanned: {each}")
     end = options.verdicts({str(project.store): judged})
     return Answer(data, [*lines, f"transport in {project.store}", *end])
-
-
-@command()
-def show(
-    context: Context,
-    folder: Annotated[Path, options.argument("FOLDER", "Pictures, or an acquisition with its patterns.")],
-    display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
-    every: Annotated[float | None, option("Next picture after so many seconds.", metavar="SECONDS")] = None,
-    arrival: Annotated[bool, option(_ARRIVAL, "--arrival")] = False,
-) -> Answer:
-    """Show patterns full screen, next by key, timer or photograph; Escape ends it. Needs extra projector."""
-    if every is not None and arrival:
-        raise InputError(f"--every is {every:g}, but --arrival is given; one of them decides what comes next")
-    from ltcl.acquisition import rigs
-
-    def progress(shot: Any, done: int, total: int) -> None:
-        context.progress(f"photograph {shot.number}: {shot.seconds:g} s, {shot.save_as}", done, total)
-
-    advance = "arrival" if arrival else every or "key"
-    count = rigs.show(folder, display=display, advance=advance, progress=progress)
-    return Answer({"folder": folder, "shown": count}, [f"{count} pattern(s) were shown"])

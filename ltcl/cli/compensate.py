@@ -33,14 +33,15 @@ _REASONS = {
 }
 
 
-def _gain(text: str) -> float | str:
+def parse_gain(text: str) -> float | str:
+    """A number, or auto."""
     try:
         return "auto" if text == "auto" else float(text)
     except ValueError:
         raise typer.BadParameter(f"{text!r} is no gain; write a number, or auto") from None
 
 
-_GAIN = "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
+GAIN = "Match FACTOR times the picture; auto: the largest within reach. Default: 1, auto of a measured T."
 _BACKGROUND = "Picture of the light that stays. Default: as measured, else none."
 _VIDEO = "Also a video of the patterns: .mkv or .avi, lossless; or .mp4, which changes their codes."
 _FPS = "Frames a second of that video. Default: as the source, else 25."
@@ -82,7 +83,7 @@ def compensate(
     transport: options.Matrix,
     out: options.Out,
     picture: Annotated[list[Path] | None, _PICTURES] = None,
-    gain: Annotated[str | None, option(_GAIN, parser=_gain, metavar="FACTOR")] = None,
+    gain: Annotated[str | None, option(GAIN, parser=parse_gain, metavar="FACTOR")] = None,
     loss: Annotated[float | None, option("Error that --gain auto may cost. Default: the least.")] = None,
     low: Annotated[float, option("Darkest light of the projector.")] = 0.0,
     high: Annotated[float, option("Brightest light of the projector.")] = 1.0,

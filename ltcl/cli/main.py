@@ -16,11 +16,12 @@ import typer
 
 from ltcl import __version__
 from ltcl.cli.acquire import app as acquire
-from ltcl.cli.acquire import show, simulate
+from ltcl.cli.acquire import simulate
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
 from ltcl.cli.compensate import compensate, relight, separate
 from ltcl.cli.doctor import demo, devices, doctor
 from ltcl.cli.files import analyze, compress, convert, denoise, info, invert
+from ltcl.cli.view import play, show, view
 from ltcl.errors import InputError, LtclError
 
 _PATIENCE = 5.0  # seconds within which ranks that fail alike do so
@@ -35,7 +36,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _FILES = (info, analyze, convert, compress, invert, denoise)
-for _command in (devices, doctor, demo, simulate, *_FILES, compensate, separate, relight, show):
+for _command in (devices, doctor, demo, simulate, *_FILES, compensate, separate, relight, view, play, show):
     app.command()(_command)
 app.add_typer(acquire, name="acquire")
 

@@ -24,7 +24,18 @@ from .conftest import Program
 
 COMMANDS = [
     *("devices", "doctor", "demo", "simulate", "info", "analyze", "convert", "compress", "denoise"),
-    *("invert", "compensate", "separate", "relight", "show", "acquire plan", "acquire run", "acquire report"),
+    *(
+        "invert",
+        "compensate",
+        "separate",
+        "relight",
+        "view",
+        "play",
+        "show",
+        "acquire plan",
+        "acquire run",
+        "acquire report",
+    ),
 ]
 DOCUMENT = (Path(__file__).resolve().parents[2] / "docs" / "cli.md").read_text(encoding="utf-8")
 

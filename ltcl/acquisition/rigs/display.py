@@ -103,17 +103,18 @@ class Display(Closing):
 
 def show(
     folder: str | os.PathLike[str],
-    display: int = 1,
+    display: Any = 1,
     advance: str | float = "key",
     progress: Callable[[Shot, int, int], None] | None = None,
 ) -> int:
     """Show the patterns of a folder full screen, one after the other; returns how many.
 
     Of a `FolderRig` in the order of the shooting list, without photographs that are there already; else the
-    pictures of the folder by the numbers in their names. `display` counts from 0. The next one is shown after
-    a "key", at the "arrival" of the photograph in the folder, or after so many seconds, as `advance` says.
-    `progress` is called with each `Shot`, how many were before it, and how many there are. Errors as of
-    `Display`; InputError or FileError for an unusable `advance`, nothing to show.
+    pictures of the folder by the numbers in their names. `display` counts from 0, or is an open one or the
+    like: `show(codes)` and `key_pressed()`. The next pattern is shown after a "key", at the "arrival" of the
+    photograph in the folder, or after so many seconds, as `advance` says. `progress` is called with each
+    `Shot`, how many were before it, and how many there are. Errors as of `Display`; InputError or FileError
+    for an unusable `advance`, nothing to show.
 
     Examples
     --------
@@ -135,7 +136,8 @@ def show(
     if not shots:
         return 0
     h, w = images.read(folder / shots[0].pattern).shape[:2]
-    with Display((h, w), index=display) as screen:
+    is_open = hasattr(display, "show")
+    with contextlib.nullcontext(display) if is_open else Display((h, w), index=display) as screen:
         for done, shot in enumerate(shots):
             screen.show(images.read(folder / shot.pattern, encoding="linear"))
             if progress is not None:

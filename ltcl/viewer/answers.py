@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`Scene`: what the library answers to the page, with one method for each thing that it may ask."""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from PIL import Image
+
+from ltcl import __version__, checks, images, layout, report
+from ltcl.compensation import compensate
+from ltcl.errors import FileError, InputError, InputTypeError, LtclError
+from ltcl.first_bounce import ENTRIES
+from ltcl.images.pictures import BITS, as_picture, decoding, from_linear, to_linear
+from ltcl.separation import separate
+from ltcl.transport import Transport
+
+Reply = tuple[dict[str, Any], dict[str, np.ndarray]]  # facts and pictures
+Callback = Callable[[int, float], None]  # of `ltcl.solve`
+QUICK = ("column", "row", "relight", "pictures", "projector")  # a product at most
+LONG = ("bounces", "compensate")  # solves, which call back
+PICTURES = ("pattern", "appearance", "target", "out_of_reach")  # of a compensation
+LARGEST_FILE, LARGEST_PICTURE, UPLOADS = 64 << 20, 64_000_000, 16  # bytes, pixels, how many are kept
+_BOUNCES = 16
+
+
+class Scene:
+    """T and what is shown of it; methods take what a question holds, and raise LtclError for anything else.
+
+    `setup` is the `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light that the
+    projector has now, of at most `white`. `questions` may be asked, the largest of so many `pixels`.
+    """
+
+    page = "index.html"
+    questions = (*QUICK, *LONG)
+
+    def __init__(self, T: Transport, title: str, pictures: Mapping[str, np.ndarray], setup: Any) -> None:
+        self.T, self.title, self.setup = T, title, setup
+        self.pattern, self.white, self.pixels = np.ones(T.grid, np.float32), 1.0, max(T.shape)
+        entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
+        self._shows_noise = T.is_square and (entries or T.measured_noise is not None)
+        self._pictures: dict[int, tuple[str, np.ndarray, np.ndarray]] = {}  # for the camera, the projector
+        self._first = self._next = 1  # of those that are uploaded
+        for name, picture in pictures.items():
+            self._first = 1 + self.add(name, as_picture(name, picture))
+        self._compensation: tuple[Any, dict[str, Any]] | None = None
+
+    def hello(self) -> dict[str, Any]:
+        """What a page has to know of T."""
+        T = self.T
+        facts = {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
+        facts |= {"title": self.title, "version": __version__, "device": T.device.name, "scan": False}
+        facts |= {"square": T.is_square, "compressed": T.is_compressed, "masked": int(T.masked.sum())}
+        facts |= {"noise": self._shows_noise, "measured": self.setup is not None}
+        return facts | {"pictures": [name for name, *_ in self._pictures.values()]}
+
+    def answer(self, do: str, asked: dict[str, Any], callback: Callback) -> Reply:
+        """The answer to a question by name; `callback` is called between the steps of a solve."""
+        method = getattr(self, checks.one_of("do", do, self.questions))
+        try:
+            bound = inspect.signature(method).bind(**asked, **({"callback": callback} if do in LONG else {}))
+        except TypeError as error:
+            raise InputTypeError(f"{do}: {error}") from None
+        return method(*bound.args, **bound.kwargs)
+
+    def column(self, pixel: Any, channel: Any = None) -> Reply:
+        """What one projector pixel lights."""
+        return {}, {"picture": self.T @ self._unit(pixel, channel, self.T.grid)}
+
+    def row(self, pixel: Any, channel: Any = None) -> Reply:
+        """How much each projector pixel adds to one camera pixel."""
+        T = self.T
+        unit = self._unit(pixel, channel, T.camera_grid)
+        columns, shape = layout.unpack("pixel", unit, T.camera_grid, T.channels)
+        columns = [np.concatenate(columns)] if T.couples else columns
+        rows = [A.T.matmat(x) for A, x in zip(T.operators, columns, strict=True)]
+        return {}, {"pattern": shape.pack(rows, T.grid)}
+
+    def relight(self, pattern: Any = None, picture: Any = None) -> Reply:
+        """The picture under a pattern, linear light or sRGB codes, shown from now on; or the present."""
+        if pattern is None:
+            light = self.pattern if picture is None else self._picture(picture)[2]
+        else:
+            pattern = checks.shape("pattern", checks.real("pattern", pattern), self.T.grid, (*self.T.grid, 3))
+            light = to_linear(pattern, "auto")
+        seen = self.T @ light
+        if light is not self.pattern:
+            self.pattern, self.white = light, 1.0
+        return {}, {"picture": seen} | ({"pattern": light} if pattern is None else {})
+
+    def bounces(self, callback: Callback, of: Any = "pattern", picture: Any = None, count: Any = 4) -> Reply:
+        """Direct light and bounces of a picture, or of what the current pattern looks like."""
+        checks.count("count", count, least=0, most=_BOUNCES)
+        is_pattern = checks.one_of("of", of, ("pattern", "picture")) == "pattern"
+        image = self.T @ self.pattern if is_pattern else self._picture(picture)[1]
+        result = separate(self.T, image, count, callback=callback)
+        numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
+        light = {"direct": result.direct, **numbered, "rest": result.rest}
+        whole = float(np.sum(image, dtype=np.float64)) or 1.0
+        shares = [float(np.sum(part, dtype=np.float64)) / whole for part in light.values()]
+        if self._shows_noise:
+            deviations = zip(["direct", *numbered], [result.std.direct, *result.std.bounces], strict=True)
+            light |= {f"{name}_std": deviation for name, deviation in deviations}
+        return {"shares": shares, "warning": result.warning}, light
+
+    def compensate(
+        self, callback: Callback, picture: Any, gain: Any = None, bounds: Any = (0, 1), method: Any = "auto"
+    ) -> Reply:
+        """The pattern under which the scene looks like a picture; the projector shows it from now on."""
+        name, desired, shown = self._picture(picture)
+        gain = ("auto" if self.setup else 1.0) if gain is None else gain
+        asked, start = {"gain": gain, "bounds": bounds, "method": method}, time.perf_counter()
+        ambient = None if self.setup is None else self.setup.ambient
+        c = compensate(self.T, desired, background=ambient, callback=callback, **asked)
+        facts = {key: getattr(c, key) for key in ("error", "gain", "clipped", "gap", "transport_error")}
+        facts["seconds"], solves = time.perf_counter() - start, report.solution(c.solution)
+        solves += [each for each in report.solution(c.limited) if each not in solves]
+        facts["method"] = ", ".join(dict.fromkeys(solve["method"] for solve in solves))
+        facts["products"] = sum(solve["products"] for solve in solves)
+        facts["residuals"] = max((solve["residuals"] for solve in solves), key=len)
+        self.pattern, self.white = c.pattern, max(float(bounds[1]), 0.0) or 1.0
+        versions = {"versions": report.versions(), "device": report.device(self.T.device)}
+        known = {"title": self.title, **versions, "picture": name, **asked}
+        self._compensation = c, known | facts | {"white": self.white, "solves": solves}
+        plain = self.T @ shown  # the picture itself as a pattern, made as bright as the target
+        plain *= np.float32(c.target.mean() / max(plain.mean(), np.finfo(np.float32).tiny))
+        return facts, {name: getattr(c, name) for name in PICTURES} | {"uncompensated": plain}
+
+    def pictures(self) -> Reply:
+        """Names and numbers of the pictures that there are."""
+        return {"pictures": [{"picture": k, "name": name} for k, (name, *_) in self._pictures.items()]}, {}
+
+    def projector(self) -> Reply:
+        """A window that is to show the pattern; the server sends it."""
+        return {}, {}
+
+    def add(self, name: str, picture: np.ndarray) -> int:
+        """Keep a picture, on the grids of camera and projector; its number."""
+        grids = (self.T.camera_grid, self.T.grid)
+        sizes = [picture if picture.shape[:2] == grid else images.resize(picture, grid) for grid in grids]
+        number, self._next = self._next, self._next + 1
+        self._pictures[number] = name, sizes[0], sizes[1]
+        if number >= self._first + UPLOADS:
+            del self._pictures[number - UPLOADS]
+        return number
+
+    def upload(self, name: str, content: bytes | bytearray) -> dict[str, Any]:
+        """Keep the picture of a file; InputError, before it is decoded, where that has too many pixels."""
+        suffix = checks.one_of("extension", Path(name).suffix.lower(), BITS)
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / f"picture{suffix}"
+            path.write_bytes(content)
+            try:
+                _check_pixels(path)
+                picture = images.read(path)
+            except LtclError as error:
+                raise InputError(str(error).replace(str(path), repr(name))) from None
+        shape = [*picture.shape, 1][:3]
+        return {"picture": self.add(name, picture), "name": name, "shape": shape}
+
+    def result(self, name: str) -> bytes | None:
+        """A file of the last compensation, by its name; None where there is none."""
+        files = ("report.json", "pattern.png", "codes.png", *(f"{each}.exr" for each in PICTURES))
+        if self._compensation is None or name not in files:
+            return None
+        c, facts = self._compensation
+        if name == "report.json":
+            return report.dumps(facts).encode()
+        picture, encoding = getattr(c, name[:-4], c.pattern), "auto"
+        if name == "pattern.png":
+            picture = c.pattern / np.float32(facts["white"])
+        elif name == "codes.png":
+            picture, encoding = self.codes(c.pattern, facts["white"]) / np.float32(255), "linear"
+        with TemporaryDirectory() as folder:
+            images.write(path := Path(folder) / name, picture, encoding=encoding)
+            return path.read_bytes()
+
+    def codes(self, pattern: np.ndarray, white: float) -> np.ndarray:
+        """What a projector has to show, uint8 on its pixels: codes of the measured one, else sRGB."""
+        if self.setup is None:
+            return from_linear(pattern / np.float32(white), "srgb", 8, is_float=False)
+        return from_linear(self.setup.codes(pattern), "linear", 8, is_float=False)
+
+    def _picture(self, number: Any) -> tuple[str, np.ndarray, np.ndarray]:
+        return self._pictures[checks.one_of("picture", number, self._pictures)]
+
+    def _unit(self, pixel: Any, channel: Any, grid: tuple[int, int]) -> np.ndarray:
+        """Light, or sight, of one pixel in one channel or in all."""
+        if not isinstance(pixel, list) or len(pixel) != 2:
+            raise InputError(f"pixel is {checks.shown(pixel)}; it must be [row, column]")
+        unit = np.zeros((*grid, self.T.channels), np.float32)
+        place = [*pixel, *([] if channel is None else [channel])]
+        for n, size in zip(place, unit.shape, strict=False):
+            checks.count("pixel or channel", n, least=0, most=size - 1)
+        unit[tuple(place)] = 1.0
+        return unit if self.T.channels == 3 else unit[..., 0]
+
+
+def _check_pixels(path: Path) -> None:
+    """Refuse a picture by the size that its header has."""
+    with decoding(path):
+        if path.suffix == ".exr":
+            low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+            w, h = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+        else:
+            w, h = Image.open(path, formats=("PNG", "JPEG", "BMP", "TIFF")).size
+        if w * h > LARGEST_PICTURE:
+            raise FileError(f"has {h} x {w} pixels; it must have at most {LARGEST_PICTURE}")

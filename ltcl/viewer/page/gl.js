@@ -1,0 +1,163 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Draws linear light on canvases. One WebGL context serves them all: it draws at the size of the picture, one
+// fragment a pixel, and the result is copied to the canvas, which CSS enlarges without smoothing.
+
+const VERTEX = `#version 300 es
+void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
+
+// Variants are #define: drawing in software pays for each branch, taken or not.
+const FRAGMENT = `precision highp float;
+precision highp sampler2DArray;
+uniform sampler2DArray light, deviation;
+uniform float weights[LAYERS], others[LAYERS], spreads[LAYERS]; // right, left of the wipe; of deviation
+uniform int height;
+uniform float wipe;
+out vec4 colour;
+
+vec3 stored(sampler2DArray pictures, ivec2 at, int k) {
+  vec3 value = texelFetch(pictures, ivec3(at, k), 0).rgb;
+  return GREY ? value.rrr : value;
+}
+vec3 heat(float t) { // fit of matplotlib's inferno by Matt Zucker (CC0)
+  return clamp(vec3(0.0002, 0.0016, -0.0194) + t * (vec3(0.1065, 0.5639, 3.9327)
+    + t * (vec3(11.6024, -3.9728, -15.9423) + t * (vec3(-41.7039, 17.4363, 44.3541)
+    + t * (vec3(77.1629, -33.4023, -81.8073) + t * (vec3(-71.3194, 32.6260, 73.2095)
+    + t * vec3(25.1311, -12.2426, -23.0703)))))), 0.0, 1.0);
+}
+// Four decades, one of them beyond white: a logarithm is asked for to see highlights, too.
+float decades(float value) { return clamp(0.75 + 0.25 * log(max(value, 1e-9)) / log(10.0), 0.0, 1.0); }
+vec3 encoded(vec3 linear) { // sRGB
+  return mix(1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, 12.92 * linear, lessThan(linear, vec3(0.0031308)));
+}
+void main() {
+  ivec2 at = ivec2(int(gl_FragCoord.x), height - 1 - int(gl_FragCoord.y)); // row 0 is at the top
+  vec3 sum = vec3(0.0), variance = vec3(0.0);
+  for (int k = 0; k < LAYERS; k++) {
+#if WIPE
+    sum += (gl_FragCoord.x < wipe ? others[k] : weights[k]) * stored(light, at, k);
+#else
+    sum += weights[k] * stored(light, at, k);
+#endif
+#if UNCERTAIN
+    vec3 sigma = spreads[k] * stored(deviation, at, k);
+    variance += sigma * sigma;
+#endif
+  }
+  if (isnan(sum.r)) sum = vec3(0.0); // masked
+  float most = max(sum.r, max(sum.g, sum.b)), least = min(sum.r, min(sum.g, sum.b));
+  float size = -least > most ? least : most; // with the sign of what is larger
+#if MODE == 0 && LOGARITHMIC
+  colour.rgb = vec3(decades(sum.r), decades(sum.g), decades(sum.b));
+#elif MODE == 0
+  colour.rgb = encoded(clamp(sum, 0.0, 1.0));
+#elif MODE == 1
+  colour.rgb = heat(LOGARITHMIC == 1 ? decades(most) : clamp(most, 0.0, 1.0));
+#else
+  float strength = LOGARITHMIC == 1 ? decades(abs(size)) : min(abs(size), 1.0);
+  colour.rgb = encoded(strength * (size < 0.0 ? vec3(0.1, 0.45, 1.0) : vec3(1.0, 0.35, 0.1)));
+#endif
+#if UNCERTAIN
+  float sigma = sqrt(max(variance.r, max(variance.g, variance.b)));
+  colour.rgb = mix(colour.rgb, vec3(1.0, 0.2, 0.75), 0.9 * clamp(sigma / max(abs(size), 1e-4), 0.0, 1.0));
+#endif
+  colour.a = 1.0;
+}`;
+
+const surface = document.createElement("canvas");
+const gl = surface.getContext("webgl2", { alpha: false, antialias: false, depth: false });
+export const supported = Boolean(gl);
+
+surface.addEventListener("webglcontextlost", (event) => event.preventDefault());
+surface.addEventListener("webglcontextrestored", () => location.reload());
+gl?.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+
+const programs = new Map();
+
+// Use the variant of the shader with these numbers for its names; returns the places of its uniforms.
+function use(defines) {
+  const head = Object.entries(defines).map(([name, value]) => `#define ${name} ${value}`).join("\n");
+  if (!programs.has(head)) {
+    const program = gl.createProgram(), variant = `#version 300 es\n${head}\n${FRAGMENT}`;
+    for (const [type, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, variant]]) {
+      const shader = gl.createShader(type);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    }
+    gl.linkProgram(program);
+    const names = ["deviation", "weights", "others", "spreads", "height", "wipe"];
+    const places = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
+    programs.set(head, { program, ...places });
+  }
+  gl.useProgram(programs.get(head).program);
+  return programs.get(head);
+}
+
+// Pictures of one size as the layers of one texture.
+export class Layers {
+  set(pictures) {
+    const { h, w, c, dtype } = pictures[0], half = dtype === "f2";
+    const stored = c === 1 ? (half ? gl.R16F : gl.R32F) : half ? gl.RGB16F : gl.RGB32F;
+    const shape = [stored, w, h, pictures.length];
+    if (String(shape) !== String(this.shape)) {
+      gl.deleteTexture(this.texture ?? null);
+      this.texture = gl.createTexture();
+      gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.texture);
+      gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, ...shape);
+      for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+        gl.texParameteri(gl.TEXTURE_2D_ARRAY, filter, gl.NEAREST); // half floats and floats alike
+      }
+    }
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.texture);
+    pictures.forEach(({ data }, k) => {
+      const [format, type] = [c === 1 ? gl.RED : gl.RGB, half ? gl.HALF_FLOAT : gl.FLOAT];
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, w, h, 1, format, type, data);
+    });
+    Object.assign(this, { shape, pictures, h, w, grey: c === 1 });
+  }
+
+  clear() {
+    gl.deleteTexture(this.texture);
+  }
+
+  // The values of one pixel of the weighted sum.
+  at(row, col, weights) {
+    const each = this.pictures.map((picture, k) => picture.at(row, col).map((value) => weights[k] * value));
+    return each.reduce((sum, values) => sum.map((value, channel) => value + values[channel]));
+  }
+}
+
+// `look`: white (the value shown as white), logarithmic, mode (0 natural, 1 heat, 2 signed), weights; and
+// optionally others and wipe (0 to 1: left of it the sum by `others`), deviation (Layers) to overlay.
+export function draw(canvas, layers, look) {
+  const { h, w } = layers;
+  if (surface.width < w || surface.height < h) {
+    surface.width = Math.max(w, surface.width);
+    surface.height = Math.max(h, surface.height);
+  }
+  if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+  const uniforms = use({
+    LAYERS: layers.pictures.length, GREY: layers.grey, MODE: look.mode, LOGARITHMIC: Number(look.logarithmic),
+    WIPE: Number(Boolean(look.others)), UNCERTAIN: Number(Boolean(look.deviation)),
+  });
+  const scaled = (weights, of) => of.pictures.map(({ scale }, k) => ((weights[k] ?? 0) * scale) / look.white);
+  gl.viewport(0, 0, w, h);
+  gl.uniform1i(uniforms.height, h);
+  gl.uniform1fv(uniforms.weights, scaled(look.weights, layers));
+  if (look.others) {
+    gl.uniform1fv(uniforms.others, scaled(look.others, layers));
+    gl.uniform1f(uniforms.wipe, look.wipe * w);
+  }
+  if (look.deviation) {
+    gl.uniform1fv(uniforms.spreads, scaled(look.weights, look.deviation));
+    gl.uniform1i(uniforms.deviation, 1);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, look.deviation.texture);
+    gl.activeTexture(gl.TEXTURE0);
+  }
+  gl.bindTexture(gl.TEXTURE_2D_ARRAY, layers.texture);
+  gl.drawArrays(gl.TRIANGLES, 0, 3);
+  canvas.getContext("2d").drawImage(surface, 0, surface.height - h, w, h, 0, 0, w, h);
+  canvas.dataset.frame = Number(canvas.dataset.frame ?? 0) + 1;
+}

@@ -1,0 +1,77 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Bytes of a message, the same both ways: the length of the header as uint32 (little-endian), the header as
+// JSON padded with spaces so that arrays begin at a multiple of 4, then the arrays, each padded to 4 bytes.
+
+const TYPES = { f2: Uint16Array, f4: Float32Array, u1: Uint8Array }; // half floats go to the GPU as they are
+
+export class Pixels {
+  // A picture of h x w pixels and c numbers each, row by row; a value is scale times the stored number.
+  constructor(data, [h, w, c = 1], scale = 1, dtype = "f4") {
+    Object.assign(this, { data, h, w, c, scale, dtype });
+  }
+
+  number(index) {
+    const stored = this.data[index];
+    return this.scale * (this.dtype === "f2" ? half(stored) : stored);
+  }
+
+  at(row, col) {
+    return Array.from({ length: this.c }, (_, k) => this.number((row * this.w + col) * this.c + k));
+  }
+
+  // What to show as white: this share of pixels is darker. The brightest would often leave the rest black.
+  white(share = 0.99) {
+    const n = this.h * this.w, step = Math.max(1, Math.floor(n / 4096)), light = [];
+    for (let i = 0; i < n; i += step) {
+      let most = 0;
+      for (let k = 0; k < this.c; k++) most = Math.max(most, Math.abs(this.number(i * this.c + k)) || 0);
+      light.push(most);
+    }
+    light.sort((a, b) => a - b);
+    return light[Math.floor(share * (light.length - 1))] || light[light.length - 1];
+  }
+}
+
+function half(bits) {
+  const exponent = (bits >> 10) & 31, mantissa = bits & 1023, sign = bits & 32768 ? -1 : 1;
+  if (exponent === 31) return mantissa ? NaN : sign * Infinity;
+  return sign * (exponent ? (1024 + mantissa) * 2 ** (exponent - 25) : mantissa * 2 ** -24);
+}
+
+const padded = (length) => Math.ceil(length / 4) * 4;
+
+export function encode(header, arrays = {}) {
+  const names = Object.keys(arrays);
+  if (!names.length) return JSON.stringify(header);
+  const list = names.map((name) => {
+    const { h, w, c, dtype, scale } = arrays[name];
+    return { name, shape: [h, w, c], dtype, scale };
+  });
+  const json = new TextEncoder().encode(JSON.stringify({ ...header, arrays: list }));
+  const start = padded(4 + json.length);
+  const size = names.reduce((sum, name) => sum + padded(arrays[name].data.byteLength), start);
+  const bytes = new Uint8Array(size);
+  new DataView(bytes.buffer).setUint32(0, start - 4, true);
+  bytes.fill(32, 4, start).set(json, 4);
+  let offset = start;
+  for (const name of names) {
+    const { buffer, byteOffset, byteLength } = arrays[name].data;
+    bytes.set(new Uint8Array(buffer, byteOffset, byteLength), offset);
+    offset += padded(byteLength);
+  }
+  return bytes;
+}
+
+export function decode(message) {
+  if (typeof message === "string") return { ...JSON.parse(message), arrays: {} };
+  const length = new DataView(message).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
+  const arrays = {};
+  let offset = 4 + length;
+  for (const { name, shape, dtype, scale } of header.arrays) {
+    const data = new TYPES[dtype](message, offset, shape.reduce((a, b) => a * b));
+    arrays[name] = new Pixels(data, shape, scale, dtype);
+    offset += padded(data.byteLength);
+  }
+  return { ...header, arrays };
+}

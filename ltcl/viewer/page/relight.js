@@ -1,0 +1,178 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Relight: paint on the projector's pattern, or let a picture, a video or a moving spot do it.
+
+import { draw, Layers } from "./gl.js";
+import { Pixels } from "./messages.js";
+import { Panel } from "./panel.js";
+
+const UNDO = 30; // steps that can be undone
+
+export function relight({ $, ask, press, hello }) {
+  const [h, w] = hello.grid;
+  const canvas = () => pattern.canvas;
+  const pattern = new Panel($("relight-pattern"), { title: "Projector’s pattern", grid: [h, w], act });
+  const seen = new Panel($("relight-seen"), { title: "What the camera sees", grid: hello.camera_grid });
+  const paint = canvas().getContext("2d", { willReadFrequently: true });
+  const past = [], video = document.createElement("video");
+  let erasing = false, last = null, changed = false, sending = 0, motion = null;
+  Object.assign(video, { muted: true, loop: true, playsInline: true });
+  paint.lineCap = "round";
+  const size = $("relight-size"), source = $("relight-source");
+  size.max = Math.max(8, Math.round(Math.max(h, w) / 3));
+  size.value = Math.max(1, Math.round(Math.max(h, w) / 10));
+  pattern.values = (row, col) => [...paint.getImageData(col, row, 1, 1).data.slice(0, 3)].map(linear);
+
+  const linear = (code) => (code <= 10 ? code / 255 / 12.92 : ((code / 255 + 0.055) / 1.055) ** 2.4);
+
+  function codes() {
+    const rgba = paint.getImageData(0, 0, w, h).data, rgb = new Uint8Array(3 * h * w);
+    let grey = hello.channels === 1;
+    for (let i = 0, k = 0; i < rgba.length; i += 4, k += 3) {
+      rgb[k] = rgba[i];
+      rgb[k + 1] = rgba[i + 1];
+      rgb[k + 2] = rgba[i + 2];
+      grey &&= rgba[i] === rgba[i + 1] && rgba[i] === rgba[i + 2];
+    }
+    return new Pixels(grey ? rgb.filter((_, k) => k % 3 === 0) : rgb, [h, w, grey ? 1 : 3], 1, "u1");
+  }
+
+  const show = (light) => seen.show(light, [1], light.white(0.97)); // bounces are darker than what is lit
+
+  // Send what is painted when an answer has come: one pattern is computed, one on its way, never more.
+  async function send() {
+    changed = true;
+    canvas().dataset.frame = Number(canvas().dataset.frame ?? 0) + 1;
+    if (sending === 2) return;
+    sending++;
+    while (changed) {
+      changed = false;
+      const answer = await ask("relight", {}, { pattern: codes() });
+      if (answer) show(answer.arrays.picture);
+    }
+    sending--;
+    pattern.read();
+  }
+
+  function act(kind, row, col) {
+    pattern.ring(kind === "leave" ? 0 : Number(size.value));
+    if (kind === "press") {
+      begin();
+      last = [row, col];
+    } else if (kind !== "drag") last = null;
+    if (!last) return;
+    paint.strokeStyle = erasing ? "#000" : $("relight-colour").value;
+    paint.lineWidth = Number(size.value);
+    paint.beginPath();
+    paint.moveTo(last[1] + 0.5, last[0] + 0.5);
+    paint.lineTo(col + 0.5, row + 0.5 + 1e-3); // a line without length is not drawn
+    paint.stroke();
+    send();
+    last = [row, col];
+  }
+
+  // Stop what moves, the spot or the video.
+  function still() {
+    cancelAnimationFrame(motion);
+    video.pause();
+    press($("relight-spot"), false);
+  }
+
+  // Before something else is painted.
+  function begin() {
+    still();
+    past.push(paint.getImageData(0, 0, w, h));
+    if (past.length > UNDO) past.shift();
+  }
+
+  function fill(style) {
+    paint.fillStyle = style;
+    paint.fillRect(0, 0, w, h);
+    send();
+  }
+
+  function animate(frame) {
+    begin();
+    const step = (now) => {
+      motion = requestAnimationFrame(step);
+      if (!changed) frame(now / 1000); // the last one is on its way
+    };
+    motion = requestAnimationFrame(step);
+  }
+
+  function spot(seconds) {
+    const x = w * (0.5 + 0.4 * Math.sin(1.1 * seconds)), y = h * (0.5 + 0.4 * Math.sin(1.7 * seconds));
+    const glow = paint.createRadialGradient(x, y, 0, x, y, Number(size.value));
+    glow.addColorStop(0, $("relight-colour").value);
+    glow.addColorStop(1, "#000");
+    fill(glow);
+  }
+
+  // Fill the pattern with a picture or a frame, cut to its shape.
+  function cover(image, width, height) {
+    const scale = Math.max(w / width, h / height);
+    paint.imageSmoothingQuality = "high";
+    paint.drawImage(image, (w - scale * width) / 2, (h - scale * height) / 2, scale * width, scale * height);
+    send();
+  }
+
+  async function take(file) {
+    if (file.type.startsWith("video/")) {
+      URL.revokeObjectURL(video.src);
+      video.src = URL.createObjectURL(file);
+      await video.play();
+      animate(() => cover(video, video.videoWidth, video.videoHeight));
+      return true;
+    }
+    const bitmap = await createImageBitmap(file).catch(() => null); // EXR and the like: the server reads them
+    if (!bitmap) return false;
+    begin();
+    cover(bitmap, bitmap.width, bitmap.height);
+    return true;
+  }
+
+  // What the server has as its pattern, as codes. All white is how it begins, and leaves nothing to paint.
+  function shown(light) {
+    const layers = new Layers();
+    layers.set([light]);
+    draw(canvas(), layers, { white: 1, mode: 0, logarithmic: false, weights: [1] });
+    layers.clear();
+    if (light.data.every((stored) => stored === light.data[0])) spot(0.15);
+  }
+
+  async function start(fields = {}) {
+    const answer = await ask("relight", fields);
+    if (!answer) return;
+    show(answer.arrays.picture);
+    shown(answer.arrays.pattern);
+    pattern.read();
+  }
+
+  const tool = (eraser) => {
+    erasing = eraser;
+    press($("relight-brush"), !eraser);
+    press($("relight-eraser"), eraser);
+  };
+  $("relight-brush").onclick = () => tool(false);
+  $("relight-eraser").onclick = () => tool(true);
+  for (const [name, style] of [["fill", () => $("relight-colour").value], ["clear", () => "#000"]]) {
+    $(`relight-${name}`).onclick = () => {
+      begin();
+      fill(style());
+    };
+  }
+  $("relight-undo").onclick = () => {
+    still();
+    if (past.length) paint.putImageData(past.pop(), 0, 0);
+    send();
+  };
+  $("relight-spot").onclick = () => {
+    if ($("relight-spot").getAttribute("aria-pressed") === "true") return still();
+    animate(spot);
+    press($("relight-spot"), true);
+  };
+  source.onchange = () => {
+    begin();
+    if (source.value) start({ picture: Number(source.value) });
+  };
+  return { start: () => start(), stop: still, take };
+}

@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: BSD-3-Clause
+// Scan: photographs of an acquisition as they come, their exposure, how far it is, and what is wrong.
+
+const percent = (share) => `${(100 * share).toFixed(1)} %`;
+
+export function scan({ $, ask, press, connection }) {
+  const list = $("scan-photographs"), most = 24; // as many as the server keeps
+
+  function facts({ state, done, total, what, left, coverage, saturated }) {
+    Object.assign($("scan-progress"), { max: total || 1, value: done });
+    const minutes = Math.round(left / 60), calibrated = coverage !== undefined;
+    $("scan-facts").textContent = [
+      state === "final" ? "finished" : `${done} of about ${total} ${what}`,
+      left !== null && (minutes ? `about ${minutes} min left` : "less than a minute left"),
+      calibrated && `camera sees ${percent(coverage)} of the projector`,
+      calibrated && `${percent(saturated)} of the camera saturated`,
+    ].filter(Boolean).join(" · ");
+  }
+
+  // Show how many pixels have which code.
+  function choose(button, text, histogram) {
+    for (const each of list.children) press(each, each === button);
+    $("scan-exposure").textContent = text;
+    const depth = (share) => Math.min(30, -7.5 * Math.log10(share + 1e-9)); // four decades
+    const points = histogram.map((share, k) => `${(100 * (k + 0.5)) / histogram.length},${depth(share)}`);
+    $("scan-histogram").firstElementChild.setAttribute("points", points.join(" "));
+  }
+
+  function add({ name, time, seconds, histogram }, { w, h, c, data }) {
+    [...list.children].find(({ dataset }) => dataset.name === name)?.remove(); // taken again
+    const button = $("photograph").content.cloneNode(true).firstElementChild, [canvas, caption] = button.children;
+    [canvas.width, canvas.height, button.dataset.name, button.dataset.time] = [w, h, name, time];
+    const code = (_, i) => (i % 4 > 2 ? 255 : data[(i >> 2) * c + (c > 1 ? i % 4 : 0)]);
+    const image = new ImageData(Uint8ClampedArray.from({ length: 4 * w * h }, code), w, h);
+    canvas.getContext("2d").putImageData(image, 0, 0);
+    caption.textContent = seconds ? `${name}, ${seconds.toPrecision(3)} s` : name;
+    if (histogram) button.onclick = () => choose(button, `Exposure of ${caption.textContent}`, histogram);
+    const chosen = list.querySelector("[aria-pressed=true]"), first = list.firstElementChild;
+    list.insertBefore(button, [...list.children].find(({ dataset }) => dataset.time < time) ?? null);
+    if (list.children.length > most) list.lastElementChild.remove();
+    if (button === list.firstElementChild && (!chosen || chosen === first)) button.click();
+  }
+
+  connection.addEventListener("scan", ({ detail }) => {
+    facts(detail);
+    detail.photographs.forEach((each, k) => add(each, detail.arrays[k]));
+    const item = (textContent) => Object.assign(document.createElement("li"), { textContent });
+    $("scan-warnings").replaceChildren(...detail.warnings.map(item));
+  });
+  return { start: () => ask("scan") };
+}

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`Window`: a projector window in the browser, shown to in turn; and `play`, a film compensated as it runs.
+
+What is shown next goes to the window when that has drawn what it had, so nothing waits on the way. A frame
+that cannot be there in time is not computed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable
+from itertools import islice
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from ltcl import images
+from ltcl.compensation import compensate
+from ltcl.images.frames import Frame, Source
+from ltcl.viewer import serve
+from ltcl.viewer.answers import Scene
+
+_POLL = 0.1  # seconds, in which Ctrl-C is heard
+_PAUSE = 1.0  # without a window for longer, a film waits
+_SAMPLE = 8  # frames that decide on the gain
+
+
+class Window(contextlib.AbstractContextManager):
+    """Windows of a browser, whichever are open, in the place of a `ltcl.acquisition.rigs.Display`.
+
+    `address` are arguments of `ltcl.viewer.serve`. Space, an arrow or page key there is a key pressed.
+    """
+
+    page = "projector.html"
+    questions = ("projector", "next")
+    pixels, white = 1, 1.0
+
+    def __init__(self, title: str, **address: Any) -> None:
+        self.title, self.pattern, self._drawn = title, None, 0.0
+        self._is_drawn, self._pressed = threading.Event(), threading.Event()
+        self._viewer = serve(self, **address)
+        self.url = self._viewer.url
+
+    def show(self, codes: np.ndarray) -> float:
+        """Show codes (h, w[, 3]), uint8 or in [0, 1], when a window is there that drew those before; when."""
+        drawn = self.wait()
+        self._is_drawn.clear()
+        self.pattern = codes if codes.dtype == np.uint8 else np.rint(255 * codes).astype(np.uint8)
+        self._viewer.refresh()
+        return drawn
+
+    def wait(self, patience: float = math.inf) -> float:
+        """Until a window drew what there is, or so many seconds: the time when it did."""
+        end = time.monotonic() + patience
+        while not self._is_drawn.wait(_POLL) and time.monotonic() < end:
+            pass
+        return self._drawn
+
+    def key_pressed(self) -> bool:
+        """Whether one was, since the last call."""
+        was_pressed = self._pressed.is_set()
+        self._pressed.clear()
+        return was_pressed
+
+    def close(self) -> None:
+        """End it; windows keep what they show."""
+        self._viewer.close()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def hello(self) -> dict[str, Any]:
+        """What a window has to know."""
+        return {"title": self.title, "keys": True}
+
+    def answer(self, do: str, asked: dict[str, Any], callback: Any) -> tuple[dict, dict]:
+        """Hear that a window is there or has drawn, or that a key was pressed."""
+        if do == "projector":
+            self._drawn = time.monotonic()
+        (self._is_drawn if do == "projector" else self._pressed).set()
+        return {}, {}
+
+    def codes(self, pattern: np.ndarray, white: float) -> np.ndarray:
+        """They are what is shown."""
+        return pattern
+
+
+def play(
+    scene: Scene,
+    film: Source,
+    window: Window,
+    gain: float | str,
+    progress: Callable[..., None],
+    **settings: Any,
+) -> dict[str, Any]:
+    """Show a film compensated for the T of `scene` at its own pace, and return what was reached.
+
+    `settings` are of `ltcl.compensate`; a `gain` "auto" is the largest for frames from all of the film.
+    `frames_per_second` are those shown; `latency` is the median of seconds from when a frame was due until a
+    window had drawn it.
+    """
+
+    def picture(frame: Frame) -> np.ndarray:
+        light, grid = frame.picture(), scene.T.camera_grid
+        return light if light.shape[:2] == grid else images.resize(light, grid)
+
+    if isinstance(gain, str):
+        every = max((film.count or _SAMPLE) // _SAMPLE, 1)
+        sample = [np.atleast_3d(picture(frame)) for frame in islice(film, 0, every * _SAMPLE, every)]
+        frames = np.stack([np.broadcast_to(each, (*each.shape[:2], 3)) for each in sample])
+        gain = compensate(scene.T, frames, gain=gain, **settings).gain
+    now, period, title = time.monotonic, 1.0 / (film.fps or 25.0), window.title
+    start = spent = 0.0  # when frame 0 was due; seconds that a frame takes to compute
+    due = sent = taken = 0.0  # of the frame on show: when it was due, and sent; seconds to send and draw it
+    late, facts, shown = list[float](), dict[str, Any](), 0
+    for frame in film:
+        if shown and start + (frame.number + 0.5) * period < max(now() + spent, sent + taken):
+            continue  # it would be late
+        begun = now()
+        pattern = compensate(scene.T, picture(frame), gain=gain, clamp=True, **settings).pattern
+        codes = scene.codes(pattern, 1.0)
+        if shown:  # kernels are built for the first
+            spent = now() - begun
+            time.sleep(max(start + frame.number * period - now(), 0.0))
+        begun = now()
+        drawn = window.show(codes)
+        if shown and now() - begun < _PAUSE:
+            late.append(drawn - due)
+            taken = drawn - sent
+        else:  # the film waited for a window
+            start = now() - frame.number * period
+        sent = now()
+        due, shown = start + frame.number * period, shown + 1
+        facts = {"shown": shown, "dropped": frame.number - shown, "gain": gain}
+        facts |= {"frames_per_second": shown / (now() - start), "latency": median(late or [0.0])}
+        text = "{frames_per_second:.1f} frames/s, {dropped} dropped, latency {latency:.3f} s".format(**facts)
+        window.title = f"{title}: {text}"
+        progress(text, frame.number, film.count)
+    window.wait(_PAUSE)
+    return facts

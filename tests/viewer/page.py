@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A page without a browser: asks the viewer by its protocol, which is written down here once more."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from typing import Any
+
+import numpy as np
+from websockets.sync.client import ClientConnection, connect
+
+TYPES = {"f2": "<f2", "f4": "<f4", "u1": "u1"}
+
+
+def question(header: dict[str, Any], arrays: dict[str, tuple[np.ndarray, float]]) -> str | bytes:
+    """A frame; arrays (h, w, c) with their scales, numbers as they are."""
+    if not arrays:
+        return json.dumps(header)
+    kinds = {name: f"{array.dtype.kind}{array.dtype.itemsize}" for name, (array, _) in arrays.items()}
+    entries = [
+        {"name": name, "shape": list(array.shape), "dtype": kinds[name], "scale": scale}
+        for name, (array, scale) in arrays.items()
+    ]
+    text = json.dumps({**header, "arrays": entries}).encode()
+    text += b" " * (-len(text) % 4)
+    bodies = [array.tobytes() for array, _ in arrays.values()]
+    padded = b"".join(body + bytes(-len(body) % 4) for body in bodies)
+    return len(text).to_bytes(4, "little") + text + padded
+
+
+def answer(message: str | bytes) -> dict[str, Any]:
+    """A header with its arrays, float64, by their names."""
+    if isinstance(message, str):
+        return json.loads(message)
+    start = 4 + int.from_bytes(message[:4], "little")
+    header = json.loads(message[4:start])
+    for entry in header.pop("arrays"):
+        assert start % 4 == 0
+        numbers = np.frombuffer(message, TYPES[entry["dtype"]], int(np.prod(entry["shape"])), start)
+        header[entry["name"]] = numbers.reshape(entry["shape"]) * float(entry["scale"])
+        start += numbers.nbytes + -numbers.nbytes % 4
+    assert start == len(message)
+    return header
+
+
+class Page:
+    """A socket to a viewer, with what it said first."""
+
+    def __init__(self, url: str, **settings: Any) -> None:
+        origin = "/".join(url.split("/")[:3])
+        settings = {"origin": origin, "max_size": None, "compression": None, **settings}
+        self.url, self.origin = url, origin
+        self._opened = contextlib.ExitStack()
+        opening = connect(url.replace("http", "ws", 1) + "socket", **settings)
+        self.socket: ClientConnection = self._opened.enter_context(opening)
+        self.hello = self.next()
+        self.asked = 0
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    def send(self, do: str, arrays: dict[str, tuple[np.ndarray, float]] | None = None, **fields: Any) -> int:
+        """Ask without waiting; the number of the question."""
+        self.asked += 1
+        self.socket.send(question({"id": self.asked, "do": do, **fields}, arrays or {}))
+        return self.asked
+
+    def next(self) -> dict[str, Any]:
+        """What comes next."""
+        return answer(self.socket.recv(timeout=60))
+
+    def ask(self, do: str, arrays: Any = None, **fields: Any) -> dict[str, Any]:
+        """The answer to a question; what comes before it is left out."""
+        number = self.send(do, arrays, **fields)
+        while (found := self.next()).get("id") != number or found["do"] != do:
+            pass
+        return found

@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Acquisitions as they grow, patterns and films in a projector window, and the token of a port."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import ltcl
+from ltcl import errors, images
+from ltcl.acquisition import FolderRig, Project, rigs
+from ltcl.acquisition.agreement import ROUGH
+from ltcl.acquisition.radiometry import Response
+from ltcl.device import tuning
+from ltcl.images.frames import open_frames, write_video
+from ltcl.viewer import serve
+from ltcl.viewer.answers import Scene
+from ltcl.viewer.scan import Scan
+from ltcl.viewer.window import Window, play
+from tests.viewer.page import Page
+
+PATIENCE = 30.0  # seconds
+BY_HAND = '[rig]\nkind = "folder"\nprojector_grid = [4, 6]\n[acquire]\ngeometry = "aligned"\n'
+VIRTUAL = (
+    '[rig]\nkind = "virtual"\ntransport = "T.npz"\n[acquire]\ngeometry = "aligned"\nstrategy = "pixel"\n'
+)
+random = np.random.default_rng(0)
+
+
+def project(folder: Path, text: str) -> Project:
+    (folder / "acquisition.toml").write_text(text)
+    return Project.open(folder)
+
+
+def news(page: Page, **wanted: Any) -> dict[str, Any]:
+    """What the page is told next that has these facts."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        found = page.next()
+        if found["do"] == "scan" and found.items() >= wanted.items():
+            return found
+    raise AssertionError(f"nothing with {wanted}")
+
+
+def test_photographs_come_with_histograms_and_warnings(tmp_path: Path) -> None:
+    project(tmp_path, BY_HAND)
+    rig, white = FolderRig(tmp_path, (4, 6)), np.ones((4, 6))
+    rig.prepare([(white, 0.5), (white, 1.0), (0 * white, 0.5)])
+    codes = random.integers(0, 256, (20, 30), dtype=np.uint8)
+    files = [tmp_path / f"{shot.save_as}.png" for shot in rig.shots]
+    images.write(files[0], codes / 255, encoding="linear", bits=8)
+    files[1].write_bytes(b"no picture")
+    with serve(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
+        assert page.hello == {"do": "hello", "title": tmp_path.name, "grid": None, "scan": True}
+        page.send("scan")
+        first = news(page, state="new", done=2)
+        np.testing.assert_array_equal(first["0"][..., 0], codes)
+        shares, _ = np.histogram(codes / np.float32(255), 32, (0, 1))
+        (photograph,) = first["photographs"]
+        np.testing.assert_allclose(photograph["histogram"], shares / codes.size, atol=1e-6)
+        assert (photograph["name"], photograph["seconds"]) == ("photograph 1", 0.5)
+        (warning,) = first["warnings"]
+        assert "photograph 2" in warning
+        time.sleep(0.01)
+        images.write(files[1], codes / 255, encoding="linear", bits=8)  # taken again
+        images.write(files[2], np.zeros((20, 31)), encoding="linear", bits=8)  # of another size
+        second = news(page, done=3)
+        assert {each["name"] for each in second["photographs"]} == {"photograph 2"}
+        (warning,) = second["warnings"]
+        assert "photograph 3" in warning
+        with Page(viewer.url) as late:
+            late.send("scan")
+            names = {each["name"] for each in news(late, done=3)["photographs"]}
+            assert names == {"photograph 1", "photograph 2"}
+            assert "do" in late.ask("pictures")
+            late.send("column", pixel=[0, 0])
+            with pytest.raises(Exception, match="1008"):
+                late.ask("pictures")
+
+
+def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
+    project(tmp_path, BY_HAND)
+    rig, codes = FolderRig(tmp_path, (4, 6)), 0.1 + 0.1 * random.random((20, 30))
+    rig.prepare(
+        [(pattern, t) for pattern in (np.eye(4, 6), np.ones((4, 6)), np.zeros((4, 6))) for t in (0.1, 0.4)]
+    )
+    for shot, factor in zip(rig.shots, (1, 4, 1, 1.5, 9, 9), strict=True):  # of 0.4 s: 4 times as bright
+        path = tmp_path / f"{shot.save_as}.png"
+        images.write(path, np.minimum(factor * codes, 1), encoding="linear")
+    scan = Scan(tmp_path, None)
+    valid = SimpleNamespace(valid=np.ones(6))
+    known: Any = {"exposures": (0.1, 0.4), "response": Response.identity(), "noise": ROUGH, "offset": 0.0}
+    known |= {"resampling": SimpleNamespace(coverage=np.ones(6)), "white": valid}
+    scan._calibration = cast(Any, SimpleNamespace(**known))
+    warnings = scan.news(0)[0]["warnings"]
+    for first, second in ((3, 4), (5, 6)):
+        assert sum(f"photograph {first} or photograph {second} " in text for text in warnings) == 1
+    assert sum(text.startswith("photograph 5: ") and "saturated" in text for text in warnings) == 1
+    assert len(warnings) == 3
+
+
+def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
+    truth = ltcl.scenes.dihedral(4, albedo=0.6).transport()
+    ltcl.save(tmp_path / "T.npz", truth)
+    scan = project(tmp_path, VIRTUAL)
+    with serve(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
+        page.send("scan")
+        assert news(page, state="new")["done"] == 0
+        with scan.rig() as rig:
+            T = ltcl.acquire(rig, store=scan.store, **scan.settings)
+        found = news(page, state="final", left=None)
+        assert found["done"] == found["total"] >= 32
+        assert (found["coverage"], found["saturated"]) == (1.0, 0.0)
+        assert page.next().items() >= {"do": "hello", "grid": [4, 8], "scan": True, "measured": True}.items()
+        unit = np.zeros(T.grid, np.float32)
+        unit[1, 2] = 1.0
+        column = page.ask("column", pixel=[1, 2])["picture"][..., 0]
+        np.testing.assert_allclose(column, T @ unit, atol=2e-3 * column.max())
+    with serve(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
+        assert (page.hello["grid"], page.hello["scan"]) == ([4, 8], True)
+
+
+def test_batches_of_a_scan_that_was_stopped(tmp_path: Path) -> None:
+    ltcl.save(tmp_path / "T.npz", ltcl.scenes.dihedral(6, albedo=0.6).transport())
+    scan = project(tmp_path, VIRTUAL)
+
+    def stop(step: str, done: int, total: int) -> None:
+        if step == "scan" and done > 70:
+            raise KeyboardInterrupt
+
+    with scan.rig() as rig, pytest.raises(KeyboardInterrupt):
+        ltcl.acquire(rig, store=scan.store, progress=stop, **scan.settings)
+    facts, previews, seen = Scan(tmp_path, None).news(0)
+    assert facts["state"] == "begun"
+    assert 0 < facts["done"] < facts["total"]
+    assert [each["name"] for each in facts["photographs"]][-1] == "batch 1"
+    assert {preview.shape for preview in previews.values()} == {(6, 12)}
+    assert seen == len(previews)
+
+
+@contextmanager
+def looking(url: str, slow: float = 0.0, keys: bool = False) -> Iterator[list[np.ndarray]]:
+    """A projector window, slow at drawing, in which somebody may press keys; the codes that it got."""
+    shown: list[np.ndarray] = []
+
+    def look() -> None:
+        with Page(url) as page:
+            page.send("projector")
+            while True:
+                try:
+                    message = page.next()
+                except Exception:  # noqa: BLE001 - the viewer has ended
+                    return
+                if message["do"] == "show":
+                    time.sleep(slow)
+                    shown.append(message["codes"])
+                    page.send("projector")
+                    if keys:
+                        page.send("next")
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    yield shown
+    thread.join(PATIENCE)
+
+
+@pytest.mark.parametrize("advance", ["key", 0.2, "arrival"])
+def test_patterns_come_one_after_the_other(tmp_path: Path, advance: Any) -> None:
+    rig = FolderRig(tmp_path, (4, 6))
+    patterns = [np.eye(4, 6), np.zeros((4, 6)), np.full((4, 6), 0.6)]
+    rig.prepare([(pattern, 0.5) for pattern in patterns])
+
+    def photograph(shot: Any, done: int, total: int) -> None:
+        assert (shot.number, done, total) == (done + 1, done, 3)
+        if advance == "arrival":
+            images.write(tmp_path / f"{shot.save_as}.png", np.zeros((5, 5)))
+
+    with (
+        Window("patterns", open_browser=False) as window,
+        looking(window.url, keys=advance == "key") as shown,
+    ):
+        assert rigs.show(tmp_path, window, advance, photograph) == 3
+        window.wait(1.0)
+        window.close()
+    for found, pattern in zip(shown, patterns, strict=True):
+        np.testing.assert_array_equal(found[..., 0], np.rint(255 * pattern))
+
+
+@pytest.mark.parametrize("slow", [0.0, 0.15])
+def test_a_film_is_compensated_frame_by_frame_and_never_late(device, tmp_path: Path, slow: float) -> None:
+    T = ltcl.scenes.dihedral(4, albedo=(0.7, 0.5, 0.3)).transport()
+    film = [np.full((*T.grid, 3), 0.02 * (k + 1), np.float32) for k in range(20)]
+    write_video(tmp_path / "film.mkv", film, 20.0)
+    source, told = open_frames(tmp_path / "film.mkv"), []
+    pictures = [frame.picture() for frame in source]
+    with Window("film", open_browser=False) as window, looking(window.url, slow) as shown:
+        scene = Scene(T, "T", {}, None)
+        facts = play(scene, source, window, 0.5, lambda *what: told.append(what), rtol=1e-4)
+        window.close()
+    expected = [scene.codes(ltcl.compensate(T, each, gain=0.5, rtol=1e-4).pattern, 1.0) for each in pictures]
+    numbers = [number - 1 for _, number, _ in told]
+    assert facts["shown"] == len(numbers) == len(shown)
+    assert (facts["shown"] + facts["dropped"], numbers) == (numbers[-1] + 1, sorted({*numbers}))
+    for found, number in zip(shown, numbers, strict=True):
+        np.testing.assert_allclose(found.astype(int), expected[number].astype(int), atol=1)
+    assert facts["latency"] < slow + 0.1  # and does not add up
+    assert (facts["dropped"] > 5) == bool(slow)
+    assert "dropped" in window.title
+
+
+def port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return free.getsockname()[1]
+
+
+def test_pages_find_the_next_viewer_on_a_port_that_was_named(device, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("LTCL_CACHE", str(tmp_path))
+    T, number = ltcl.Transport(np.eye(6) / 2, (2, 3)), port()
+
+    def url(**address: Any) -> str:
+        with ltcl.view(T, open_browser=False, **address) as viewer:
+            return viewer.url
+
+    first = url(port=number)
+    assert url(port=number) == first
+    assert url() != url()
+    anywhere = url(port=number, host="0.0.0.0")  # noqa: S104 - whose token is not kept
+    assert anywhere.split("/")[3] != first.split("/")[3]
+    file = tuning.folder() / f"viewer-{number}"
+    assert file.read_text() in first
+    assert os.name != "posix" or file.stat().st_mode & 0o777 == 0o600
+    os.utime(file, times=(0, 0))
+    second = url(port=number)
+    assert second != first
+    if os.name == "posix":
+        file.chmod(0o644)  # others may have read it
+        assert url(port=number) != second
+        file.unlink()
+        file.symlink_to(tmp_path / "elsewhere")
+        with pytest.raises(errors.InputError, match="port"):
+            url(port=number)
+        assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize("command", ["play", "show", "view"])
+def test_the_commands_run(tmp_path: Path, command: str) -> None:
+    ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(24) / 2, (4, 6)))
+    project(tmp_path, BY_HAND)
+    for k in range(3):
+        images.write(tmp_path / "film" / f"{k}.png", np.full((4, 6), 0.1 * k))
+    film, T = tmp_path / "film", tmp_path / "T.npz"
+    words: dict[str, list[Any]] = {"play": [film, T, "--no-browser"], "show": [film, "--browser"]}
+    words |= {"view": [tmp_path, "--no-browser"]}
+    arguments = [sys.executable, "-m", "ltcl", command, *words[command], "--json"]
+    pipes: dict[str, Any] = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(arguments, env=os.environ | {"BROWSER": "true"}, **pipes) as process:
+        assert process.stderr is not None
+        assert process.stdout is not None
+        url = process.stderr.readline().split()[0]
+        if command == "view":
+            with Page(url) as page:
+                assert page.hello["scan"]
+                process.send_signal(signal.SIGINT)
+                assert process.wait(PATIENCE) == 0
+        else:
+            with looking(url, keys=True) as shown:
+                assert process.wait(PATIENCE) == 0
+            assert len(shown) >= 2
+            assert '"shown": ' in process.stdout.read()

@@ -1,0 +1,418 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The viewer against dense float64 results by its protocol; turns, projector windows, files, the command."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+from PIL import Image
+from websockets.exceptions import ConnectionClosed
+
+import ltcl
+from ltcl import errors, images
+from ltcl.viewer import answers
+from tests.viewer.page import Page
+
+HALF = 2.0**-10  # of the largest value, or of each: half floats
+random = np.random.default_rng(0)
+MIXING = [[1.0, 0.2, 0.1], [0.3, 0.9, 0.0], [0.0, 0.4, 1.1]]
+
+
+def compressed() -> ltcl.Transport:
+    return ltcl.compress(ltcl.scenes.dihedral(8, albedo=(0.8, 0.6, 0.4)).transport(), rtol=1e-2)
+
+
+TRANSPORTS = {
+    "grey": lambda: ltcl.scenes.dihedral(6, albedo=0.7).transport(),
+    "colour": lambda: ltcl.scenes.dihedral(6, albedo=(0.8, 0.6, 0.4)).transport(),
+    "rectangular": lambda: ltcl.Transport(random.random((35, 12)), (3, 4), camera_grid=(5, 7)),
+    "sparse": lambda: ltcl.Transport(scipy.sparse.random(30, 30, 0.3, "csr") + scipy.sparse.eye(30), (5, 6)),
+    "mixing": lambda: ltcl.Transport(random.random((3, 12, 12)) + np.eye(12), (3, 4), mixing=MIXING),
+    "blocks": lambda: ltcl.Transport(random.random((3, 3, 20, 12)), (3, 4), camera_grid=(4, 5)),
+    "compressed": compressed,
+}
+
+
+@contextmanager
+def viewing(T: ltcl.Transport, *arguments: Any, **settings: Any) -> Iterator[Page]:
+    with ltcl.view(T, *arguments, open_browser=False, **settings) as viewer, Page(viewer.url) as page:
+        yield page
+
+
+@pytest.fixture(scope="module", params=TRANSPORTS)
+def shown(request, device) -> Iterator[tuple[ltcl.Transport, Page]]:
+    T = TRANSPORTS[request.param]()
+    with viewing(T) as page:
+        yield T, page
+
+
+@pytest.fixture(scope="module")
+def colour(device) -> ltcl.Transport:
+    return TRANSPORTS["colour"]()
+
+
+def whole(T: ltcl.Transport) -> np.ndarray:
+    """T as one matrix (3 M, 3 N) of pixels by channels in float64, or (M, N) of a grey one."""
+    dense = T.to_numpy().astype(np.float64)
+    if T.channels == 1:
+        return dense
+    blocks = dense if dense.ndim == 4 else np.einsum("cd,cij->cdij", np.eye(3), dense)
+    if T.mixing is not None:
+        blocks = np.einsum("cij,cd->cdij", dense, T.mixing)
+    return blocks.transpose(2, 0, 3, 1).reshape(3 * T.shape[0], 3 * T.shape[1])
+
+
+def near(found: np.ndarray, exact: np.ndarray) -> None:
+    assert found.size == exact.size
+    np.testing.assert_allclose(found.ravel(), exact.ravel(), rtol=0, atol=HALF * np.abs(exact).max())
+
+
+def test_hello_says_what_T_is(shown):
+    T, page = shown
+    facts = {"grid": list(T.grid), "camera_grid": list(T.camera_grid), "channels": T.channels, "pictures": []}
+    facts |= {"square": T.is_square, "compressed": T.is_compressed, "error": T.error, "measured": False}
+    facts |= {
+        "scan": False,
+        "version": ltcl.__version__,
+        "masked": 0,
+        "noise": T.is_square and not T.is_compressed,
+    }
+    assert page.hello.items() >= {"do": "hello", **facts}.items()
+
+
+@pytest.mark.parametrize("channel", [None, 0, 2])
+def test_columns_and_rows_are_those_of_T(shown, channel):
+    T, page = shown
+    A, c = whole(T), T.channels
+    if channel is not None and channel >= c:
+        assert "channel" in page.ask("column", pixel=[0, 0], channel=channel)["error"]
+        return
+    fields, own = ({}, slice(None)) if channel is None else ({"channel": channel}, channel)
+    for ask, name, grid, matrix in (("column", "picture", T.grid, A), ("row", "pattern", T.camera_grid, A.T)):
+        for pixel in ([0, 0], [grid[0] - 1, 1]):
+            unit = np.zeros((*grid, c))
+            unit[(*pixel, own)] = 1
+            near(page.ask(ask, pixel=pixel, **fields)[name], matrix @ unit.ravel())
+
+
+def test_relighting_with_codes_and_with_light(shown):
+    T, page = shown
+    for c in (1, 3):
+        codes = random.integers(0, 256, (*T.grid, c), dtype=np.uint8)
+        light = images.from_srgb(codes / 255.0)
+        exact = T @ np.squeeze(light, -1) if c == 1 else T @ light
+        if c == T.channels:
+            near(exact, whole(T) @ light.ravel())
+        near(page.ask("relight", {"pattern": (codes, 1.0)})["picture"], exact)
+        halves = random.random((*T.grid, c)).astype(np.float16)
+        light = 3.0 * halves.astype(np.float64)
+        exact = T @ (light[..., 0] if c == 1 else light)
+        near(page.ask("relight", {"pattern": (halves, 3.0)})["picture"], exact)
+        floats = light.astype(np.float32)
+        near(page.ask("relight", {"pattern": (floats, 1.0)})["picture"], exact)
+
+
+def test_bounces_of_a_picture_and_of_the_pattern(colour):
+    A = colour.to_numpy().astype(np.float64)
+    F = np.einsum("cii->ci", A)
+    light = random.random((*colour.grid, 3)).astype(np.float32)
+    with viewing(colour, colour @ light) as page:
+        page.ask("relight", {"pattern": (light, 1.0)})
+        for fields in ({"of": "picture", "picture": 1}, {"of": "pattern"}, {}):
+            found = page.ask("bounces", count=2, **fields)
+            rest, shares = np.einsum("cij,jc->ic", A, light.reshape(-1, 3)), []
+            total = rest.sum()
+            for name in ("direct", "bounce_1", "bounce_2"):
+                b = np.stack([F[c] * np.linalg.solve(A[c], rest[:, c]) for c in range(3)], axis=1)
+                np.testing.assert_allclose(found[name].reshape(-1, 3), b, rtol=0, atol=4e-3 * rest.max())
+                assert found[f"{name}_std"].shape == found[name].shape
+                rest = rest - b
+                shares.append(b.sum() / total)
+            np.testing.assert_allclose(found["shares"], [*shares, rest.sum() / total], atol=4e-3)
+
+
+def test_a_compensation_and_its_downloads(colour, tmp_path):
+    pattern = 0.2 + 0.6 * random.random((*colour.grid, 3))
+    desired = (colour @ pattern).astype(np.float32)
+    with viewing(colour, {"wanted": desired}) as page:
+        found = page.ask("compensate", picture=1)
+        exact = np.linalg.solve(whole(colour), desired.ravel())
+        np.testing.assert_allclose(found["pattern"].ravel(), exact, atol=0.02)
+        near(found["target"], desired)
+        np.testing.assert_allclose(found["appearance"].ravel(), desired.ravel(), atol=0.02 * desired.max())
+        assert not found["out_of_reach"].any()
+        assert found["gain"] == 1.0
+        assert found["clipped"] == 0.0
+        assert found["method"] == "direct"
+        assert found["products"] == 0
+        assert found["seconds"] > 0
+        assert found["residuals"][-1] <= 1e-2
+        files = {}
+        for name in (
+            "pattern.exr",
+            "appearance.exr",
+            "target.exr",
+            "pattern.png",
+            "codes.png",
+            "report.json",
+        ):
+            with urllib.request.urlopen(f"{page.url}result/{name}") as response:  # noqa: S310
+                (tmp_path / name).write_bytes(response.read())
+                files[name] = response.headers["Content-Type"]
+        assert files["pattern.exr"] == "image/x-exr"
+        assert files["codes.png"] == "image/png"
+        light = images.read(tmp_path / "pattern.exr")
+        near(found["pattern"], light)
+        codes = np.rint(255 * images.to_srgb(light))
+        np.testing.assert_array_equal(images.read_codes(tmp_path / "codes.png"), codes)
+        np.testing.assert_array_equal(images.read_codes(tmp_path / "pattern.png"), codes)
+        written = json.loads((tmp_path / "report.json").read_text())
+        assert written.items() >= {"picture": "wanted", "error": found["error"], "gain": 1.0}.items()
+
+        brighter = page.ask("compensate", picture=1, gain="auto", bounds=[0, 2])
+        assert brighter["gain"] > 1.9
+        assert brighter["pattern"].max() <= 2.0
+        too_bright = page.ask("compensate", picture=1, gain=5.0)
+        assert too_bright["clipped"] > 0.1
+        assert too_bright["out_of_reach"].max() > 0
+
+
+def test_a_T_without_first_bounce_compensates_but_does_not_separate(device):
+    T = TRANSPORTS["rectangular"]()
+    with viewing(T, T @ np.full(T.grid, 0.5)) as page:
+        assert "camera_grid" in page.ask("bounces")["error"]
+        assert page.ask("compensate", picture=1)["error"] < 0.02
+
+
+def upload(page: Page, name: str, content: bytes) -> dict[str, Any]:
+    headers = {"Origin": page.origin}
+    request = urllib.request.Request(f"{page.url}picture?name={name}", content, headers)  # noqa: S310
+    try:
+        return json.load(urllib.request.urlopen(request))  # noqa: S310
+    except urllib.error.HTTPError as error:
+        return json.load(error)
+
+
+def png(codes: np.ndarray) -> bytes:
+    Image.fromarray(codes).save(file := io.BytesIO(), "PNG")
+    return file.getvalue()
+
+
+def test_uploads_are_relit_and_wrong_ones_refused(colour):
+    codes = random.integers(0, 256, (*colour.grid, 3), dtype=np.uint8)
+    with viewing(colour) as page:
+        told = upload(page, "a%20b.png", png(codes))
+        assert told == {"picture": 1, "name": "a b.png", "shape": [*codes.shape]}
+        assert page.ask("pictures")["pictures"] == [{"picture": 1, "name": "a b.png"}]
+        near(
+            page.ask("relight", picture=1)["picture"], whole(colour) @ images.from_srgb(codes / 255.0).ravel()
+        )
+        assert upload(page, "large.png", png(np.zeros((40, 50), np.uint8)))["shape"] == [40, 50, 1]
+        assert page.ask("relight", picture=2)["picture"].max() == 0
+        for name, content in {"a.txt": b"text", "a.png": b"text", "a.exr": b"text", "": b"x"}.items():
+            assert list(upload(page, name, content)) == ["error"]
+        for number in range(3, 25):
+            upload(page, f"{number}.png", png(codes))
+        kept = page.ask("pictures")["pictures"]
+        assert [each["picture"] for each in kept] == list(range(25 - answers.UPLOADS, 25))
+
+
+def test_projector_windows_show_what_is_relit_and_compensated(colour):
+    codes = random.integers(0, 256, (*colour.grid, 3), dtype=np.uint8)
+    with viewing(colour, colour @ np.full(colour.grid, 0.5)) as page, Page(page.url) as window:
+        assert window.ask("projector")["do"] == "projector"
+        np.testing.assert_array_equal(window.next()["codes"], np.full((*colour.grid, 1), 255))
+        page.ask("relight", {"pattern": (codes, 1.0)})
+        np.testing.assert_array_equal(window.next()["codes"], codes)
+        found = page.ask("compensate", picture=1, bounds=[0, 2])
+        pushed = window.next()
+        assert pushed["do"] == "show"
+        np.testing.assert_allclose(pushed["codes"], 255 * images.to_srgb(found["pattern"] / 2), atol=0.6)
+
+
+def test_a_measured_T_shows_the_codes_of_its_projector(device, tmp_path):
+    from ltcl.acquisition import Setup, VirtualRig
+
+    rig = VirtualRig(np.eye(64) / 2, (8, 8), ambient=0.1)
+    T = ltcl.acquire(rig, geometry="aligned", store=tmp_path / "T.zarr")
+    setup = Setup.of(tmp_path / "T.zarr")
+    light = random.random(T.grid).astype(np.float32)
+    with viewing(T, setup=setup) as page:
+        assert page.hello["measured"]
+        page.ask("relight", {"pattern": (light[..., None], 1.0)})
+        page.send("projector")
+        while (pushed := page.next())["do"] != "show":
+            pass
+        np.testing.assert_array_equal(pushed["codes"][..., 0], np.rint(255 * setup.codes(light)))
+
+
+@pytest.mark.parametrize(
+    ("do", "fields", "word"),
+    [
+        ("column", {"pixel": [6, 0]}, "pixel"),
+        ("column", {"pixel": [-1, 0]}, "pixel"),
+        ("row", {"pixel": [0.5, 0]}, "pixel"),
+        ("row", {"pixel": [True, 0]}, "pixel"),
+        ("row", {"pixel": "00"}, "pixel"),
+        ("row", {}, "pixel"),
+        ("row", {"pixel": [0, 0], "more": 1}, "more"),
+        ("relight", {"pattern": [[1, 2]]}, "pattern"),
+        ("bounces", {"count": 17}, "count"),
+        ("bounces", {"of": "light"}, "of"),
+        ("bounces", {"callback": 1}, "callback"),
+        ("compensate", {"picture": 7}, "picture"),
+        ("compensate", {"picture": 1, "bounds": [1, 0]}, "bounds"),
+        ("compensate", {"picture": 1, "bounds": [0, float("nan")]}, "bounds"),
+        ("compensate", {"picture": 1, "gain": "most"}, "gain"),
+        ("compensate", {"picture": 1, "method": "magic"}, "method"),
+    ],
+)
+def test_wrong_questions_get_one_line_and_the_next_one_is_answered(colour, do, fields, word):
+    with viewing(colour, np.ones(colour.grid)) as page:
+        line = page.ask(do, **fields)["error"]
+        assert word in line
+        assert "\n" not in line
+        assert "internal" not in line
+        assert "picture" in page.ask("column", pixel=[0, 0])
+
+
+class Slow:
+    """In the place of `separate`: 500 steps of 10 ms."""
+
+    def __init__(self) -> None:
+        self.steps, self.begun = 0, threading.Event()
+
+    def __call__(self, T: Any, image: Any, count: int, callback: Any) -> Any:
+        for step in range(500):
+            self.steps += 1
+            self.begun.set()
+            time.sleep(0.01)
+            callback(step, 1.0)
+        raise errors.ConvergenceError("the end")
+
+
+@pytest.fixture
+def slow(monkeypatch) -> Slow:
+    monkeypatch.setattr(answers, "separate", slow := Slow())
+    return slow
+
+
+def test_a_long_solve_lets_others_by_and_tells_how_far_it_is(colour, slow):
+    with viewing(colour) as page, Page(page.url) as other:
+        number = page.send("bounces")
+        slow.begun.wait()
+        for _ in range(5):
+            assert "picture" in other.ask("column", pixel=[0, 0])
+            assert "picture" in page.ask("column", pixel=[0, 0])
+        told = page.next()
+        assert told.items() >= {"do": "progress", "id": number, "step": "bounces"}.items()
+        assert slow.steps < 500
+
+
+def test_what_is_asked_again_takes_the_place_of_what_waits_or_runs(colour, slow):
+    with viewing(colour) as page:
+        page.send("bounces")
+        slow.begun.wait()
+        page.send("bounces", of="pattern")
+        last = page.send("bounces", of="nothing")
+        while (found := page.next())["do"] == "progress":
+            pass
+        assert found.items() >= {"id": last, "do": "bounces"}.items()
+        assert slow.steps < 500
+
+
+def test_nothing_is_computed_for_who_has_gone(colour, slow):
+    with viewing(colour) as page:
+        with Page(page.url) as other:
+            other.send("bounces")
+            slow.begun.wait()
+        assert "picture" in page.ask("column", pixel=[0, 0])
+        time.sleep(0.2)
+        steps = slow.steps
+        time.sleep(0.2)
+        assert slow.steps == steps
+
+
+def test_painting_never_queues(colour):
+    codes = random.integers(0, 256, (*colour.grid, 3), dtype=np.uint8)
+    with viewing(colour) as page:
+        last = [page.send("relight", {"pattern": (codes, 1.0)}) for _ in range(500)][-1]
+        count = 1
+        while page.next()["id"] != last:
+            count += 1
+        assert count < 500
+
+
+def test_close_ends_it_also_amid_a_solve(colour, slow):
+    with ltcl.view(colour, open_browser=False) as viewer:
+        page = Page(viewer.url)
+        page.send("bounces")
+        slow.begun.wait()
+        start = time.monotonic()
+    assert time.monotonic() - start < 4
+    with pytest.raises(ConnectionClosed):  # behind what was said before
+        _ = [page.next() for _ in range(100)]
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(viewer.url)  # noqa: S310
+
+
+def test_a_viewer_in_a_notebook_is_a_frame(colour):
+    async def cell() -> None:
+        with ltcl.view(colour, open_browser=False) as viewer:
+            assert f'src="{viewer.url}"' in viewer._repr_html_()
+            assert viewer.url in repr(viewer)
+
+    asyncio.run(cell())
+
+
+def test_an_address_that_cannot_be_had_is_refused(colour):
+    with ltcl.view(colour, open_browser=False) as viewer:
+        port = int(viewer.url.split(":")[2].split("/")[0])
+        for host, wrong in (("127.0.0.1", port), ("127.0.0.1", -1), ("127.0.0.1", 1 << 17), ("256.1.1.1", 0)):
+            with pytest.raises(errors.InputError, match="port"):
+                ltcl.view(colour, host=host, port=wrong, open_browser=False)
+
+
+def test_the_command_runs_until_ctrl_c(tmp_path):
+    ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(6) / 2, (2, 3)))
+    images.write(tmp_path / "wanted.png", np.full((2, 3), 0.3))
+    words = [
+        sys.executable,
+        "-m",
+        "ltcl",
+        "view",
+        tmp_path / "T.npz",
+        tmp_path / "wanted.png",
+        "--no-browser",
+    ]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        url = process.stderr.readline().split()[0]
+        with Page(url) as page:
+            assert page.hello.items() >= {"title": "T.npz", "pictures": ["wanted.png"]}.items()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+
+
+def test_without_the_extra_ltcl_imports_and_says_how_to_get_it():
+    code = "import sys; sys.modules['starlette'] = None; import ltcl, numpy; "
+    code += "ltcl.view(ltcl.Transport(numpy.eye(2), (1, 2)))"
+    words, folder = [sys.executable, "-c", code], Path(ltcl.__file__).parents[1]
+    run = subprocess.run(words, capture_output=True, text=True, cwd=folder)
+    assert run.stderr.splitlines()[-1].endswith("pip install 'ltcl[view]'")
