@@ -131,7 +131,7 @@ def playing(browser: Browser, T: ltcl.Transport, folder: Path, given: Options) -
     return facts
 
 
-def nothing(*_: Any) -> None:
+def nothing(*_: Any, **__: Any) -> None:
     """Progress that is not drawn."""
 
 

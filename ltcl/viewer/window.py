@@ -139,6 +139,6 @@ def play(
         facts |= {"frames_per_second": shown / (now() - start), "latency": median(late or [0.0])}
         text = "{frames_per_second:.1f} frames/s, {dropped} dropped, latency {latency:.3f} s".format(**facts)
         window.title = f"{title}: {text}"
-        progress(text, frame.number, film.count)
+        progress("playing", frame.number, film.count, detail=f": {text}")
     window.wait(_PAUSE)
     return facts

@@ -208,7 +208,7 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(device, tmp_path: P
     pictures = [frame.picture() for frame in source]
     with Window("film", open_browser=False) as window, looking(window.url, slow) as shown:
         scene = Scene(T, "T", {}, None)
-        facts = play(scene, source, window, 0.5, lambda *what: told.append(what), rtol=1e-4)
+        facts = play(scene, source, window, 0.5, lambda *what, detail: told.append(what), rtol=1e-4)
         window.close()
     expected = [scene.codes(ltcl.compensate(T, each, gain=0.5, rtol=1e-4).pattern, 1.0) for each in pictures]
     numbers = [number - 1 for _, number, _ in told]
