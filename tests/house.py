@@ -44,7 +44,7 @@ _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1219, "images": 500, "batch": 577, "cli": 2009, "scenes": 2710}
+_OTHERS = {"acquisition": 6310, "store": 1219, "images": 500, "batch": 577, "cli": 2000, "scenes": 2710}
 _PAST = ("cluster", "operators/parts", "operators/distributed", "batch/scenes")
 _TESTS_PAST = (
     "batch/test_cluster",
@@ -70,7 +70,7 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     # Clusters, ranks, several devices and disks, as far as they have files of their own; about 300 lines more
     # are in other parts, mostly batch and cli: 900 are to be enough for all.
-    "past one machine": (825, [f"ltcl/{name}.py" for name in _PAST]),
+    "past one machine": (830, [f"ltcl/{name}.py" for name in _PAST]),
     "tests past one machine": (1100, [f"tests/{name}.py" for name in _TESTS_PAST]),
     # 700 were asked for; `ltcl show` moved here, 30 lines.
     "viewer, without its page": (1175, ["ltcl/viewer", "ltcl/cli/view.py"]),
