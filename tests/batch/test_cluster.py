@@ -22,7 +22,7 @@ import ltcl
 from ltcl import images
 from ltcl.batch import compensate_frames
 from ltcl.cli.main import main
-from ltcl.cluster import stream
+from ltcl.cluster import connect, stream
 from ltcl.errors import BatchError, ClusterError, FileError, InputError, InputTypeError
 from tests.problems import lambertian
 
@@ -340,3 +340,12 @@ def test_a_cluster_that_is_none_is_refused_in_one_line(film, tmp_path, capsys, o
     error = capsys.readouterr().err
     assert (text in error, error.count("\n")) == (True, 1), error
     assert not (tmp_path / "out").exists()
+
+
+def test_local_workers_have_the_compute_units_of_a_serial_run():
+    """Else sums are rounded in another order, and codes of large patterns differ."""
+    units = ltcl.open_device().compute_units
+    with connect("local", 2) as client:
+        client.wait_for_workers(2)
+        found: Any = client.run(lambda: importlib.import_module("ltcl").open_device().compute_units)
+    assert [*found.values()] == [units, units]
