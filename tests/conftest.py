@@ -58,7 +58,7 @@ def small_device(device: Device) -> Device:
     return small
 
 
-@pytest.fixture(scope="module", params=["cpu", "gpu"])
+@pytest.fixture(scope="session", params=["cpu", "gpu"])
 def shaped(request: pytest.FixtureRequest, device: Device) -> Device:
     """The same hardware; kernels are launched as on a CPU or as on a GPU."""
     other = Device(device.description)

@@ -25,7 +25,7 @@ from tests.store.stores import contents
 from .stopping import SETTINGS, acquire_and_end, set_up
 
 random = np.random.default_rng()
-KILLS = int(os.environ.get("LTCL_KILLS", "9"))
+KILLS = int(os.environ.get("LTCL_KILLS", "3"))
 STATUS = {"SIGKILL": -signal.SIGKILL, "Ctrl-C": 2}
 FINAL, HALF = ("pixel", "adaptive"), ("pixel, half done", "adaptive, half done")
 

@@ -30,7 +30,7 @@ METHODS = {"sor": 1.3, "block_gauss_seidel": None}  # omega
 SHAPES = {"cpu": 1, "gpu7": 7, "gpu64": 64, "gpu256": 256}  # items of a work-group
 
 
-@pytest.fixture(params=SHAPES)
+@pytest.fixture(scope="module", params=SHAPES)
 def launch(request, device) -> tuple[Device, int]:
     """A device whose kernels are launched as on a CPU or a GPU, and the size of its work-groups."""
     if request.param == "cpu" and not device.is_cpu:
@@ -43,7 +43,7 @@ def launch(request, device) -> tuple[Device, int]:
 def matrix_of(launch: tuple[Device, int], form: str, name: str) -> tuple[CSR | Dense, np.ndarray]:
     """R on the device, some in slabs, and I - R."""
     M, device = MATRICES[name], launch[0]
-    device.max_allocation = SMALL if "slabs" in name else device.max_allocation
+    device.max_allocation = SMALL if "slabs" in name else device.description.max_allocation
     R = helpers.FORMATS[form](device, M)
     assert (len(R.slabs) > 1) == ("slabs" in name)
     return R, np.eye(len(M)) - M.astype(np.float64)
