@@ -89,6 +89,8 @@ class Scene:
             light = self.pattern if picture is None else self._picture(picture)[2]
         else:
             pattern = checks.shape("pattern", checks.real("pattern", pattern), self.T.grid, (*self.T.grid, 3))
+            if self.T.channels == 1 and pattern.ndim == 3 and (pattern == pattern[..., :1]).all():
+                pattern = pattern[..., 0]  # a product in place of three
             light = to_linear(pattern, "auto")
         seen = self.T @ light
         if light is not self.pattern:

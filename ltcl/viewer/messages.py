@@ -6,7 +6,8 @@ padded with spaces so that arrays begin at multiples of 4, then the arrays, each
 
     {"id": 7, "do": "relight", "arrays": [{"name": "pattern", "shape": [h, w, c], "dtype": "f2", "scale": s}]}
 
-Values are scale * numbers. Half floats are scaled by the largest value, so that none overflows.
+Values are scale * numbers. Half floats are scaled by the largest value, so that none overflows. A fourth
+channel, alpha of a canvas, is left out.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]
                 scale = np.float32(checks.number("scale", entry["scale"], most=1e38))
                 with np.errstate(over="ignore"):
                     values = checks.finite("arrays", values.astype(np.float32) * scale)
-            arrays[str(entry["name"])] = values[..., 0] if c == 1 else values
+            arrays[str(entry["name"])] = values[..., 0] if c == 1 else values[..., : 3 if c == 4 else c]
     except LtclError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:

@@ -330,6 +330,100 @@ def test_pictures_and_spots_relight(
     shows(page, "relight-seen", T @ painted(page))
 
 
+class Late:
+    """The first answer of a kind comes when `come` is set; `asked` is set when it has been computed."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, viewer: Any, do: str) -> None:
+        self.come, self.asked, self._answer = threading.Event(), threading.Event(), viewer._scene.answer
+        self._do = do
+        monkeypatch.setattr(viewer._scene, "answer", self)
+
+    def __call__(self, do: str, asked: dict[str, Any], callback: Any) -> Any:
+        reply = self._answer(do, asked, lambda *_: None)
+        if do == self._do and not self.asked.is_set():
+            self.asked.set()
+            assert self.come.wait(PATIENCE)
+        return reply
+
+
+def settle(page: Page) -> None:
+    """All is answered, and nothing is asked because of it."""
+    page.wait_for_timeout(300)
+    page.wait_for_selector("body[data-state=ready]")
+
+
+def test_a_late_pattern_of_the_server_replaces_nothing(
+    page: Page, viewer: Any, T: ltcl.Transport, picture: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = Late(monkeypatch, viewer, "relight")
+    page.locator("#tab-relight").click()
+    assert late.asked.wait(PATIENCE)
+    page.locator("#relight-source").select_option("landscape")
+    late.come.set()
+    shows(page, "relight-seen", T @ picture)
+    settle(page)
+    shows(page, "relight-seen", T @ picture)
+    np.testing.assert_allclose(viewer._scene.pattern, picture, atol=1e-6)
+
+    viewer._scene.pattern = white = np.ones(T.grid, np.float32)
+    page.locator("#tab-probe").click()
+    settle(page)
+    late = Late(monkeypatch, viewer, "relight")
+    page.locator("#tab-relight").click()
+    assert late.asked.wait(PATIENCE)
+    page.locator("#tab-probe").click()  # where nothing is to be painted
+    late.come.set()
+    settle(page)
+    assert viewer._scene.pattern is white
+    late = Late(monkeypatch, viewer, "relight")
+    page.locator("#tab-relight").click()
+    assert late.asked.wait(PATIENCE)
+    page.locator("#relight-colour").fill("#00ff00")
+    page.locator("#relight-fill").click()
+    late.come.set()
+    green = np.full((*T.grid, 3), (0.0, 1.0, 0.0), np.float32)
+    shows(page, "relight-seen", T @ green)
+    settle(page)
+    np.testing.assert_array_equal(painted(page), green)
+    np.testing.assert_allclose(viewer._scene.pattern, green)
+
+
+def test_late_bounces_leave_newer_sliders(
+    page: Page, viewer: Any, T: ltcl.Transport, picture: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page.locator("#tab-bounces").click()
+    shows(page, "bounces-mix", picture)
+    late = Late(monkeypatch, viewer, "bounces")
+    page.locator("#tab-probe").click()
+    page.locator("#tab-bounces").click()
+    assert late.asked.wait(PATIENCE)
+    page.locator("#bounces-0").fill("0")
+    late.come.set()
+    settle(page)
+    shows(page, "bounces-mix", picture - ltcl.separate(T, picture, 4).direct)
+    assert page.locator("#bounces-0").input_value() == "0"
+
+
+def test_late_compensation_is_not_that_of_another_picture(
+    browser: Browser, T: ltcl.Transport, picture: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dim = 0.5 * picture[::-1]
+    pictures = {"bright": picture, "dim": dim}
+    with browser.new_context() as context, ltcl.view(T, pictures, open_browser=False) as viewer:
+        page, late = context.new_page(), Late(monkeypatch, viewer, "compensate")
+        page.goto(f"{viewer.url}#compensate")
+        assert late.asked.wait(PATIENCE)
+        page.evaluate(
+            """() => { const target = document.getElementById("compensate-target-canvas"); window.drawn = 0;
+            new MutationObserver(() => { window.drawn++; })
+              .observe(target, { attributes: true, attributeFilter: ["data-frame"] }); }"""
+        )
+        page.locator("#compensate-source").select_option("dim")
+        late.come.set()
+        shows(page, "compensate-target", ltcl.compensate(T, dim, gain="auto").target)
+        assert page.evaluate("window.drawn") == 1
+
+
 def test_compensation(page: Page, T: ltcl.Transport, picture: np.ndarray, tmp_path: Path) -> None:
     page.locator("#tab-compensate").click()
     c = ltcl.compensate(T, picture, gain="auto")

@@ -9,14 +9,16 @@ const SECONDS = 1.2; // of a step of the film
 export function bounces({ $, ask, press, hello }) {
   const mix = new Panel($("bounces-mix"), { title: "Mixed light", grid: hello.camera_grid });
   const deviation = new Layers(), stack = $("bounces-stack"), source = $("bounces-source");
-  let sliders = [], film = null;
+  let sliders = [], film = null, turn = 0;
   if (source.options.length > 1) source.selectedIndex = 1;
 
   async function separate() {
+    const own = ++turn;
+    set(() => 1);
     const count = Number($("bounces-count").value);
     const of = source.value ? { of: "picture", picture: Number(source.value) } : { of: "pattern" };
     const answer = await ask("bounces", { ...of, count });
-    if (!answer) return;
+    if (!answer || own !== turn) return;
     const names = ["direct", ...Array.from({ length: count }, (_, k) => `bounce_${k + 1}`), "rest"];
     const pictures = names.map((name) => answer.arrays[name]);
     const known = "direct_std" in answer.arrays;
@@ -40,6 +42,7 @@ export function bounces({ $, ask, press, hello }) {
     title.firstElementChild.textContent = name;
     title.lastElementChild.textContent = `${(100 * share).toPrecision(2)} % of the light` +
       (times > 1.5 ? `, shown ${times < 10 ? times.toFixed(1) : Math.round(times)}× brighter` : "");
+    slider.value = sliders[k]?.slider.value ?? 1; // moved while this was computed
     layers.set([picture]);
     draw(canvas, layers, { white, mode: 0, logarithmic: false, weights: [1] });
     layers.clear();

@@ -36,8 +36,9 @@ export function compensate({ $, ask, hello }) {
     if (!auto.checked) $("compensate-gain-value").textContent = gain.value;
     const bounds = [low, high].map(({ value }) => Number(value));
     const level = auto.checked ? "auto" : Number(gain.value);
-    const answer = await ask("compensate", { picture: Number(source.value), gain: level, bounds });
-    if (!answer) return;
+    const picture = source.value;
+    const answer = await ask("compensate", { picture: Number(picture), gain: level, bounds });
+    if (!answer || picture !== source.value) return;
     const { arrays } = answer, white = arrays.target.white();
     wipe.note = "without ◂ ▸ with compensation";
     wipe.show([arrays.appearance, arrays.uncompensated], [1, 0], white);
@@ -47,7 +48,7 @@ export function compensate({ $, ask, hello }) {
     reach.show(arrays.out_of_reach, [1], Math.max(missed, white / 50));
     reach.note = missed ? "" : "nothing";
     if (wipe.wipe === undefined) part(0.5);
-    if (auto.checked) {
+    if (auto.checked && level === "auto") {
       gain.value = answer.gain;
       $("compensate-gain-value").textContent = answer.gain.toPrecision(2);
     }

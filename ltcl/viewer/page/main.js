@@ -140,7 +140,7 @@ async function known() {
   if (answer) app.pictures = answer.pictures;
   for (const select of document.querySelectorAll("select[id$=source]")) {
     const chosen = select.value, first = select.dataset.first ? [new Option(select.dataset.first, "")] : [];
-    select.replaceChildren(...first, ...app.pictures.map(({ picture, name }) => new Option(name, picture)));
+    select.replaceChildren(...first, ...(app.pictures ?? []).map(({ picture, name }) => new Option(name, picture)));
     select.value = chosen;
     if (select.selectedIndex < 0) select.selectedIndex = 0;
   }
@@ -148,15 +148,16 @@ async function known() {
 
 // Give a file to the view in sight: it takes it itself, or the server does, and the view gets its number.
 async function open(file) {
-  if (await views[current].take?.(file)) return;
+  const view = current;
+  if (await views[view].take?.(file)) return;
   document.body.dataset.state = "busy";
   const answer = await fetch(`picture?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
   if (!answer.ok) say(`${file.name}: ${await answer.text()}`);
   else {
     const { picture } = await answer.json();
     await known();
-    const select = $(`${current}-source`);
-    if (!select) return;
+    const select = $(`${view}-source`);
+    if (!select || view !== current) return;
     select.value = picture;
     select.dispatchEvent(new Event("change"));
   }

@@ -14,7 +14,7 @@ export function relight({ $, ask, press, hello }) {
   const seen = new Panel($("relight-seen"), { title: "What the camera sees", grid: hello.camera_grid });
   const paint = canvas().getContext("2d", { willReadFrequently: true });
   const past = [], video = document.createElement("video");
-  let erasing = false, last = null, changed = false, sending = 0, motion = null;
+  let erasing = false, last = null, changed = false, sending = 0, motion = null, turn = 0;
   Object.assign(video, { muted: true, loop: true, playsInline: true });
   paint.lineCap = "round";
   const size = $("relight-size"), source = $("relight-source");
@@ -24,17 +24,7 @@ export function relight({ $, ask, press, hello }) {
 
   const linear = (code) => (code <= 10 ? code / 255 / 12.92 : ((code / 255 + 0.055) / 1.055) ** 2.4);
 
-  function codes() {
-    const rgba = paint.getImageData(0, 0, w, h).data, rgb = new Uint8Array(3 * h * w);
-    let grey = hello.channels === 1;
-    for (let i = 0, k = 0; i < rgba.length; i += 4, k += 3) {
-      rgb[k] = rgba[i];
-      rgb[k + 1] = rgba[i + 1];
-      rgb[k + 2] = rgba[i + 2];
-      grey &&= rgba[i] === rgba[i + 1] && rgba[i] === rgba[i + 2];
-    }
-    return new Pixels(grey ? rgb.filter((_, k) => k % 3 === 0) : rgb, [h, w, grey ? 1 : 3], 1, "u1");
-  }
+  const codes = () => new Pixels(paint.getImageData(0, 0, w, h).data, [h, w, 4], 1, "u1");
 
   const show = (light) => seen.show(light, [1], light.white(0.97)); // bounces are darker than what is lit
 
@@ -70,8 +60,9 @@ export function relight({ $, ask, press, hello }) {
     last = [row, col];
   }
 
-  // Stop what moves, the spot or the video.
+  // Stop what moves, the spot or the video; and what is still to come is too late.
   function still() {
+    turn++;
     cancelAnimationFrame(motion);
     video.pause();
     press($("relight-spot"), false);
@@ -116,15 +107,17 @@ export function relight({ $, ask, press, hello }) {
   }
 
   async function take(file) {
+    still();
+    const own = turn;
     if (file.type.startsWith("video/")) {
       URL.revokeObjectURL(video.src);
       video.src = URL.createObjectURL(file);
       await video.play();
-      animate(() => cover(video, video.videoWidth, video.videoHeight));
+      if (own === turn) animate(() => cover(video, video.videoWidth, video.videoHeight));
       return true;
     }
     const bitmap = await createImageBitmap(file).catch(() => null); // EXR and the like: the server reads them
-    if (!bitmap) return false;
+    if (!bitmap || own !== turn) return Boolean(bitmap);
     begin();
     cover(bitmap, bitmap.width, bitmap.height);
     return true;
@@ -140,8 +133,10 @@ export function relight({ $, ask, press, hello }) {
   }
 
   async function start(fields = {}) {
+    const own = ++turn;
+    changed = false;
     const answer = await ask("relight", fields);
-    if (!answer) return;
+    if (!answer || own !== turn) return;
     show(answer.arrays.picture);
     shown(answer.arrays.pattern);
     pattern.read();
