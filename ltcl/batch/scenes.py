@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import builtins
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ltcl.cluster import stream
@@ -51,8 +49,7 @@ def map(
         except LtclError as error:
             return type(error)(*error.args)  # without what it holds, which may lie on a device
 
-    each = builtins.map if client is None else partial(stream, client, window=1, share_gpu=share_gpu)
-    for result in each(attempt, scenes):
+    for result in stream(client, attempt, scenes, window=1, share_gpu=share_gpu):
         results.append(result)
         if progress is not None:
             progress("scenes", len(results), len(scenes))
