@@ -99,7 +99,7 @@ def stream(
 def is_there(client: Any, path: Any) -> bool:
     """Whether all workers see a file or folder; None is no file."""
     require(client)
-    return path is not None and all(client.run(os.path.exists, path).values())
+    return path is not None and all(client.run(os.path.exists, path, on_error="ignore").values())
 
 
 def require(client: Any) -> str:
@@ -122,20 +122,19 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
     distributed = _distributed()
     from dask import config
 
-    with contextlib.ExitStack() as stack:
-        address: Any = cluster
-        if cluster == "local":
-            # Else a worker that takes 15 s to start again, on a busy machine, is given up.
-            stack.enter_context(config.set({"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}))
-            address = stack.enter_context(_processes(workers, device))
-        elif workers is not None:
-            raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
+    if cluster != "local" and workers is not None:
+        raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
+    # Else a worker that takes 15 s to start again, on a busy machine, is given up.
+    patience = {"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}
+    place = _processes(workers, device) if cluster == "local" else contextlib.nullcontext(cluster)
+    with place as address, config.set(patience):
         try:
-            client = stack.enter_context(distributed.Client(address, set_as_default=False))
+            client = distributed.Client(address, set_as_default=False)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise ClusterError(f"cluster is {cluster!r}, where no scheduler answers: {reason}") from None
-        yield client
+        with client:
+            yield client
 
 
 def _processes(workers: int | None, device: str | None) -> Any:

@@ -70,7 +70,7 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     # Clusters, ranks, several devices and disks, as far as they have files of their own; about 300 lines more
     # are in other parts, mostly batch and cli: 900 are to be enough for all.
-    "past one machine": (828, [f"ltcl/{name}.py" for name in _PAST]),
+    "past one machine": (826, [f"ltcl/{name}.py" for name in _PAST]),
     "tests past one machine": (1100, [f"tests/{name}.py" for name in _TESTS_PAST]),
     # 700 were asked for; `ltcl show` moved here, 30 lines.
     "viewer, without its page": (1175, ["ltcl/viewer", "ltcl/cli/view.py"]),

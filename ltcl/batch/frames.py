@@ -296,15 +296,15 @@ class _Run:
         self.solver.gain = self.head["gain"]
         taken, waiting = tee(chain(first, batches))
         tasks = (([frame.number for frame, *_ in batch], _stack(batch)) for batch in taken)
-        for (light, *numbers), batch in zip(self.each(self.solver, tasks), waiting, strict=True):
-            with ThreadPoolExecutor(_WRITERS) as writers:
+        with ThreadPoolExecutor(_WRITERS) as writers:
+            for (light, *numbers), batch in zip(self.each(self.solver, tasks), waiting, strict=True):
                 list(writers.map(self._write, (frame.number for frame, *_ in batch), *light))
-            for (frame, digest, _), *others in zip(batch, *numbers, strict=True):
-                self.records[frame.number] = Record(frame.number, frame.name, digest, *others)
-                self.done.add(frame.number)
-            manifest.write(self.folder, self.head, self.records)
-            self.solved += len(batch)
-            yield len(self.done)
+                for (frame, digest, _), *others in zip(batch, *numbers, strict=True):
+                    self.records[frame.number] = Record(frame.number, frame.name, digest, *others)
+                    self.done.add(frame.number)
+                manifest.write(self.folder, self.head, self.records)
+                self.solved += len(batch)
+                yield len(self.done)
         if self.broken:
             named = ", ".join(f"{number} ({why})" for number, why in sorted(self.broken.items())[:_NAMED])
             more = f" and {len(self.broken) - _NAMED} more" if len(self.broken) > _NAMED else ""

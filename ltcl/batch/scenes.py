@@ -53,8 +53,7 @@ def map(
         results.append(result)
         if progress is not None:
             progress("scenes", len(results), len(scenes))
-    errors = {s: r for s, r in zip(scenes, results, strict=True) if isinstance(r, LtclError)}
-    if errors:
-        named = "; ".join(f"{scene}: {error}" for scene, error in errors.items())
-        raise BatchError(f"{len(errors)} of {len(scenes)} scenes failed: {named}", results)
+    failed = [f"{s}: {r}" for s, r in zip(scenes, results, strict=True) if isinstance(r, LtclError)]
+    if failed:
+        raise BatchError(f"{len(failed)} of {len(scenes)} scenes failed: {'; '.join(failed)}", results)
     return results
