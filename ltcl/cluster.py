@@ -231,7 +231,7 @@ class _Crew:
                     patience *= 2.0
                 continue
             if refusal is None:
-                self.tasks.popleft()
+                self.tasks.popleft().future.release()  # tracebacks of waits in vain hold it, too
                 if error is not None:
                     raise error
                 return result
