@@ -175,8 +175,8 @@ def compensate_frames(
     for name, target in {"out": out, "video": video}.items():
         if target is not None and as_path(target).resolve() == opened.path.resolve():
             raise InputError(f"{name} is {target}, where the frames are; it must be another place")
-    settings = {**(compensate.__kwdefaults__ or {}), "gain": gain, "loss": loss, "format": format}
-    settings |= {"batch": checks.count("batch", batch), "appearance": appearance}
+    settings = {**(compensate.__kwdefaults__ or {}), "gain": gain, "loss": loss}
+    settings |= {"batch": checks.count("batch", batch), "format": format, "appearance": appearance}
     settings |= {"encoding": encoding, "resize": resize, **options}
     described = {name: setting(value) for name, value in settings.items() if name != "callback"}
     described["codes"] = codes and curve(codes, T.grid)
