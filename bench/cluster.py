@@ -45,7 +45,7 @@ def cluster(workers: int, cache: Path) -> Iterator[Client]:
 
 
 def pids(client: Client) -> list[int]:
-    answers: Any = client.run(os.getpid)
+    answers: Any = client.run(os.getpid, on_error="ignore")  # of a worker that is ending
     return [*answers.values()]
 
 

@@ -42,7 +42,7 @@ _running = threading.Lock()
 
 
 def stream(
-    client: Client,
+    client: Client | None,
     function: Callable[[Any], Any],
     items: Iterable[Any],
     *,
@@ -53,7 +53,7 @@ def stream(
 
     Parameters
     ----------
-    client : distributed.Client
+    client : distributed.Client, or None: calls are made here, one after the other
     function : callable(item)
         Sent to each worker once, with all it holds, and called by one thread at a time. A worker that cannot
         unpickle it takes no work.
@@ -79,6 +79,9 @@ def stream(
     ...     list(stream(client, abs, [-1, -2, 3]))
     [1, 2, 3]
     """
+    if client is None:
+        yield from map(function, items)
+        return
     crew = _Crew(client, require(client), _pickled(function), share_gpu)
     window = checks.count("window", window)
     try:
@@ -91,6 +94,12 @@ def stream(
             yield crew.result()
     finally:
         crew.leave()
+
+
+def is_there(client: Any, path: Any) -> bool:
+    """Whether all workers see a file or folder; None is no file."""
+    require(client)
+    return path is not None and all(client.run(os.path.exists, path, on_error="ignore").values())
 
 
 def require(client: Any) -> str:
@@ -113,21 +122,19 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
     distributed = _distributed()
     from dask import config
 
-    with contextlib.ExitStack() as stack:
-        address: Any = cluster
-        if cluster == "local":
-            # Else a worker that takes 15 s to start again, on a busy machine, is given up.
-            patience = {"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}
-            stack.enter_context(config.set(patience))
-            address = stack.enter_context(_processes(workers, device))
-        elif workers is not None:
-            raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
+    if cluster != "local" and workers is not None:
+        raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
+    # Else a worker that takes 15 s to start again, on a busy machine, is given up.
+    patience = {"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}
+    place = _processes(workers, device) if cluster == "local" else contextlib.nullcontext(cluster)
+    with place as address, config.set(patience):
         try:
-            client = stack.enter_context(distributed.Client(address, set_as_default=False))
+            client = distributed.Client(address, set_as_default=False)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise ClusterError(f"cluster is {cluster!r}, where no scheduler answers: {reason}") from None
-        yield client
+        with client:
+            yield client
 
 
 def _processes(workers: int | None, device: str | None) -> Any:
@@ -139,12 +146,10 @@ def _processes(workers: int | None, device: str | None) -> Any:
     devices = itertools.cycle(gpus or [device or open_device().description.index])
     local = {"host": "127.0.0.1", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
     alike = {**local, "nthreads": 1, "memory_limit": 0, "silence_logs": quiet}
-    nannies = {}
-    for number, name in zip(range(count), devices, strict=False):
-        options = {**alike, "env": {"LTCL_DEVICE": name}}
-        nannies[number] = {"cls": distributed.Nanny, "options": options}
+    environments = ({"LTCL_DEVICE": next(devices)} for _ in range(count))
+    nannies = ({"cls": distributed.Nanny, "options": {**alike, "env": each}} for each in environments)
     scheduler = {"cls": distributed.Scheduler, "options": local}
-    return distributed.SpecCluster(nannies, scheduler, silence_logs=quiet)
+    return distributed.SpecCluster(dict(enumerate(nannies)), scheduler, silence_logs=quiet)
 
 
 def _distributed() -> Any:
@@ -226,7 +231,7 @@ class _Crew:
                     patience *= 2.0
                 continue
             if refusal is None:
-                self.tasks.popleft()
+                self.tasks.popleft().future.release()  # tracebacks of waits in vain hold it, too
                 if error is not None:
                     raise error
                 return result
@@ -242,8 +247,6 @@ class _Crew:
 
     def look(self) -> None:
         """Forget workers that have gone, ask new ones; ClusterError where none can be expected."""
-        from ltcl import __version__  # here, because it is set after this module is imported
-
         running = self.client.status == "running"
         if running and self.ready and time.monotonic() < self.looked + _PERIOD:
             return
@@ -252,7 +255,7 @@ class _Crew:
             if running:
                 there = [*self.client.nthreads()]
                 new = [each for each in there if each not in self.ready and each not in self.excluded]
-                question = __version__, self.token, self.function
+                question = importlib.import_module("ltcl").__version__, self.token, self.function
                 answers = self.client.run(_ask(), *question, workers=new, on_error="return")
         if answers is None:
             raise ClusterError(f"the scheduler at {self.scheduler} was lost")

@@ -33,7 +33,7 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "operators": (2599, ["ltcl/operators"]),
     "solvers": (2800, ["ltcl/solvers"]),
     "theory and diagnostics": (1100, ["ltcl/theory", "ltcl/diagnostics.py"]),
-    "compression": (1700, ["ltcl/compression"]),
+    "compression": (1698, ["ltcl/compression"]),
     "compensation, separation, relighting, analysis": (1370, _TASKS),
     # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
     "noise": (1406, _NOISE),
@@ -44,7 +44,7 @@ _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1219, "images": 500, "batch": 577, "cli": 2000, "scenes": 2710}
+_OTHERS = {"acquisition": 6310, "store": 1219, "images": 500, "batch": 530, "cli": 2000, "scenes": 2710}
 _PAST = ("cluster", "operators/parts", "operators/distributed", "batch/scenes")
 _TESTS_PAST = (
     "batch/test_cluster",
@@ -68,9 +68,9 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     "tests of noise": (1300, ["tests/noise"]),
     "benches of the core": (1750, [f"bench/{name}.py" for name in _BENCHES.split()]),
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
-    # Clusters, ranks, several devices and disks, as far as they have files of their own; about 300 lines more
+    # Clusters, ranks, several devices and disks, as far as they have files of their own; about 200 lines more
     # are in other parts, mostly batch and cli: 900 are to be enough for all.
-    "past one machine": (830, [f"ltcl/{name}.py" for name in _PAST]),
+    "past one machine": (826, [f"ltcl/{name}.py" for name in _PAST]),
     "tests past one machine": (1100, [f"tests/{name}.py" for name in _TESTS_PAST]),
     # 700 were asked for; `ltcl show` moved here, 30 lines.
     "viewer, without its page": (1177, ["ltcl/viewer", "ltcl/cli/view.py"]),

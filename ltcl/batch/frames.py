@@ -10,30 +10,28 @@ is missing from a batch is solved alone, to the same tolerance: the rest after `
 from __future__ import annotations
 
 import copy
-import inspect
 import os
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import islice
+from itertools import chain, islice, repeat, tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ltcl import checks, images, layout
-from ltcl.batch.manifest import NAME, Manifest, OtherRun, Record, curve, identity, locked, setting
-from ltcl.cluster import require as require_client
-from ltcl.cluster import stream
+from ltcl.batch import manifest
+from ltcl.batch.manifest import OtherRun, Record, curve, identity, locked, setting
+from ltcl.cluster import is_there, stream
 from ltcl.compensation import compensate, problem
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
-from ltcl.files import as_path
+from ltcl.files import as_path, read_ahead
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
 from ltcl.images.pictures import Encoding
+from ltcl.report import versions
 from ltcl.solvers import Inverse
 from ltcl.solvers.auto import SMALL, survey
 from ltcl.transport import Transport, error_note, require, resolve_reference
@@ -41,6 +39,7 @@ from ltcl.transport import Transport, error_note, require, resolve_reference
 if TYPE_CHECKING:
     from distributed import Client
 
+_Read = tuple[Frame, str, np.ndarray]  # a frame, its digest and its picture
 _USUAL_FPS = 25.0
 _NAMED = 5  # broken frames, in an error
 _WRITERS = 4  # threads: files are compressed and flushed side by side
@@ -176,26 +175,19 @@ def compensate_frames(
     for name, target in {"out": out, "video": video}.items():
         if target is not None and as_path(target).resolve() == opened.path.resolve():
             raise InputError(f"{name} is {target}, where the frames are; it must be another place")
-    parameters = inspect.signature(compensate).parameters.values()
-    settings = {each.name: each.default for each in parameters if each.kind is each.KEYWORD_ONLY}
-    settings |= {"gain": gain, "loss": loss, "batch": checks.count("batch", batch), "format": format}
-    settings |= {"appearance": appearance, "encoding": encoding, "resize": resize, **options}
+    settings = {**(compensate.__kwdefaults__ or {}), "gain": gain, "loss": loss}
+    settings |= {"batch": checks.count("batch", batch), "format": format, "appearance": appearance}
+    settings |= {"encoding": encoding, "resize": resize, **options}
     described = {name: setting(value) for name, value in settings.items() if name != "callback"}
     described["codes"] = codes and curve(codes, T.grid)
-    manifest, white = Manifest(folder / NAME, described, identity(T)), bounds[1] if bounds[1] > 0 else 1.0
-    solver, each = _Solver(T, options, appearance, manifest.transport), map
-    if client is not None:
-        require_client(client)
-        each = partial(stream, client, share_gpu=share_gpu)
-        reload: Any = T.reload
-        visible: Any = reload and client.run(os.path.exists, reload.args[0])  # by address
-        solver.sent = reload if reload and all(visible.values()) else None
-    run = _Run(solver, each, opened, limit, resize, manifest, batch, format, white, codes)
+    head = {"versions": versions(), "settings": described, "transport": identity(T), "gain": None}
+    reload: Any = T.reload
+    seen = client is not None and is_there(client, reload and reload.args[0])
+    solver = _Solver(T, options, appearance, head["transport"], reload if seen else None)
+    each = partial(stream, client, share_gpu=share_gpu)
+    run = _Run(solver, each, opened, limit, folder, head, bounds[1] if bounds[1] > 0 else 1.0, codes)
     with locked(folder):
-        manifest.begin(resume)
-        for name in (".pattern_*", ".frames-*.json", "appearance/.appearance_*"):  # of killed runs
-            for file in folder.glob(name):
-                file.unlink(missing_ok=True)
+        run.records |= manifest.read(folder, head, resume)
         try:
             for done in run.solve(gain, loss):
                 if progress is not None:
@@ -203,14 +195,14 @@ def compensate_frames(
             if video is not None:
                 write_video(video, run.patterns(), fps or opened.fps or _USUAL_FPS)
         except LtclError as error:
-            if manifest.records and not isinstance(error, OtherRun):
-                done = f"{len(manifest.records)} frame(s) are done and stay in {folder}"
+            if run.records and not isinstance(error, OtherRun):
+                done = f"{len(run.records)} frame(s) are done and stay in {folder}"
                 error.args = (f"{error}; {done}, resume=True goes on from there",)
             raise
-    records = tuple(manifest.records[number] for number in sorted(run.done))
+    records = tuple(run.records[number] for number in sorted(run.done))
     error = (options.get("exact") or T).error
     seconds, film = time.perf_counter() - start, None if video is None else as_path(video)
-    return CompensatedFrames(folder, film, manifest.gain or 0.0, records, run.solved, seconds, error)
+    return CompensatedFrames(folder, film, head["gain"] or 0.0, records, run.solved, seconds, error)
 
 
 def _validate(
@@ -241,30 +233,31 @@ class _Solver:
     options: dict[str, Any]
     appearance: bool
     identity: dict[str, Any]
-    sent: Callable[[], Transport] | None = None  # to workers in the place of T: reads it from its file
+    reload: Callable[[], Transport] | None = None  # on workers, in the place of T: reads it from its file
+    gain: Any = None  # of all frames, when it is known
 
-    def __call__(self, batch: tuple[list[int], np.ndarray, float]) -> tuple[Any, ...]:
-        """Numbers, pictures and gain of a batch. Of "auto", every batch sees the same survey of S."""
-        numbers, pictures, gain = batch
+    def __call__(self, batch: tuple[list[int], np.ndarray]) -> tuple[Any, ...]:
+        """Of numbers and pictures. With "auto", every batch sees the same survey of S."""
+        numbers, pictures = batch
         try:
             if self.options.get("method", "auto") == "auto" and self.T.is_square and self.T.shape[0] > SMALL:
                 for S in self.T.systems:
                     survey(S)
-            solved = compensate(self.T, pictures, gain=gain, **self.options)
+            solved = compensate(self.T, pictures, gain=self.gain, **self.options)
         except LtclError as error:
             error.args = (f"frames {numbers[0]} to {numbers[-1]}: {error}",)
             raise
-        appearance = solved.appearance if self.appearance else solved.pattern  # not written then
-        return solved.pattern, appearance, solved.frame_errors.tolist(), solved.frame_clipped.tolist()
+        light = (solved.pattern, solved.appearance)[: 1 + self.appearance]
+        return light, solved.frame_errors.tolist(), solved.frame_clipped.tolist()
 
     def __getstate__(self) -> dict[str, Any]:
         options = {name: _portable(value) for name, value in self.options.items() if name != "callback"}
-        return dict(vars(self), T=None if self.sent else _portable(self.T), options=options)
+        return dict(vars(self), T=None if self.reload else _portable(self.T), options=options)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        if self.sent is not None:
-            self.T = self.sent()
+        if self.reload is not None:
+            self.T = self.reload()
             if identity(self.T) != self.identity:
                 raise InputError("the file of T holds another T there; give all workers the same")
 
@@ -274,50 +267,90 @@ class _Run:
     """The loop over batches: read ahead, solve here or on workers, write, record, in this order."""
 
     solver: _Solver
-    each: Callable[..., Iterator[Any]]  # `map`, or that of a cluster
+    each: Callable[..., Iterator[Any]]  # results of the solver, here or by workers
     source: Source
     limit: int | None
-    resize: bool
-    manifest: Manifest
-    size: int
-    format: str
+    folder: Path
+    head: dict[str, Any]  # of the manifest
     white: float  # light that is white in .png
     codes: Callable[[np.ndarray], np.ndarray] | None
     read: int = 0  # frames, of the right size
+    records: dict[int, Record] = field(default_factory=dict)  # by number, of all runs into the folder
     done: set[int] = field(default_factory=set)  # numbers of frames, of earlier runs, too
     broken: dict[int, str] = field(default_factory=dict)  # frames that are left out, and why
     solved: int = 0
 
-    @property
-    def count(self) -> int | None:
-        """Of the frames, as far as the source tells."""
-        count = self.source.count
-        return count if count is None or self.limit is None else min(count, self.limit)
+    def __post_init__(self) -> None:
+        known, settings = self.source.count, self.head["settings"]
+        self.count = known and min(known, self.limit or known)  # as far as the source tells
+        self.size, self.format, self.resize = (settings[name] for name in ("batch", "format", "resize"))
 
     def solve(self, gain: float | str, loss: float | None) -> Iterator[int]:
         """All batches; yields the number of frames done, before the first that is not and after each."""
-        batches, waiting = self._batches(), deque[tuple[Any, Any]]()
-
-        def tasks() -> Iterator[tuple[list[int], np.ndarray, float]]:
-            nonlocal coming
-            while (batch := coming.result()) is not None:
-                coming = reader.submit(next, batches, None)
-                frames, digests, pictures = zip(*batch, strict=True)
-                waiting.append((frames, digests))
-                numbers = [frame.number for frame in frames]
-                yield numbers, _stack(pictures), self._gain(gain, loss, pictures)
-
-        with ThreadPoolExecutor(1) as reader:
-            coming = reader.submit(next, batches, None)
-            coming.result()
-            yield len(self.done)
-            for solved in self.each(self.solver, tasks()):
-                self._keep(*waiting.popleft(), *solved)
+        ahead = read_ahead(partial(next, self._batches()), repeat(None), 1)
+        batches = iter(partial(next, ahead), None)
+        first = [*islice(batches, 1)]
+        yield len(self.done)
+        if first and self.head["gain"] is None:
+            self.head["gain"] = self._gain(gain, loss, first[0])
+        self.solver.gain = self.head["gain"]
+        taken, waiting = tee(chain(first, batches))
+        tasks = (([frame.number for frame, *_ in batch], _stack(batch)) for batch in taken)
+        with ThreadPoolExecutor(_WRITERS) as writers:
+            for (light, *numbers), batch in zip(self.each(self.solver, tasks), waiting, strict=True):
+                list(writers.map(self._write, (frame.number for frame, *_ in batch), *light))
+                for (frame, digest, _), *others in zip(batch, *numbers, strict=True):
+                    self.records[frame.number] = Record(frame.number, frame.name, digest, *others)
+                    self.done.add(frame.number)
+                manifest.write(self.folder, self.head, self.records)
+                self.solved += len(batch)
                 yield len(self.done)
         if self.broken:
-            named = ", ".join(f"{number} ({why})" for number, why in [*sorted(self.broken.items())][:_NAMED])
+            named = ", ".join(f"{number} ({why})" for number, why in sorted(self.broken.items())[:_NAMED])
             more = f" and {len(self.broken) - _NAMED} more" if len(self.broken) > _NAMED else ""
             raise FileError(f"{self.source.path}: frames were left out: {named}{more}")
+
+    def _gain(self, gain: float | str, loss: float | None, first: list[_Read]) -> float:
+        """The one of all frames, of a sample: the first frames where their number is unknown."""
+        if not isinstance(gain, str):
+            return float(gain)
+        count = self.count or self.size
+        numbers = {*np.rint(np.linspace(1, count, min(self.size, count))).astype(int).tolist()}
+        frames = (frame for frame in islice(self.source, max(numbers)) if frame.number in numbers)
+        sample = [read for frame in frames for read in self._read(frame)]
+        T, options = self.solver.T, self.solver.options
+        return compensate(T, _stack(sample or first), gain=gain, loss=loss, **options).gain
+
+    def _batches(self) -> Iterator[list[_Read]]:
+        """The frames that no earlier run has done, without broken ones."""
+        frames = islice(self.source, self.limit)
+        while batch := [*islice(frames, self.size)]:
+            if missing := [read for frame in batch for read in self._read(frame)]:
+                yield missing
+
+    def _read(self, frame: Frame) -> list[_Read]:
+        """One frame, on the camera's grid; none where it is done, or broken, which is noted."""
+        record, (h, w) = self.records.get(frame.number), self.solver.T.camera_grid
+        place = f"{self.source.path}: frame {frame.number} ({frame.name})"
+        try:
+            digest = frame.digest()
+            if record is not None and record.digest != digest:
+                advice = f"give the same frames to go on, or another folder than {self.folder}"
+                raise OtherRun(f"{place} has changed since its pattern was made; {advice}")
+            if record and all(file.is_file() for file in self._files(frame.number)):
+                self.done.add(frame.number)
+                return []
+            picture = frame.picture()
+            if picture.shape[:2] != (h, w) and not self.resize:
+                size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
+                raise InputError(f"{place} is {size}; give resize=True to scale all frames")
+        except InputError as error:
+            if isinstance(error, OtherRun) or not (isinstance(error, FileError) or self.read):
+                raise  # also where all seem to be of another size
+            self.broken[frame.number] = str(error)
+            return []
+        self.read += 1
+        return [(frame, digest, picture if picture.shape[:2] == (h, w) else images.resize(picture, (h, w)))]
 
     def patterns(self) -> Iterator[np.ndarray]:
         """As they were written, white at 1; codes as the light of which sRGB makes them."""
@@ -331,84 +364,18 @@ class _Run:
     def _files(self, number: int) -> list[Path]:
         """Those of a frame: its pattern and, where asked for, its appearance."""
         names = ["pattern_{:06}.{}", "appearance/appearance_{:06}.{}"][: 1 + self.solver.appearance]
-        return [self.manifest.path.parent / name.format(number, self.format) for name in names]
+        return [self.folder / name.format(number, self.format) for name in names]
 
-    def _batches(self) -> Iterator[list[tuple[Frame, str, np.ndarray]]]:
-        """The frames that no earlier run has done, with digests and pictures, and without broken ones."""
-        frames, folder = islice(self.source, self.limit), self.manifest.path.parent
-        while batch := list(islice(frames, self.size)):
-            missing: list[tuple[Frame, str, np.ndarray]] = []
-            for frame in batch:
-                record = self.manifest.records.get(frame.number)
-                with self._left_out(frame):
-                    digest = frame.digest()
-                    if record is not None and record.digest != digest:
-                        advice = f"give the same frames to go on, or another folder than {folder}"
-                        changed = "has changed since its pattern was made"
-                        raise OtherRun(f"{self._place(frame)} {changed}; {advice}")
-                    if record and all(file.is_file() for file in self._files(frame.number)):
-                        self.done.add(frame.number)
-                    else:
-                        missing.append((frame, digest, self._picture(frame)))
-            if missing:
-                yield missing
-
-    @contextmanager
-    def _left_out(self, frame: Frame) -> Iterator[None]:
-        """Note that a frame is broken, and go on; not where all seem to be of another size."""
-        try:
-            yield
-        except InputError as error:
-            if isinstance(error, OtherRun) or not (isinstance(error, FileError) or self.read):
-                raise
-            self.broken[frame.number] = str(error)
-
-    def _place(self, frame: Frame) -> str:
-        return f"{self.source.path}: frame {frame.number} ({frame.name})"
-
-    def _picture(self, frame: Frame) -> np.ndarray:
-        """The frame on the camera's grid."""
-        picture, (h, w) = frame.picture(), self.solver.T.camera_grid
-        if picture.shape[:2] != (h, w) and not self.resize:
-            size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
-            raise InputError(f"{self._place(frame)} is {size}; give resize=True to scale all frames")
-        self.read += 1
-        return picture if picture.shape[:2] == (h, w) else images.resize(picture, (h, w))
-
-    def _gain(self, gain: float | str, loss: float | None, first: Sequence[np.ndarray]) -> float:
-        """The one of all frames, found once, of a sample: the first frames where their number is unknown."""
-        if self.manifest.gain is None and isinstance(gain, str):
-            count = self.count or self.size
-            numbers = {*np.rint(np.linspace(1, count, min(self.size, count))).astype(int).tolist()}
-            sample = []
-            for frame in islice(self.source, max(numbers)):
-                with self._left_out(frame):
-                    sample += [self._picture(frame)] if frame.number in numbers else []
-            T, options = self.solver.T, self.solver.options
-            self.manifest.gain = compensate(T, _stack(sample or first), gain=gain, loss=loss, **options).gain
-        elif self.manifest.gain is None:
-            self.manifest.gain = float(gain)
-        return self.manifest.gain
-
-    def _keep(self, frames: Any, digests: Any, patterns: Any, appearances: Any, *numbers: Any) -> None:
-        """Patterns of a batch, on the disk, and then their records."""
-        with ThreadPoolExecutor(_WRITERS) as writers:
-            list(writers.map(self._write, (frame.number for frame in frames), patterns, appearances))
-        rows = zip(frames, digests, *numbers, strict=True)
-        self.manifest.add(Record(f.number, f.name, digest, *others) for f, digest, *others in rows)
-        self.done |= {frame.number for frame in frames}
-        self.solved += len(frames)
-
-    def _write(self, number: int, pattern: np.ndarray, appearance: np.ndarray) -> None:
+    def _write(self, number: int, *light: np.ndarray) -> None:
         """A frame's files; an appearance in a .png is divided by the gain, as the picture asked for."""
-        pairs = ((pattern, self.white), (appearance, self.manifest.gain))
-        for file, (light, white) in zip(self._files(number), pairs, strict=False):
+        whites = (self.white, self.head["gain"])[: len(light)]
+        for file, values, white in zip(self._files(number), light, whites, strict=True):
             if self.format == "exr":
-                images.write(file, light)
-            elif self.codes is not None and light is pattern:
-                images.write(file, self.codes(pattern), bits=16, encoding="linear")
+                images.write(file, values)
+            elif self.codes is not None and values is light[0]:
+                images.write(file, self.codes(values), bits=16, encoding="linear")
             else:
-                images.write(file, light / np.float32(white), bits=16)
+                images.write(file, values / np.float32(white), bits=16)
 
 
 def _portable(value: Any) -> Any:
@@ -419,8 +386,9 @@ def _portable(value: Any) -> Any:
     return value
 
 
-def _stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """(frames, h, w), or (frames, h, w, 3) where one of them is in colour."""
+def _stack(batch: Sequence[_Read]) -> np.ndarray:
+    """Its pictures: (frames, h, w), or (frames, h, w, 3) where one of them is in colour."""
+    pictures = [picture for *_, picture in batch]
     if any(picture.ndim == 3 for picture in pictures):
         pictures = [np.stack([p] * 3, axis=-1) if p.ndim == 2 else p for p in pictures]
     return np.stack(pictures)

@@ -7,10 +7,9 @@ Replaced whole after every batch, when its patterns are on the disk: what ends a
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,54 +42,40 @@ class Record:
     clipped: float
 
 
-@dataclass(eq=False)
-class Manifest:
-    """The settings and records of a run; `gain` is None until it is known."""
+def write(folder: Path, head: dict[str, Any], records: dict[int, Record]) -> None:
+    """Replace the list of a folder: `head` has versions, settings, transport and gain of the run."""
+    text = report.dumps({"format": _FORMAT, **head})
+    frames = ",\n    ".join(json.dumps(vars(records[number])) for number in sorted(records))
+    with replace_file(folder / NAME) as temporary:
+        temporary.write_text(f'{text[:-2]},\n  "frames": [\n    {frames}\n  ]\n}}\n', encoding="utf-8")
 
-    path: Path
-    settings: dict[str, Any]
-    transport: dict[str, Any]
-    gain: float | None = None
-    records: dict[int, Record] = field(default_factory=dict)
 
-    def add(self, records: Iterable[Record]) -> None:
-        """Take these frames as done, on the disk, too."""
-        self.records |= {record.number: record for record in records}
-        known = {"settings": self.settings, "transport": self.transport, "gain": self.gain}
-        head = report.dumps({"format": _FORMAT, "versions": report.versions(), **known})
-        ordered = (dataclasses.asdict(self.records[number]) for number in sorted(self.records))
-        lines = ",\n".join(f"    {json.dumps(record)}" for record in ordered)
-        with replace_file(self.path) as temporary:
-            temporary.write_text(f'{head[:-2]},\n  "frames": [\n{lines}\n  ]\n}}\n', encoding="utf-8")
-
-    def begin(self, resume: bool) -> None:
-        """Go on with the run whose file is there, if any; refuse other settings, another T, no `resume`."""
-        if not self.path.exists():
-            return
-        try:
-            content = json.loads(input_file(self.path).read_text(encoding="utf-8"))
-            if content["format"] != _FORMAT:
-                raise ValueError(f"format {content['format']!r}")
-            records = {int(entry["number"]): Record(**entry) for entry in content["frames"]}
-            settings, transport = dict(content["settings"]), {**content["transport"], "error": None}
-            gain = float(content["gain"])
-        except FileError:
-            raise
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            reason = " ".join(str(error).split())
-            raise FileError(f"{self.path}: is no list of frames of ltcl, or damaged ({reason})") from None
-        if not resume:
-            count, folder = len(records), self.path.parent
-            advice = "give resume=True to go on with it, or another folder"
-            raise InputError(f"{folder}: holds {count} frame(s) of an earlier run; {advice}")
-        advice = "give the same to go on with it, or another folder"
-        for name in sorted({*self.settings, *settings}):
-            before, now = settings.get(name), self.settings.get(name)
-            if before != now:
-                raise OtherRun(f"{self.path}: that run had {name}={before!r}, this one has {now!r}; {advice}")
-        if transport != {**self.transport, "error": None}:  # depends on the first bounce, patterns do not
-            raise OtherRun(f"{self.path}: that run was with another T; {advice}")
-        self.gain, self.records = gain, records
+def read(folder: Path, head: dict[str, Any], resume: bool) -> dict[int, Record]:
+    """Records of the run to go on with, and its gain in `head`; refuses another run, and no `resume`."""
+    path, advice = folder / NAME, "give the same to go on with it, or another folder"
+    if not path.exists():
+        return {}
+    file = input_file(path)
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if content["format"] != _FORMAT:
+            raise ValueError(f"format {content['format']!r}")
+        records = {int(entry["number"]): Record(**entry) for entry in content["frames"]}
+        head["gain"], settings = float(content["gain"]), dict(content["settings"])
+        transport = {**content["transport"], "error": head["transport"]["error"]}  # that of the first bounce
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise FileError(f"{path}: is no list of frames of ltcl, or damaged ({reason})") from None
+    if not resume:
+        count = f"{folder}: holds {len(records)} frame(s) of an earlier run"
+        raise InputError(f"{count}; give resume=True to go on with it, or another folder")
+    for name in sorted({*head["settings"], *settings}):
+        before, now = settings.get(name), head["settings"].get(name)
+        if before != now:
+            raise OtherRun(f"{path}: that run had {name}={before!r}, this one has {now!r}; {advice}")
+    if transport != head["transport"]:
+        raise OtherRun(f"{path}: that run was with another T; {advice}")
+    return records
 
 
 @contextlib.contextmanager

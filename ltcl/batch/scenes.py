@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import builtins
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ltcl.cluster import stream
@@ -51,13 +49,11 @@ def map(
         except LtclError as error:
             return type(error)(*error.args)  # without what it holds, which may lie on a device
 
-    each = builtins.map if client is None else partial(stream, client, window=1, share_gpu=share_gpu)
-    for result in each(attempt, scenes):
+    for result in stream(client, attempt, scenes, window=1, share_gpu=share_gpu):
         results.append(result)
         if progress is not None:
             progress("scenes", len(results), len(scenes))
-    errors = {s: r for s, r in zip(scenes, results, strict=True) if isinstance(r, LtclError)}
-    if errors:
-        named = "; ".join(f"{scene}: {error}" for scene, error in errors.items())
-        raise BatchError(f"{len(errors)} of {len(scenes)} scenes failed: {named}", results)
+    failed = [f"{s}: {r}" for s, r in zip(scenes, results, strict=True) if isinstance(r, LtclError)]
+    if failed:
+        raise BatchError(f"{len(failed)} of {len(scenes)} scenes failed: {'; '.join(failed)}", results)
     return results

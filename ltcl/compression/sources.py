@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +16,7 @@ import scipy.sparse.linalg
 
 from ltcl import checks
 from ltcl import first_bounce as _first_bounce
-from ltcl.cluster import stream
+from ltcl.cluster import is_there, stream
 from ltcl.device import Device, open_device
 from ltcl.errors import InputError, InputTypeError, MemoryLimitError
 from ltcl.noise import Noise
@@ -68,8 +67,7 @@ class Rows(scipy.sparse.linalg.LinearOperator):
         else:
             spans = itertools.pairwise([0, *itertools.accumulate(self.chunks)])
         items = ((*span, None if fetch else self.fetch(*span), value()) for span in spans)
-        results = stream(self.client, task, items) if self.client is not None else map(task, items)
-        return itertools.chain.from_iterable(results)
+        return itertools.chain.from_iterable(stream(self.client, task, items))
 
     def diagonal(self) -> np.ndarray:
         """The main diagonal, (min(M, N),) float64, not rounded: a first bounce may be made of it."""
@@ -132,7 +130,7 @@ def _is_there(client: Any, matrix: Any) -> bool:
     from distributed.protocol.pickle import dumps
 
     if root := getattr(getattr(matrix, "store", None), "root", None):
-        return all(client.run(os.path.isdir, str(root)).values())
+        return is_there(client, str(root))
     if hasattr(matrix, "dask"):
         return not futures_of(matrix)
     with contextlib.suppress(Exception):  # of whatever it holds that cannot be sent
