@@ -44,7 +44,8 @@ _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1219, "images": 500, "batch": 530, "cli": 2000, "scenes": 2710}
+# 2 000 were asked for the command line; `ltcl view`, `play` and `show` came with the viewer, 138 lines.
+_OTHERS = {"acquisition": 6310, "store": 1217, "images": 500, "batch": 530, "cli": 2076, "scenes": 2710}
 _PAST = ("cluster", "operators/parts", "operators/distributed", "batch/scenes")
 _TESTS_PAST = (
     "batch/test_cluster",
@@ -72,8 +73,8 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     # are in other parts, mostly batch and cli: 900 are to be enough for all.
     "past one machine": (826, [f"ltcl/{name}.py" for name in _PAST]),
     "tests past one machine": (1100, [f"tests/{name}.py" for name in _TESTS_PAST]),
-    # 700 were asked for; `ltcl show` moved here, 30 lines.
-    "viewer, without its page": (1177, ["ltcl/viewer", "ltcl/cli/view.py"]),
+    # 700 were asked for; its commands count with the command line.
+    "viewer, without its page": (1039, ["ltcl/viewer"]),
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),
     "tests of these": (
         9220,

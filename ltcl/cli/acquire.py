@@ -8,7 +8,7 @@ import datetime
 import json
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -23,16 +23,12 @@ from ltcl.report import versions
 from ltcl.store import Record, formats
 from ltcl.verdict import verdict
 
-if TYPE_CHECKING:
-    from ltcl.acquisition import Project
-
 _SCENES = ("dihedral", "trihedral", "box")
 
 
 def _albedo(text: str) -> tuple[float, ...]:
     with suppress(ValueError):
-        albedo = tuple(float(value) for value in text.split(","))
-        if len(albedo) in (1, 3):
+        if len(albedo := tuple(map(float, text.split(",")))) in (1, 3):
             return albedo
     raise typer.BadParameter(f"{text!r} is no albedo; write one number, or red,green,blue")
 
@@ -110,16 +106,14 @@ def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
         if is_refused and asked[name] is not None:
             raise InputError(f"--{name} is {asked[name]}, but {scene} takes no --{name}")
     albedo = asked["albedo"] or (0.7,)
-    is_grey = len(albedo) == 1
     rig: dict[str, Any] = {} if asked["camera_grid"] is None else {"camera_grid": asked["camera_grid"]}
     if is_rendered:
         rig |= {"kind": "mitsuba", "projector_grid": asked["grid"] or (24, 32)}
         rig |= {"scene": source if is_named else str(Path(source).resolve())}
-        paint = {"channels": len(albedo), "albedo": albedo[0] if is_grey else albedo}
+        paint = {"channels": len(albedo), "albedo": albedo if albedo[1:] else albedo[0]}
         return rig | (paint if is_named else {})
     if is_named:
-        walls = albedo[0] if is_grey else np.array([albedo])
-        sides = {"sides": 5} if scene == "box" else {}
+        walls, sides = np.array([albedo]) if albedo[1:] else albedo[0], {"sides": 5} if scene == "box" else {}
         built = getattr(scenes, scene)(asked["size"] or 16, albedo=walls, **sides)
         record: Any = Record(built.matrices(), grid=built.grid)
     else:
@@ -176,11 +170,8 @@ _Overhead = Annotated[float, option("Seconds of each photograph beyond its expos
 
 _HELP = """Photograph a scene under patterns, and make its transport of the photographs, in
 DIR/transport.zarr. DIR has an acquisition.toml, which says what photographs, and how."""
-app = typer.Typer(help=_HELP, no_args_is_help=True)
 
 
-@app.command()
-@command()
 def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.0) -> Answer:
     """What each strategy takes: photographs, time, disk; and how accurate it is.
 
@@ -194,10 +185,9 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     project = Project.open(folder)
     settings, facts = project.outlook()
     if is_measured := project.state != "new":
-        calibration = Calibration.of(project.store)
-        channels = 1 if calibration.white.value.ndim == 2 else 3
-        facts = {"grid": calibration.resampling.grid, "channels": channels, "light": measured(calibration)}
-        facts |= {"exposures": calibration.exposures, "noise": calibration.noise}
+        known = Calibration.of(project.store)
+        facts = {"grid": known.resampling.grid, "channels": len(known.offset), "light": measured(known)}
+        facts |= {"exposures": known.exposures, "noise": known.noise}
     kind: dict[str, Any] = {"aligned": settings.geometry == "aligned", "by_hand": project.kind == "folder"}
     count = photographs(facts["grid"], channels=facts["channels"], frames=settings.frames, **kind)
     asked: dict[str, Any] = {name: getattr(settings, name) for name in ("block", "order", "threshold")}
@@ -207,7 +197,6 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     data = {"folder": folder, "rig": project.kind, "measured": is_measured}
     data |= {"asked_for": settings.strategy, "auto": best, "why": why}
     data |= {name: facts[name] for name in ("exposures", "noise", "light", "channels")}
-    data["plans"] = strategies
     rows = []
     for name, each in strategies.items():
         counts = "{} x {}".format(*each.grid), each.patterns, each.photographs
@@ -224,13 +213,9 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
         f"\nphotographs: all, {count} of them of the calibration; error of T p: by noise, relative",
         f"{advice}auto takes {best}: {why}",
     ]
-    return Answer(data, lines)
+    return Answer(data | {"plans": strategies}, lines)
 
 
-@app.command("finalize", hidden=True)
-@app.command("resume", hidden=True)  # of earlier versions
-@app.command()
-@command()
 def run(
     context: Context, folder: options.Acquisition, take: _Take = None, device: options.Device = None
 ) -> Answer:
@@ -255,7 +240,7 @@ def run(
         with suppress(AcquisitionError):  # photographs are missing
             finalize(project.store)
         if project.state == "final":  # no camera or display has to be there
-            return _report(context, project, opened)
+            return report(context, folder, device)
     settings = {"store": project.store, "device": opened, **project.settings}
     try:
         with project.rig() as rig:
@@ -276,10 +261,10 @@ def run(
     except (AcquisitionError, KeyboardInterrupt) as error:
         error.args = (f"{str(error) or 'interrupted'}; {_advice(project, error)}",)
         raise
-    return _report(context, project, opened)
+    return report(context, folder, device)
 
 
-def _advice(project: Project, error: BaseException) -> str:
+def _advice(project: Any, error: BaseException) -> str:
     """What is kept of an acquisition that ends early, and how it goes on."""
     from ltcl.acquisition.session import calibration_photographs
 
@@ -295,27 +280,20 @@ def _advice(project: Project, error: BaseException) -> str:
     return f"take wrong photographs in {project.folder}/photographs again; then {again}"
 
 
-@app.command()
-@command()
 def report(context: Context, folder: options.Acquisition, device: options.Device = None) -> Answer:
     """Coverage, saturation, noise and reciprocity of a finished acquisition.
 
     Of a virtual rig also the relative error of T p, for patterns p that were not scanned, after one scale for
     each channel: the unit of light of a camera is its own.
     """
-    from ltcl.acquisition import Project
+    from ltcl.acquisition import Project, Report, Setup
 
-    return _report(context, Project.open(folder), open_device(device))
-
-
-def _report(context: Context, project: Project, device: Any) -> Answer:
-    from ltcl.acquisition import Report, Setup
-
+    project, opened = Project.open(folder), open_device(device)
     context.progress("entries and noise")
     facts = Report.of(project.store)
-    data = {"folder": project.folder, "store": project.store, **json.loads(facts.to_json())}
+    data = {"folder": folder, "store": project.store, **json.loads(facts.to_json())}
     lines = [str(facts)]
-    T = store.load(project.store, on_dark="mask", device=device)
+    T = store.load(project.store, on_dark="mask", device=opened)
     data["verdict"] = judged = verdict(T, sum_deviation=facts.sum_deviation, saturation=facts.saturated)
     if project.kind == "virtual":
         context.progress("relative error of T p")
@@ -325,3 +303,10 @@ def _report(context: Context, project: Project, device: Any) -> Answer:
         lines.append(f"relative error of T p, for patterns p that were not scanned: {each}")
     end = options.verdicts({str(project.store): judged})
     return Answer(data, [*lines, f"transport in {project.store}", *end])
+
+
+app = typer.Typer(help=_HELP, no_args_is_help=True)
+for _command in (plan, run, report):
+    app.command()(command()(_command))
+for _name in ("resume", "finalize"):  # of earlier versions
+    app.command(_name, hidden=True)(command()(run))

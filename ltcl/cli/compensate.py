@@ -27,6 +27,7 @@ from ltcl.transport import Transport
 _MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
 _RESULTS = ("gain", "clipped", "error", "transport_error", "gap")
 _SHEET = 12  # pictures on a contact sheet, at most
+_DIM = 4  # times as bright: what is that much darker is shown a second time on a contact sheet, amplified
 _REASONS = {
     "dark": "; where the pattern is at 1 a lower --gain helps, or --gain auto",
     "bright": ", by bounces or the background; brighten its dark parts",
@@ -46,10 +47,15 @@ _BACKGROUND = "Picture of the light that stays. Default: as measured, else none.
 _VIDEO = "Also a video of the patterns: .mkv or .avi, lossless; or .mp4, which changes their codes."
 _FPS = "Frames a second of that video. Default: as the source, else 25."
 _FORMAT = "png: 16 bits (default); exr: the light as it is."
+_CLUSTER = "Of frames and scenes. local: processes here, one for each GPU; or a Dask scheduler's ADDRESS."
+_SCENES = "In the place of TRANSPORT: many, as 'scans/*.zarr'. DIR gets a folder each."
+_MPI = "Share each solve: 'mpiexec -n 2 ltcl compensate ... --mpi'."
+_PICTURES = argument("PICTURE...", "Pictures; or one folder or one video of frames.")
 _FILM: dict[str, Any] = {"rich_help_panel": "Options of frames: a folder or a video"}
+_FRAMES = ("batch", "resume", "frames", "video", "fps", "format", "appearance")
 
 
-def _film_options(
+def _work_options(
     batch: Annotated[int | None, option("Frames solved at once. Default: 8.", min=1, **_FILM)] = None,
     resume: Annotated[bool, option("Go on where the last run into DIR ended.", "--resume", **_FILM)] = False,
     frames: Annotated[int | None, option("Only the first N frames.", metavar="N", min=1, **_FILM)] = None,
@@ -57,27 +63,15 @@ def _film_options(
     fps: Annotated[float | None, option(_FPS, **_FILM)] = None,
     format: Annotated[Literal["png", "exr"] | None, option(_FORMAT, **_FILM)] = None,
     appearance: Annotated[bool, option("Also how the scene will look.", "--appearance", **_FILM)] = False,
-) -> None:
-    """Of `ltcl.batch.compensate_frames`."""
-
-
-_FRAMES = tuple(inspect.signature(_film_options).parameters)
-_CLUSTER = "Of frames and scenes. local: processes here, one for each GPU; or a Dask scheduler's ADDRESS."
-_SCENES = "In the place of TRANSPORT: many, as 'scans/*.zarr'. DIR gets a folder each."
-_MPI = "Share each solve: 'mpiexec -n 2 ltcl compensate ... --mpi'."
-_PICTURES = argument("PICTURE...", "Pictures; or one folder or one video of frames.")
-
-
-def _cluster_options(
     mpi: Annotated[bool, option(_MPI, "--mpi")] = False,
     cluster: Annotated[str | None, option(_CLUSTER, metavar="local|ADDRESS")] = None,
     workers: Annotated[int | None, option("Processes of --cluster local.", metavar="N", min=1)] = None,
     transports: Annotated[str | None, option(_SCENES, metavar="PATTERN")] = None,
 ) -> None:
-    """What shares the work."""
+    """Of many frames, as of `ltcl.batch.compensate_frames`, or scenes, and what shares the work."""
 
 
-@command(*options.TASK, _film_options, _cluster_options)
+@command(*options.TASK, _work_options)
 def compensate(
     context: Context,
     transport: options.Matrix,
@@ -109,11 +103,13 @@ def compensate(
     from ltcl.acquisition import Setup
 
     asked, paths = context.options, picture or []
-    if asked["transports"] is not None:
-        return _compensate_scenes(context, [transport, *paths], out)
+    has_scenes = asked["transports"] is not None
+    paths = [transport, *paths] if has_scenes else paths
     if not paths:
         raise UsageError("Missing argument 'PICTURE...'.")
     film = _film(paths, asked)
+    if has_scenes:
+        return _compensate_scenes(context, paths, out)
     measured = calibration or (transport if options.is_measured(transport) else None)
     setup = Setup.of(measured) if measured else None
     T = options.load(context, transport)
@@ -150,7 +146,8 @@ def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
     films = [path for path in paths if is_frames(path)]
     if films and len(paths) > 1:
         raise InputError(f"{films[0]}: holds frames and must be alone; there are {len(paths) - 1} more")
-    refused = ("mpi", "transports") if films else (*_FRAMES, "cluster", "workers")
+    refused = ("mpi", "transports") if films else _FRAMES
+    refused += ("cluster", "workers") if not films and asked["transports"] is None else ()
     why = "holds frames; it is for pictures" if films else "is a picture; it is for a folder or a video"
     for name in refused:
         if asked[name] not in (None, False):
@@ -176,9 +173,9 @@ def _compensate_pictures(
             written, panels = _write(folder / name, desired[name], result, factor, high, setup, noisy)
             sheet.append(panels)
             facts = {key: getattr(result, key) for key in _RESULTS}
-            lack, solves = result.out_of_reach, {"channels": result.solution, "limited": result.limited}
+            lack = result.out_of_reach
             facts |= {"too_dark": float(np.mean(lack > 0)), "too_bright": float(np.mean(lack < 0))}
-            facts |= {key: report.solution(each) for key, each in solves.items()}
+            facts["channels"], facts["limited"] = map(report.solution, (result.solution, result.limited))
             text["pictures"].append({"file": str(path), **facts, **written})
             solved = facts["channels"] + [each for each in facts["limited"] if each not in facts["channels"]]
             methods = ", ".join(dict.fromkeys(each["method"] for each in solved))
@@ -204,22 +201,23 @@ def _write(
     units = {"pattern": 1 / high, "appearance": factor / result.gain}  # to compare with what was asked for
     seen = pictures.shades(result.appearance, units["appearance"])
     missing = pictures.mark(seen, result.out_of_reach * units["appearance"])
-    panels = {
-        "desired": pictures.panel(desired, f"{name}, desired", factor),
-        "pattern": pictures.panel(pattern, f"{name}, pattern", units["pattern"]),
-        "appearance": pictures.panel(seen, f"{name}, as predicted, error {100 * result.error:.2g} %"),
-        "out_of_reach": pictures.panel(missing, "out of reach: orange too dark, blue too bright"),
-    }
+    panels = [
+        pictures.panel(desired, f"{name}, desired", factor),
+        pictures.panel(pattern, f"{name}, pattern", units["pattern"]),
+        pictures.panel(seen, f"{name}, as predicted, error {100 * result.error:.2g} %"),
+        pictures.panel(missing, "out of reach: orange too dark, blue too bright"),
+    ]
     images.write(folder / f"{name}_pattern.exr", pattern)
     codes, encoding = (pattern / high, "srgb") if setup is None else (setup.codes(pattern), "linear")
     images.write(folder / f"{name}_pattern.png", codes, encoding=encoding)
     written: dict[str, Any] = {"pattern": {suffix: f"{name}_pattern.{suffix}" for suffix in ("exr", "png")}}
-    for key in ("appearance", "out_of_reach"):
-        written[key] = pictures.write(folder, f"{name}_{key}", getattr(result, key), panels[key])
+    for key, shown in zip(("appearance", "out_of_reach"), panels[2:], strict=True):
+        written[key] = pictures.write(folder, f"{name}_{key}", getattr(result, key), shown)
     for key, unit in units.items() if noisy else ():
-        deviation = pictures.deviation(folder, f"{name}_{key}", getattr(result.std, key), unit)
-        written[key]["std"], panels[f"{key}_std"] = deviation
-    return written, list(panels.values())
+        std = getattr(result.std, key)
+        written[key]["std"], shown = pictures.deviation(folder, f"{name}_{key}", std, unit)
+        panels.append(shown)
+    return written, panels
 
 
 def _compensate_frames(
@@ -269,12 +267,12 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer
     scenes = sorted(map(Path, glob.glob(pattern)))
     if len({scene.stem for scene in scenes}) < max(1, len(scenes)):
         raise InputError(f"--transports is {pattern}: it must mean files or folders of different names")
-    here = dict.fromkeys(["cluster", "workers", *["device"] * (context.options["cluster"] is not None)])
-    _film(paths, context.options | here)  # is refused
+    asked = context.options | dict.fromkeys(("transports", "cluster", "workers"))
+    asked |= {} if context.options["cluster"] is None else {"device": None}  # workers have their own
     reports, rows, failed = [], [], None
     with _cluster(context) as client:
         try:
-            task = partial(_compensate_scene, context.options | here | {"transports": None}, paths)
+            task = partial(_compensate_scene, asked, paths)
             results = of_each(task, scenes, client=client, progress=context.progress)
         except BatchError as error:
             results, failed = error.results, error
@@ -284,9 +282,8 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer
                 for name, content in files.items():
                     (folder / name).write_bytes(content)
             reports.append({"folder": out / scene.stem, **json.loads(files["compensate.json"])})
-            pictures_of = reports[-1]["pictures"]
-            worst = max(picture["error"] for picture in pictures_of)
-            rows.append((scene.stem, pictures_of[0]["gain"], percent(worst)))
+            shown = reports[-1]["pictures"]
+            rows.append((scene.stem, shown[0]["gain"], percent(max(each["error"] for each in shown))))
     if failed is not None:
         raise failed
     lines = [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"]
@@ -323,39 +320,41 @@ def separate(
     photographs = pictures.read_all(context, picture, T.camera_grid, "the camera", upright=False)
     noisy, factor = options.shows_noise(T, settings), pictures.exposure(*photographs.values())
     text = options.heading(context, transport, T, rtol=settings["rtol"])
-    text["exposure"], text["pictures"], sheet, rows = factor, [], [], []
+    text["exposure"], text["pictures"], sheet, rows, errors = factor, [], [], [], []
     with pictures.fill(out, text) as folder:
         for name, path in zip(context.progress.each(list(photographs)), picture, strict=True):
             result = separation.separate(T, photographs[name], bounces, **settings)
             numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
             light = {"direct": result.direct, "indirect": result.indirect, **numbered, "rest": result.rest}
-            solved = dict(zip(["direct", *numbered], result.solutions, strict=True))
+            solved = dict(zip(["direct", *numbered], map(report.solution, result.solutions), strict=True))
             std = dict(zip(solved, [result.std.direct, *result.std.bounces], strict=True)) if noisy else {}
             panels, deviations, parts = [pictures.panel(photographs[name], name, factor)], [], []
             whole = float(photographs[name].mean(dtype=np.float64))
             for part, picture_of in light.items():
                 panels.append(pictures.panel(picture_of, part, factor))
                 place = f"{name}/{part}" if len(photographs) > 1 else part
-                files = pictures.write(folder, place, picture_of, panels[-1])
-                facts: dict[str, Any] = {"part": part, **files}
-                mean, facts["lowest"] = float(picture_of.mean(dtype=np.float64)), float(picture_of.min())
-                facts["share"] = mean / whole if whole else None
-                facts["channels"] = solves = report.solution(solved[part]) if part in solved else []
+                facts: dict[str, Any] = {"part": part}
+                facts |= pictures.write(folder, place, picture_of, panels[-1])
+                mean, solves = float(picture_of.mean(dtype=np.float64)), solved.get(part, [])
+                facts |= {"lowest": float(picture_of.min()), "share": mean / whole if whole else None}
+                facts["channels"] = solves
                 if part in std:
                     facts["std"], shown = pictures.deviation(folder, place, std[part], factor)
                     deviations.append(shown)
                 parts.append(facts)
                 residual = max((each["residual"] for each in solves if each["error"] is None), default=None)
+                errors += [each["error"] for each in solves if each["error"] is not None]
                 products = sum(each["products"] for each in solves) or None
                 rows.append((path.name, part, percent(facts["share"], 4), products, residual))
             entry = {"file": str(path), "transport_error": result.transport_error, "parts": parts}
             text["pictures"].append(entry)
-            sheet += [panels[:3], panels[3:], pictures.amplified(light, factor), deviations]
+            brighter = (pictures.amplified(light[part], part, factor) for part in light)
+            dim = [panel for times, panel in brighter if times >= _DIM]
+            sheet += [panels[:3], panels[3:], dim, deviations]
         pictures.contact_sheet([row for row in sheet if row]).save(folder / "separate.png")
     lines: list[Any] = [table(("picture", "part", "share of light", "products", "residual"), rows)]
     lines.append(f"\neach part as .exr and .png in {out}; look at {out / 'separate.png'}")
-    solves = [each for entry in text["pictures"] for part in entry["parts"] for each in part["channels"]]
-    if errors := [each["error"] for each in solves if each["error"] is not None]:
+    if errors:
         worst = 100 * float(checks.upwards(max(errors)))
         lines.append(f"the relative error of each part by the inverse is at most {worst:.2g} %")
     lines.append(options.caveat("all of this is", T, context.options["exact"]))

@@ -57,8 +57,7 @@ def info(
             rows.append(_row(facts))
         except LtclError as error:
             entries.append({"file": str(file), **fail(error)})
-    if show_dark is not None and lights:
-        pictures.write_first_bounces(show_dark, lights)
+    pictures.write_first_bounces(show_dark, lights)
     columns = ("file", "shape", "channels", "grid", "camera grid", "stored", "entries", "memory")
     lines = [table((*columns, "first bounce", "dark pixels"), rows)] if rows else []
     return Answer(entries, lines + options.verdicts(verdicts), FAILED if len(rows) < len(files) else 0)
@@ -73,13 +72,11 @@ def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.nd
         facts |= {"first_bounce_from": "file", "stored": record.format.split("-")[1]}
     else:
         F, facts = _describe_record(record)
-    facts = {
-        "file": str(file),
-        **{name: getattr(record, name) for name in ("shape", "grid", "camera_grid", "mixing")},
-        **facts,
-        "first_bounce": None if F is None else (float(F.min()), float(F.max())),
-        "dark_pixels": None if F is None else int(np.count_nonzero((F <= 0).any(axis=0))),
-    }
+    sizes = {name: getattr(record, name) for name in ("shape", "grid", "camera_grid", "mixing")}
+    facts = {"file": str(file), **sizes, **facts, "first_bounce": None, "dark_pixels": None}
+    if F is not None:
+        facts["first_bounce"] = float(F.min()), float(F.max())
+        facts["dark_pixels"] = int(np.count_nonzero((F <= 0).any(axis=0)))
     return facts, F
 
 
@@ -87,8 +84,7 @@ def _describe_record(record: Record) -> tuple[np.ndarray | None, dict[str, Any]]
     """F (channels, N), 0 where dark, which a rectangular T has not, and facts about the matrices."""
     (rows, columns), F, matrices = record.shape, record.first_bounce, list[Any](record.matrices)
     for name, pixels in (("grid", columns), ("camera_grid", rows)):
-        if getattr(record, name) is not None:
-            checks.grid(name, getattr(record, name), pixels)
+        checks.grid(name, getattr(record, name) or (1, pixels), pixels)
     if F is not None and rows != columns:
         raise InputError(f"first_bounce is given, but T is {record.shape}; only a square T has one")
     if F is None and rows == columns:
@@ -121,10 +117,9 @@ def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
         why = "the file does not contain the grid" if missing else "T takes more than 256 MiB"
         tool = f"analyze {facts['file']}" if square else f"convert {facts['file']} OUT.npz"
         return Verdict(f"Unknown: {why}: run 'ltcl {tool}{missing}'.")
-    names = ("grid", "first_bounce", "camera_grid", "mixing", "noise")
-    settings = {n: value for n in names if (value := getattr(record, n)) is not None}
+    known = {name: value for name, value in vars(record).items() if value is not None}
     try:
-        return verdict(Transport(record.matrices, **settings))
+        return verdict(Transport(known.pop("matrices"), **known))
     except InputError as error:  # dark all over
         return Verdict(f"Good for nothing: {error}.", False, False)
 
@@ -169,14 +164,24 @@ def analyze(
         entries.append({"file": str(file), "device": T.device.name, **facts.to_dict()})
         for colour, channel in zip(_COLOURS[T.channels], facts.channels, strict=True):
             label = {"file": str(file), "channel": colour}
-            spectra.append(label | _spectrum(channel))
             forecasts.append(label | channel.products)
+            spectrum = {
+                "rho(R)": channel.spectral_radius,
+                "certificate": channel.spectral_radius_certificate,
+                "rho(R) within": _interval(*channel.spectral_radius_bounds),
+                "albedo": channel.albedo,
+                "S within": _interval(*channel.bounds),
+                "first bounce": _interval(channel.first_bounce[0], channel.first_bounce[-1]),
+                "reciprocity defect": channel.reciprocity_defect,
+                "negative light": percent(channel.negative_bounce),
+                "light passed on": _interval(channel.energy.bounce_lowest, channel.energy.bounce_highest),
+            }
+            spectra.append(label | spectrum)
     if plot is not None:
         from ltcl import plots
 
         plots.save(plots.analysis(analyses), plot)
-    if show_dark is not None:
-        pictures.write_first_bounces(show_dark, lights)
+    pictures.write_first_bounces(show_dark, lights)
     lines = [
         "Spectrum of R, bounds on that of S, and checks of the measurement",
         table([*spectra[0]], [row.values() for row in spectra]),
@@ -189,21 +194,6 @@ def analyze(
     return Answer(entries, lines)
 
 
-def _spectrum(channel: analysis.ChannelAnalysis) -> dict[str, Any]:
-    energy, first = channel.energy, channel.first_bounce
-    return {
-        "rho(R)": channel.spectral_radius,
-        "certificate": channel.spectral_radius_certificate,
-        "rho(R) within": _interval(*channel.spectral_radius_bounds),
-        "albedo": channel.albedo,
-        "S within": _interval(*channel.bounds),
-        "first bounce": _interval(first[0], first[-1]),
-        "reciprocity defect": channel.reciprocity_defect,
-        "negative light": percent(channel.negative_bounce),
-        "light passed on": _interval(energy.bounce_lowest, energy.bounce_highest),
-    }
-
-
 def _bytes(text: str) -> int:
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([kmg]?i?)b?\s*", text, re.IGNORECASE)
     count = int(float(match[1]) * _UNITS.get(match[2].lower(), 0)) if match else 0
@@ -212,17 +202,14 @@ def _bytes(text: str) -> int:
     return count
 
 
-def _rtol(text: str) -> float | str:
-    return text if text == "noise" else float(text)
-
-
 _BUDGET = "Bytes that the numbers of R may take, such as 50MB."
 _BASIS = "pixels or a wavelet (haar, db2, ...; compress: 'db2 rows', too); more than once: the best of them."
-_RTOL = "Relative error that solutions may have; compress: or noise, which keeps what stands out of it."
+_HELP = "Relative error that solutions may have; compress: or noise, which keeps what stands out of it."
+_RTOL = option(_HELP, parser=lambda text: text if text == "noise" else float(text), metavar="FLOAT")
 
 
 def _accuracy_options(
-    rtol: Annotated[Any, option(_RTOL, parser=_rtol, metavar="FLOAT")] = 1e-2,
+    rtol: Annotated[Any, _RTOL] = 1e-2,
     basis: Annotated[list[str] | None, option(_BASIS)] = None,
 ) -> None:
     """How accurate the solutions are, and in which basis R is written."""

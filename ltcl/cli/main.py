@@ -94,7 +94,3 @@ def _run_on_every_rank(words: list[str]) -> int:
             ends.Abort(code)
         time.sleep(0.01)
     return code
-
-
-if __name__ == "__main__":
-    sys.exit(main())

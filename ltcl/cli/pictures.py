@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from ltcl import report
 from ltcl.cli.command import Context
@@ -25,7 +25,6 @@ _MARGIN, _TEXT = 8, 18  # of contact sheets and labels, in pixels
 _PAPER, _INK = (21, 23, 27), (241, 239, 234)
 _ORANGE, _BLUE = np.array([1.0, 0.55, 0.0]), np.array([0.1, 0.45, 1.0])  # in sRGB
 _VISIBLE = 0.5 / 255  # of white: the smallest difference that is marked
-_DIM = 0.25  # of white: what is darker is shown a second time on a contact sheet, amplified
 
 
 @contextmanager
@@ -53,9 +52,9 @@ def read(
     encoding = context.options["encoding"]
     is_code = setup is not None and encoding == "auto" and images.read_codes(path).dtype.kind == "u"
     picture = images.read(path, encoding="linear" if is_code else encoding, upright=upright)
-    if picture.shape[:2] != grid and context.options["resize"]:
+    if context.options["resize"]:
         picture = images.resize(picture, grid)
-    if picture.shape[:2] != grid:
+    elif picture.shape[:2] != grid:
         (h, w), (height, width) = picture.shape[:2], grid
         size = f"has {h} x {w} pixels, but {whose} has {height} x {width}"
         raise InputError(f"{path}: {size}; --resize scales the picture")
@@ -113,18 +112,23 @@ def mark(codes: np.ndarray, missing: np.ndarray) -> np.ndarray:
 def panel(picture: np.ndarray, label: str, factor: float | None = None) -> Any:
     """A linear picture times `factor`, or sRGB values, as one of Pillow: enlarged, with its label above."""
     codes = picture if factor is None else shades(picture, factor)
-    side = -(-_WIDTH // codes.shape[1])
-    large = np.rint(255 * codes).astype(np.uint8).repeat(side, axis=0).repeat(side, axis=1)
-    sheet = Image.new("RGB", (large.shape[1], large.shape[0] + 2 * _TEXT), _PAPER)
-    sheet.paste(Image.fromarray(large), (0, 2 * _TEXT))
+    image = Image.fromarray(np.rint(255 * codes).astype(np.uint8))
+    image = ImageOps.scale(image, -(-_WIDTH // image.width), Image.Resampling.NEAREST)
+    sheet = ImageOps.expand(image, (0, 2 * _TEXT, 0, 0), _PAPER)
     place, font = (_MARGIN, _TEXT // 2), ImageFont.load_default(_TEXT)
     ImageDraw.Draw(sheet).text(place, label, fill=_INK, font=font)
     return sheet
 
 
+def amplified(picture: np.ndarray, name: str, factor: float) -> tuple[float, Any]:
+    """The panel of a picture times a power of two, at which it is seen best; that factor is on its label."""
+    times = 2 ** int(np.log2(max(exposure(picture) / factor, 1.0)))
+    return times, panel(picture, f"{name}, {times} times as bright", factor * times)
+
+
 def deviation(folder: Path, name: str, std: np.ndarray, factor: float) -> tuple[dict[str, str], Any]:
-    """Files of standard deviations, which are amplified by a power of two to be seen; and their panel."""
-    _, shown = _brightened(std, factor, f"{name.split('/')[-1]}_std")
+    """Files of standard deviations, and their panel, amplified."""
+    _, shown = amplified(std, f"{name.split('/')[-1]}_std", factor)
     return write(folder, f"{name}_std", std, shown), shown
 
 
@@ -141,22 +145,12 @@ def contact_sheet(rows: Sequence[Sequence[Any]]) -> Any:
     return sheet
 
 
-def write_first_bounces(place: Path, lights: Mapping[str, tuple[np.ndarray, tuple[int, int]]]) -> None:
+def write_first_bounces(place: Path | None, lights: Mapping[str, tuple[np.ndarray, tuple[int, int]]]) -> None:
     """First bounces (N,) or (3, N) on their grids as one PNG; pixels where one is 0 are orange."""
     rows = []
-    for name, (F, grid) in lights.items():
+    for name, (F, grid) in lights.items() if place is not None else ():
         dark = np.any(np.atleast_2d(F) <= 0.0, axis=0)
         codes = mark(shades(F.T.reshape(*grid, *F.shape[:-1]), exposure(F)), 1.0 * dark)
         rows.append([panel(codes, f"{name}: {np.count_nonzero(dark)} of {dark.size} pixels are dark")])
-    contact_sheet(rows).save(place, "PNG")
-
-
-def amplified(components: Mapping[str, np.ndarray], factor: float) -> list[Any]:
-    """Panels of what is too dark to be seen at this exposure, times powers of two that their labels name."""
-    panels = (_brightened(picture, factor, name) for name, picture in components.items())
-    return [shown for times, shown in panels if times * _DIM >= 1]
-
-
-def _brightened(picture: np.ndarray, factor: float, name: str) -> tuple[int, Any]:
-    times = 2 ** int(np.log2(max(exposure(picture) / factor, 1.0)))
-    return times, panel(picture, f"{name}, {times} times as bright", factor * times)
+    if place is not None and rows:
+        contact_sheet(rows).save(place, "PNG")

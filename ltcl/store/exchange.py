@@ -138,10 +138,8 @@ def read_hdf5(path: Path, variable: str | None = None, *names: Any) -> Record:
 
 def _record(members: dict[str, Any], variable: str | None, *names: Any) -> Record:
     """Of datasets, and of groups of one sparse matrix; `names` and reverse axes are those of `assemble`."""
-    shapes = {}
-    for name, data in members.items():
-        if "/" not in name:
-            shapes[name] = getattr(data, "shape", (1, 1) if f"{name}/data" in members else ()) or ()
+    own = {name: data for name, data in members.items() if "/" not in name}
+    shapes = {n: getattr(a, "shape", (1, 1) if f"{n}/data" in members else ()) or () for n, a in own.items()}
 
     def load(name: str) -> Any:
         if not hasattr(members[name], "dtype"):  # a group of one sparse matrix

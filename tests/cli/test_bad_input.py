@@ -54,6 +54,8 @@ OTHERS = [
     ("simulate {nan} --grid 3x3 --out {out}", ["--grid is 3 x 3"]),
     ("acquire resume {empty}", ["acquisition.toml: ", "ltcl simulate"]),
     ("compensate {store} {picture} --resize --high 2 --out {out}", ["--high is 2", "0 to 1"]),
+    ("compensate --transports {nan} {film} --out {out}", ["--transports", "film.avi holds frames"]),
+    ("compensate --transports {nan} {empty} --out {out}", ["--transports", "empty holds frames"]),
     ("acquire run {simulated} --take {empty}", ["--take", "virtual"]),
     ("show {empty} --every 2 --arrival", ["--every is 2", "--arrival"]),
 ]
