@@ -23,6 +23,7 @@ from typing import Any, Self
 
 import numpy as np
 import scipy.ndimage
+import scipy.optimize
 import scipy.sparse
 
 from ltcl import checks
@@ -203,7 +204,6 @@ class Noise:
 
 def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ...]:
     """Photons, floor, rows (M,), columns (N,) and direct: means in octaves of light, and factors."""
-    from scipy.optimize import nnls  # which takes as long as an eighth of ltcl
     stride = max(1, min(shape) // _ENTRIES)
     parts = [[x[(i - j) % stride == 0] for x in (i, j, *rest)] for i, j, *rest in samples]
     i, j, light, square = map(np.concatenate, zip(*parts, strict=True))
@@ -235,7 +235,7 @@ def _fit(shape: tuple[int, int], samples: Samples, exact: bool) -> tuple[Any, ..
         root[-1] = np.sqrt(len(z)) if exact else root[-1]  # all say the same of the first bounce
         for _ in range(_PASSES):  # by relative errors
             weight = root / np.maximum(A @ x, 1e-6 * mean.max())
-            x = nnls(A * weight[:, None], mean * weight)[0]
+            x = scipy.optimize.nnls(A * weight[:, None], mean * weight)[0]
         photons, floor2 = x[0] / top, max(x[1], 1e-6 * mean.max())
     photons, floor2, direct = scale * photons, scale * floor2, 1.0
     if len(first[0]) >= (1 if exact else _FIRST):
