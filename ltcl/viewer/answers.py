@@ -29,6 +29,8 @@ LONG = ("bounces", "compensate")  # solves, which call back
 PICTURES = ("pattern", "appearance", "target", "out_of_reach")  # of a compensation
 LARGEST_FILE, LARGEST_PICTURE, UPLOADS = 64 << 20, 64_000_000, 16  # bytes, pixels, how many are kept
 _BOUNCES = 16
+_STEPS = 65535  # of light between black and white, of which each has a code: a table in place of powers
+_CODES = from_linear(np.linspace(0, 1, _STEPS + 1, dtype=np.float32), "srgb", 8, is_float=False)
 
 
 class Scene:
@@ -176,10 +178,10 @@ class Scene:
         if name == "report.json":
             return report.dumps(facts).encode()
         picture, encoding = getattr(c, name[:-4], c.pattern), "auto"
-        if name == "pattern.png":
-            picture = c.pattern / np.float32(facts["white"])
-        elif name == "codes.png":
+        if name == "codes.png" and self.setup is not None:
             picture, encoding = self.codes(c.pattern, facts["white"]) / np.float32(255), "linear"
+        elif name.endswith(".png"):
+            picture = c.pattern / np.float32(facts["white"])
         with TemporaryDirectory() as folder:
             images.write(path := Path(folder) / name, picture, encoding=encoding)
             return path.read_bytes()
@@ -187,7 +189,8 @@ class Scene:
     def codes(self, pattern: np.ndarray, white: float) -> np.ndarray:
         """What a projector has to show, uint8 on its pixels: codes of the measured one, else sRGB."""
         if self.setup is None:
-            return from_linear(pattern / np.float32(white), "srgb", 8, is_float=False)
+            steps = np.clip(pattern * np.float32(_STEPS / white) + np.float32(0.5), 0, _STEPS)
+            return _CODES[steps.astype(np.uint16)]
         return from_linear(self.setup.codes(pattern), "linear", 8, is_float=False)
 
     def _picture(self, number: Any) -> tuple[str, np.ndarray, np.ndarray]:

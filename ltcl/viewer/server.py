@@ -40,6 +40,7 @@ from ltcl.viewer.answers import LARGEST_FILE, LONG
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json"}
 TYPES |= {".svg": "image/svg+xml", ".png": "image/png", ".exr": "image/x-exr"}
 SOCKETS, CONNECTIONS = 32, 256
+BUFFER = 1 << 20  # bytes to a client: a picture is handed over at once
 PATIENCE, LIFETIME = 5.0, 60.0  # seconds for a client to read an answer, or to ask; of what is no socket
 _PERIOD = 0.1  # seconds between two reports of progress
 _LOOK = 1.0  # seconds between two looks into the folder of a scan
@@ -181,7 +182,9 @@ class _Http(H11Protocol):
         super().connection_made(transport)
         self.app_state = {"abort": transport.abort}  # of its socket, too: close would wait for a reader
         # asyncio sets it for sockets of another making only; without it an answer after another waits 40 ms.
-        transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        own = transport.get_extra_info("socket")
+        own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)
         self.since = time.monotonic()
         self.loop.call_later(PATIENCE, lambda: self.scope is None and self._drop())
         self.loop.call_later(LIFETIME, self._drop)

@@ -1,16 +1,15 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Draws linear light on canvases. One WebGL context serves them all: it draws at the size of the picture, one
-// fragment a pixel, and the result is copied to the canvas, which CSS enlarges without smoothing.
+// fragment a pixel, row 0 first, and the result is copied to the canvas, which CSS enlarges without smoothing.
 
 const VERTEX = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
-// Variants are #define: drawing in software pays for each branch, taken or not.
+// Variants are #define, sums among them: drawing in software pays for each branch, taken or not, and for loops.
 const FRAGMENT = `precision highp float;
 precision highp sampler2DArray;
 uniform sampler2DArray light, deviation;
 uniform float weights[LAYERS], others[LAYERS], spreads[LAYERS]; // right, left of the wipe; of deviation
-uniform int height;
 uniform float wipe;
 out vec4 colour;
 
@@ -18,6 +17,7 @@ vec3 stored(sampler2DArray pictures, ivec2 at, int k) {
   vec3 value = texelFetch(pictures, ivec3(at, k), 0).rgb;
   return GREY ? value.rrr : value;
 }
+vec3 square(vec3 value) { return value * value; }
 vec3 heat(float t) { // fit of matplotlib's inferno by Matt Zucker (CC0)
   return clamp(vec3(0.0002, 0.0016, -0.0194) + t * (vec3(0.1065, 0.5639, 3.9327)
     + t * (vec3(11.6024, -3.9728, -15.9423) + t * (vec3(-41.7039, 17.4363, 44.3541)
@@ -26,23 +26,13 @@ vec3 heat(float t) { // fit of matplotlib's inferno by Matt Zucker (CC0)
 }
 // Four decades, one of them beyond white: a logarithm is asked for to see highlights, too.
 float decades(float value) { return clamp(0.75 + 0.25 * log(max(value, 1e-9)) / log(10.0), 0.0, 1.0); }
-vec3 encoded(vec3 linear) { // sRGB
-  return mix(1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, 12.92 * linear, lessThan(linear, vec3(0.0031308)));
+vec3 encoded(vec3 linear) { // sRGB, to a tenth of a code: roots are far faster than powers where it is software
+  vec3 root = sqrt(linear), curve = 0.83375 * root + 0.29811 * sqrt(root) - 0.05532 * linear - 0.0769;
+  return mix(curve, 12.92 * linear, lessThan(linear, vec3(0.0031308)));
 }
 void main() {
-  ivec2 at = ivec2(int(gl_FragCoord.x), height - 1 - int(gl_FragCoord.y)); // row 0 is at the top
-  vec3 sum = vec3(0.0), variance = vec3(0.0);
-  for (int k = 0; k < LAYERS; k++) {
-#if WIPE
-    sum += (gl_FragCoord.x < wipe ? others[k] : weights[k]) * stored(light, at, k);
-#else
-    sum += weights[k] * stored(light, at, k);
-#endif
-#if UNCERTAIN
-    vec3 sigma = spreads[k] * stored(deviation, at, k);
-    variance += sigma * sigma;
-#endif
-  }
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  vec3 sum = SUM;
   if (isnan(sum.r)) sum = vec3(0.0); // masked
   float most = max(sum.r, max(sum.g, sum.b)), least = min(sum.r, min(sum.g, sum.b));
   float size = -least > most ? least : most; // with the sign of what is larger
@@ -57,6 +47,7 @@ void main() {
   colour.rgb = encoded(strength * (size < 0.0 ? vec3(0.1, 0.45, 1.0) : vec3(1.0, 0.35, 0.1)));
 #endif
 #if UNCERTAIN
+  vec3 variance = VARIANCE;
   float sigma = sqrt(max(variance.r, max(variance.g, variance.b)));
   colour.rgb = mix(colour.rgb, vec3(1.0, 0.2, 0.75), 0.9 * clamp(sigma / max(abs(size), 1e-4), 0.0, 1.0));
 #endif
@@ -86,7 +77,7 @@ function use(defines) {
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
     }
     gl.linkProgram(program);
-    const names = ["deviation", "weights", "others", "spreads", "height", "wipe"];
+    const names = ["deviation", "weights", "others", "spreads", "wipe"];
     const places = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
     programs.set(head, { program, ...places });
   }
@@ -137,13 +128,16 @@ export function draw(canvas, layers, look) {
     surface.height = Math.max(h, surface.height);
   }
   if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+  const LAYERS = layers.pictures.length;
+  const total = (term) => Array.from({ length: LAYERS }, (_, k) => term.replaceAll("#", k)).join(" + ");
+  const weight = look.others ? "(gl_FragCoord.x < wipe ? others[#] : weights[#])" : "weights[#]";
   const uniforms = use({
-    LAYERS: layers.pictures.length, GREY: layers.grey, MODE: look.mode, LOGARITHMIC: Number(look.logarithmic),
-    WIPE: Number(Boolean(look.others)), UNCERTAIN: Number(Boolean(look.deviation)),
+    LAYERS, GREY: layers.grey, MODE: look.mode, LOGARITHMIC: Number(look.logarithmic),
+    SUM: total(`${weight} * stored(light, at, #)`), UNCERTAIN: Number(Boolean(look.deviation)),
+    VARIANCE: total("square(spreads[#] * stored(deviation, at, #))"),
   });
   const scaled = (weights, of) => of.pictures.map(({ scale }, k) => ((weights[k] ?? 0) * scale) / look.white);
   gl.viewport(0, 0, w, h);
-  gl.uniform1i(uniforms.height, h);
   gl.uniform1fv(uniforms.weights, scaled(look.weights, layers));
   if (look.others) {
     gl.uniform1fv(uniforms.others, scaled(look.others, layers));
@@ -158,6 +152,8 @@ export function draw(canvas, layers, look) {
   }
   gl.bindTexture(gl.TEXTURE_2D_ARRAY, layers.texture);
   gl.drawArrays(gl.TRIANGLES, 0, 3);
-  canvas.getContext("2d").drawImage(surface, 0, surface.height - h, w, h, 0, 0, w, h);
+  const image = new ImageData(w, h);
+  gl.readPixels(0, 0, w, h, gl.RGBA, gl.UNSIGNED_BYTE, image.data);
+  canvas.getContext("2d").putImageData(image, 0, 0);
   canvas.dataset.frame = Number(canvas.dataset.frame ?? 0) + 1;
 }

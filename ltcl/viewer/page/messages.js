@@ -19,15 +19,25 @@ export class Pixels {
     return Array.from({ length: this.c }, (_, k) => this.number((row * this.w + col) * this.c + k));
   }
 
+  // Of codes: as a canvas takes them.
+  image() {
+    const { data, h, w, c } = this, image = new ImageData(w, h), rgba = image.data.fill(255);
+    for (let i = 0; i < h * w; i++) {
+      for (let k = 0; k < 3; k++) rgba[4 * i + k] = data[i * c + (c === 3 ? k : 0)];
+    }
+    return image;
+  }
+
   // What to show as white: this share of pixels is darker. The brightest would often leave the rest black.
   white(share = 0.99) {
-    const n = this.h * this.w, step = Math.max(1, Math.floor(n / 4096)), light = [];
+    const n = this.h * this.w, step = Math.max(1, Math.floor(n / 4096));
+    const light = new Float32Array(Math.ceil(n / step)); // whose numbers are sorted fast
     for (let i = 0; i < n; i += step) {
       let most = 0;
       for (let k = 0; k < this.c; k++) most = Math.max(most, Math.abs(this.number(i * this.c + k)) || 0);
-      light.push(most);
+      light[i / step] = most;
     }
-    light.sort((a, b) => a - b);
+    light.sort();
     return light[Math.floor(share * (light.length - 1))] || light[light.length - 1];
   }
 }

@@ -27,12 +27,7 @@ connection.addEventListener("show", async ({ detail: { title, arrays: { codes } 
     [canvas.width, canvas.height] = [codes.w, codes.h];
     fit();
   }
-  const context = canvas.getContext("2d"), image = context.createImageData(codes.w, codes.h);
-  for (let i = 0; i < codes.h * codes.w; i++) {
-    for (let k = 0; k < 3; k++) image.data[4 * i + k] = codes.data[i * codes.c + (codes.c === 3 ? k : 0)];
-    image.data[4 * i + 3] = 255;
-  }
-  context.putImageData(image, 0, 0);
+  canvas.getContext("2d").putImageData(codes.image(), 0, 0);
   canvas.dataset.frame = Number(canvas.dataset.frame ?? 0) + 1;
   await connection.ask("projector"); // it is drawn: the next one
 });

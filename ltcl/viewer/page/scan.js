@@ -26,13 +26,12 @@ export function scan({ $, ask, press, connection }) {
     $("scan-histogram").firstElementChild.setAttribute("points", points.join(" "));
   }
 
-  function add({ name, time, seconds, histogram }, { w, h, c, data }) {
+  function add({ name, time, seconds, histogram }, codes) {
     [...list.children].find(({ dataset }) => dataset.name === name)?.remove(); // taken again
     const button = $("photograph").content.cloneNode(true).firstElementChild, [canvas, caption] = button.children;
-    [canvas.width, canvas.height, button.dataset.name, button.dataset.time] = [w, h, name, time];
-    const code = (_, i) => (i % 4 > 2 ? 255 : data[(i >> 2) * c + (c > 1 ? i % 4 : 0)]);
-    const image = new ImageData(Uint8ClampedArray.from({ length: 4 * w * h }, code), w, h);
-    canvas.getContext("2d").putImageData(image, 0, 0);
+    Object.assign(button.dataset, { name, time });
+    [canvas.width, canvas.height] = [codes.w, codes.h];
+    canvas.getContext("2d").putImageData(codes.image(), 0, 0);
     caption.textContent = seconds ? `${name}, ${seconds.toPrecision(3)} s` : name;
     if (histogram) button.onclick = () => choose(button, `Exposure of ${caption.textContent}`, histogram);
     const chosen = list.querySelector("[aria-pressed=true]"), first = list.firstElementChild;
