@@ -256,7 +256,7 @@ class _Crew:
                 there = [*self.client.nthreads()]
                 new = [each for each in there if each not in self.ready and each not in self.excluded]
                 question = importlib.import_module("ltcl").__version__, self.token, self.function
-                # Dask sends what it asks to the scheduler even if it asks nobody, and a function may be large.
+                # Dask sends it to the scheduler even where nobody is asked, and a function may be large.
                 answers = self.client.run(_ask(), *question, workers=new, on_error="return") if new else {}
         if answers is None:
             raise ClusterError(f"the scheduler at {self.scheduler} was lost")

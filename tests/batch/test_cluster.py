@@ -79,6 +79,20 @@ def test_results_come_in_order_and_items_are_taken_as_results_are(client):
     assert not client.futures
 
 
+def test_a_function_is_sent_once_to_each_worker(client, monkeypatch):
+    """And not to the scheduler at each look at the workers: it may hold a large T."""
+    asked, run = [], client.run
+
+    def count(function: Any, *arguments: Any, workers: Any = None, **options: Any) -> Any:
+        asked.append(len(workers))
+        return run(function, *arguments, workers=workers, **options)
+
+    monkeypatch.setattr("ltcl.cluster._PERIOD", 0.02)
+    monkeypatch.setattr(client, "run", count)
+    list(stream(client, lambda number: time.sleep(0.05), range(12)))
+    assert asked == [2, 2]  # before the first task, and at the end
+
+
 def test_an_error_is_raised_at_the_place_of_its_item(client):
     def fails(number: int) -> int:
         if number == 7:
