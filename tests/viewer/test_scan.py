@@ -221,6 +221,25 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(device, tmp_path: P
     assert "dropped" in window.title
 
 
+@pytest.mark.parametrize("is_grey", [False, True])
+def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey: bool) -> None:
+    T = ltcl.scenes.dihedral(4, albedo=0.6 if is_grey else (0.7, 0.5, 0.3)).transport()
+    for k in range(2):
+        images.write(tmp_path / f"{k}.png", 0.3 + 0.2 * random.random((*T.grid, 3) if k else T.grid))
+    source, background = open_frames(tmp_path), np.full((*T.grid, *(3,) * (not is_grey)), 0.05, np.float32)
+    rules: Any = {"inverse": ltcl.invert(T, 1e-4), "background": background, "rtol": 1e-3, "clamp": True}
+    with Window("film", open_browser=False) as window, looking(window.url) as shown:
+        scene = Scene(T, "T", {}, None)
+        assert play(scene, source, window, 0.5, lambda *_, **__: None, **rules)["shown"] == 2
+        window.close()
+    for found, frame in zip(shown, source, strict=True):
+        light = ltcl.compensate(T, frame.picture(), gain=0.5, **rules).pattern
+        exact = np.atleast_3d(scene.codes(light, 1.0))
+        np.testing.assert_allclose(found.astype(int), exact.astype(int), atol=1)
+    with pytest.raises(errors.InputError, match="inverse"):
+        play(scene, source, window, 0.5, print, inverse=ltcl.invert(ltcl.scenes.dihedral(5).transport()))
+
+
 def port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as free:
         return free.getsockname()[1]
