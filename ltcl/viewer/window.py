@@ -24,7 +24,7 @@ from ltcl import images
 from ltcl.compensation import compensate
 from ltcl.images.frames import Frame, Source
 from ltcl.viewer import serve
-from ltcl.viewer.answers import Scene
+from ltcl.viewer.answers import Reply, Scene
 
 _POLL = 0.1  # seconds, in which Ctrl-C is heard
 _PAUSE = 1.0  # without a window for longer, a film waits
@@ -32,7 +32,7 @@ _RECENT = 5  # frames by which the next one is timed: the median, as other work 
 _SAMPLE = 8  # frames that decide on the gain
 
 
-class Window(contextlib.AbstractContextManager):
+class Window(Scene, contextlib.AbstractContextManager):
     """Windows of a browser, whichever are open, in the place of a `ltcl.acquisition.rigs.Display`.
 
     `address` are arguments of `ltcl.viewer.serve`. Space, an arrow or page key there is a key pressed.
@@ -40,10 +40,10 @@ class Window(contextlib.AbstractContextManager):
 
     page = "projector.html"
     questions = ("projector", "next")
-    pixels, white = 1, 1.0
 
     def __init__(self, title: str, **address: Any) -> None:
-        self.title, self.pattern, self._drawn = title, None, 0.0
+        super().__init__(None, title, {}, None)
+        self._drawn = 0.0
         self._is_drawn, self._pressed = threading.Event(), threading.Event()
         self._viewer = serve(self, **address)
         self.url = self._viewer.url
@@ -78,18 +78,18 @@ class Window(contextlib.AbstractContextManager):
 
     def hello(self) -> dict[str, Any]:
         """What a window has to know."""
-        return {"title": self.title, "keys": True}
+        return super().hello() | {"keys": True}
 
-    def answer(self, do: str, asked: dict[str, Any], callback: Any) -> tuple[dict, dict]:
-        """Hear that a window is there or has drawn, or that a key was pressed."""
-        if do == "projector":
-            self._drawn = time.monotonic()
-        (self._is_drawn if do == "projector" else self._pressed).set()
+    def projector(self) -> Reply:
+        """One is there, or has drawn."""
+        self._drawn = time.monotonic()
+        self._is_drawn.set()
         return {}, {}
 
-    def codes(self, pattern: np.ndarray, white: float) -> np.ndarray:
-        """They are what is shown."""
-        return pattern
+    def next(self) -> Reply:
+        """A key was pressed."""
+        self._pressed.set()
+        return {}, {}
 
 
 def play(

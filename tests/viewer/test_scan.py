@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -194,6 +196,10 @@ def test_patterns_come_one_after_the_other(tmp_path: Path, advance: Any) -> None
     ):
         assert rigs.show(tmp_path, window, advance, photograph) == 3
         window.wait(1.0)
+        headers = {"Origin": window.url.rsplit("/", 2)[0]}
+        for path, data, code in (("result/report.json", None, 404), ("picture?name=a.png", b"", 400)):
+            with pytest.raises(HTTPError, match=str(code)):  # a window has neither
+                urlopen(Request(f"{window.url}{path}", data, headers))  # noqa: S310
         window.close()
     for found, pattern in zip(shown, patterns, strict=True):
         np.testing.assert_array_equal(found[..., 0], np.rint(255 * pattern))
