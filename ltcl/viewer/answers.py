@@ -20,7 +20,6 @@ from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.first_bounce import ENTRIES
 from ltcl.images.pictures import BITS, as_picture, decoding, from_linear, to_linear
 from ltcl.separation import separate
-from ltcl.transport import Transport
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]  # facts and pictures
 Callback = Callable[[int, float], None]  # of `ltcl.solve`
@@ -36,18 +35,22 @@ _CODES = from_linear(np.linspace(0, 1, _STEPS + 1, dtype=np.float32), "srgb", 8,
 class Scene:
     """T and what is shown of it; methods take what a question holds, and raise LtclError for anything else.
 
-    `setup` is the `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light that the
-    projector has now, of at most `white`. `questions` may be asked, the largest of so many `pixels`.
+    T is None where there is none yet, or only patterns are shown: then nothing is computed. `setup` is the
+    `ltcl.acquisition.Setup` of a measured T. `pattern` (h, w[, 3]) is the light that the projector has now,
+    of at most `white`, or uint8 codes. `questions` may be asked, the largest of so many `pixels`.
     """
 
     page = "index.html"
-    questions = (*QUICK, *LONG)
+    questions: tuple[str, ...] = (*QUICK, *LONG)
 
-    def __init__(self, T: Transport, title: str, pictures: Mapping[str, np.ndarray], setup: Any) -> None:
+    def __init__(self, T: Any, title: str, pictures: Mapping[str, np.ndarray], setup: Any) -> None:
         self.T, self.title, self.setup = T, title, setup
-        self.pattern, self.white, self.pixels = np.ones(T.grid, np.float32), 1.0, max(T.shape)
-        entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
-        self._shows_noise = T.is_square and (entries or T.measured_noise is not None)
+        self.pattern: Any = None
+        self.white, self.pixels = 1.0, 1
+        if T is not None:
+            self.pattern, self.pixels = np.ones(T.grid, np.float32), max(T.shape)
+            entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
+            self._shows_noise = T.is_square and (entries or T.measured_noise is not None)
         self._pictures: dict[int, tuple[str, np.ndarray, np.ndarray]] = {}  # for the camera, the projector
         self._first = self._next = 1  # of those that are uploaded
         for name, picture in pictures.items():
@@ -55,10 +58,12 @@ class Scene:
         self._compensation: tuple[Any, dict[str, Any]] | None = None
 
     def hello(self) -> dict[str, Any]:
-        """What a page has to know of T."""
-        T = self.T
-        facts = {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
-        facts |= {"title": self.title, "version": __version__, "device": T.device.name, "scan": False}
+        """What a page has to know; `grid` is None where there is no T."""
+        T, facts = self.T, {"title": self.title, "grid": None, "scan": "scan" in self.questions}
+        if T is None:
+            return facts
+        facts |= {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
+        facts |= {"version": __version__, "device": T.device.name}
         facts |= {"square": T.is_square, "compressed": T.is_compressed, "masked": int(T.masked.sum())}
         facts |= {"noise": self._shows_noise, "measured": self.setup is not None}
         return facts | {"pictures": [name for name, *_ in self._pictures.values()]}
@@ -142,8 +147,10 @@ class Scene:
         return {"pictures": [{"picture": k, "name": name} for k, (name, *_) in self._pictures.items()]}, {}
 
     def projector(self) -> Reply:
-        """A window that is to show the pattern; the server sends it."""
+        """A window that is to show the pattern, or a page to get news of a scan; the server sends them."""
         return {}, {}
+
+    scan = projector
 
     def add(self, name: str, picture: np.ndarray) -> int:
         """Keep a picture, on the grids of camera and projector; its number."""
@@ -157,6 +164,8 @@ class Scene:
 
     def upload(self, name: str, content: bytes | bytearray) -> dict[str, Any]:
         """Keep the picture of a file; InputError, before it is decoded, where that has too many pixels."""
+        if self.T is None:
+            raise InputError(f"{self.title} has no transport, or none yet; pictures are for one")
         suffix = checks.one_of("extension", Path(name).suffix.lower(), BITS)
         with TemporaryDirectory() as folder:
             path = Path(folder) / f"picture{suffix}"
@@ -188,6 +197,8 @@ class Scene:
 
     def codes(self, pattern: np.ndarray, white: float) -> np.ndarray:
         """What a projector has to show, uint8 on its pixels: codes of the measured one, else sRGB."""
+        if pattern.dtype == np.uint8:  # they are such
+            return pattern
         if self.setup is None:
             steps = np.clip(pattern * np.float32(_STEPS / white) + np.float32(0.5), 0, _STEPS)
             return _CODES[steps.astype(np.uint16)]

@@ -18,14 +18,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ltcl import images
 from ltcl.acquisition import Calibration, Project, Setup
 from ltcl.acquisition.agreement import Sensor, find_deviation, sample
 from ltcl.acquisition.calibrate import photographs
 from ltcl.acquisition.rig import to_unit
 from ltcl.acquisition.rigs.folder import Shot, read_photograph
 from ltcl.acquisition.session import calibration_folder
-from ltcl.errors import InputError, LtclError
-from ltcl.images.pictures import from_linear
+from ltcl.errors import LtclError
 from ltcl.store import ArrayLog, BlockStore, load
 from ltcl.viewer.answers import Scene
 
@@ -47,11 +47,11 @@ class _File(NamedTuple):
 class Scan(Scene):
     """A folder with an acquisition.toml; `T` is None, and only `news` are to be had, until it is finished."""
 
-    T: Any
+    questions = ("scan", "pictures")
 
     def __init__(self, folder: Path, device: Any) -> None:
-        self.project, self._device, self.T, self.title = Project.open(folder), device, None, folder.name
-        self.questions, self._pictures, self._compensation = ("scan", "pictures"), {}, None
+        super().__init__(None, folder.name, {}, None)
+        self.project, self._device = Project.open(folder), device
         self._lock, self._looked = threading.Lock(), 0.0
         self._read: dict[Path, float] = {}  # when files that were read had been written
         self._shown: dict[str, tuple[int, dict[str, Any], np.ndarray]] = {}  # photographs in order
@@ -61,7 +61,7 @@ class Scan(Scene):
         self._kind: Any = None  # shape and type of the first photograph
         self._samples: defaultdict[str, dict[int, tuple[float, np.ndarray]]] = defaultdict(dict)
         self._calibration: Calibration | None = None
-        self._total, self.pixels = 0, 1
+        self._total = 0
         if self.project.state == "final":
             self._finish()
         else:
@@ -69,21 +69,6 @@ class Scan(Scene):
             ways = {"aligned": settings.geometry == "aligned", "by_hand": self.project.kind == "folder"}
             self._total = photographs(facts["grid"], facts["channels"], settings.frames, **ways)
             self.pixels = int(np.prod(facts["grid"]))
-
-    def hello(self) -> dict[str, Any]:
-        """What a page has to know; `grid` is None where there is no transport yet."""
-        facts = {"title": self.title, "grid": None} if self.T is None else super().hello()
-        return facts | {"scan": True}
-
-    def scan(self) -> tuple[dict, dict]:
-        """A page that is to get the news; the server sends them."""
-        return {}, {}
-
-    def upload(self, name: str, content: bytes | bytearray) -> dict[str, Any]:
-        """As of a `Scene`, of a finished one."""
-        if self.T is None:
-            raise InputError(f"{self.title} has no transport yet; pictures are for one")
-        return super().upload(name, content)
 
     def news(self, seen: int) -> tuple[dict[str, Any], dict[str, np.ndarray], int]:
         """Facts, and photographs of which a page has `seen` so many; how many it has then."""
@@ -113,30 +98,30 @@ class Scan(Scene):
             done, what = round(total * done / batches), "patterns"
         if store and store.final:
             done = total = int(store.attributes["patterns"])
-        total, times = max(total, done), sorted(file.time for file in files)[-_PACE:]
+        total, newest = max(total, done), sorted(files, key=lambda file: -file.time)
+        times = [file.time for file in newest[:_PACE]]
         self._facts = {"state": state, "done": done, "total": total, "what": what, "left": None}
         if total > done and len(times) > 1:  # each file has as many on average
-            each = (times[-1] - times[0]) / (len(times) - 1) * len(files) / done
+            each = (times[0] - times[-1]) / (len(times) - 1) * len(files) / done
             self._facts["left"] = each * (total - done)
         if c := self._calibration:
             self._facts["coverage"] = float(np.mean(c.resampling.coverage > 0))
             self._facts["saturated"] = 1.0 - float(np.mean(c.white.valid))
         end = time.monotonic() + _BUDGET
-        newest = sorted(files, key=lambda file: -file.time)
         for file in [*newest[-1:], *newest[:-1]]:  # the first photograph says what the others have to be
             if self._read.get(file.path) != file.time and time.monotonic() < end:
                 self._read[file.path] = file.time
-                self._open(file, store, file in newest[:_SHOWN])
+                self._open(file, store)
         if state == "final" and self.T is None:
             self._finish()
 
     def _by_hand(self) -> Iterator[_File]:
         """Photographs by their numbers."""
         with self.project.rig() as self._camera:
-            missing = {*self._camera.missing()}
+            self._camera.missing()  # which looks for them
             for shot in self._camera.shots:
-                if shot.number not in missing:
-                    path = self._camera.folder / "photographs" / self._camera.file_name(shot.number)
+                if file := self._camera.file_name(shot.number):
+                    path = self._camera.folder / "photographs" / file
                     yield _File(path, path.stat().st_mtime, shot.number, shot)
 
     def _in_store(self, store: BlockStore | None) -> Iterator[_File]:
@@ -147,14 +132,14 @@ class Scan(Scene):
         for number, (written, path) in enumerate(times, 1):
             yield _File(path, written, number if store is None else int(path.stem[10:]))
 
-    def _open(self, file: _File, store: BlockStore | None, is_shown: bool) -> None:
+    def _open(self, file: _File, store: BlockStore | None) -> None:
         """Read a photograph or a batch: its preview, its histogram and what is wrong with it."""
         name, facts = f"photograph {file.number}", dict[str, Any]()
         self._warnings.pop(name, None)
         if file.shot is None and store is not None:
             light = store.block(0, file.number).matrix.sum(axis=0)
             light = np.reshape(light, store.layout.camera_grid or store.layout.grid)
-            codes = from_linear(light / max(light.max(), 1e-30), "srgb", 8, is_float=False)
+            codes = images.to_srgb(light / max(light.max(), 1e-30))
             name = f"batch {file.number + 1}"
         else:
             try:
@@ -167,11 +152,9 @@ class Scan(Scene):
             if file.shot is not None:
                 self._check(name, file.shot, codes)
         step = -(-max(codes.shape[:2]) // _SIDE)
-        codes = codes[::step, ::step]
-        preview = codes if codes.dtype == np.uint8 else np.rint(255 * codes.clip(0, 1)).astype(np.uint8)
-        if is_shown:
-            self._count += 1
-            self._shown[name] = self._count, {"name": name, "time": file.time, **facts}, preview
+        preview = np.rint(255 * codes[::step, ::step].clip(0, 1)).astype(np.uint8)
+        self._count += 1
+        self._shown[name] = self._count, {"name": name, "time": file.time, **facts}, preview
         if len(self._shown) > _SHOWN:
             del self._shown[min(self._shown, key=lambda name: self._shown[name][1]["time"])]
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Window`: a projector window in the browser, shown to in turn; and `play`, a film compensated as it runs.
 
-What is shown next goes to the window when that has drawn what it had, so nothing waits on the way. A frame
-that cannot be there in time is not computed.
+What is shown next goes to the window when that has drawn what it had, so nothing waits on the way. While a
+frame is drawn the next one is computed: the first that can be there in time.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ import contextlib
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from statistics import median
 from typing import Any
@@ -22,14 +24,15 @@ from ltcl import images
 from ltcl.compensation import compensate
 from ltcl.images.frames import Frame, Source
 from ltcl.viewer import serve
-from ltcl.viewer.answers import Scene
+from ltcl.viewer.answers import Reply, Scene
 
 _POLL = 0.1  # seconds, in which Ctrl-C is heard
 _PAUSE = 1.0  # without a window for longer, a film waits
+_RECENT = 5  # frames by which the next one is timed: the median, as other work delays single ones
 _SAMPLE = 8  # frames that decide on the gain
 
 
-class Window(contextlib.AbstractContextManager):
+class Window(Scene, contextlib.AbstractContextManager):
     """Windows of a browser, whichever are open, in the place of a `ltcl.acquisition.rigs.Display`.
 
     `address` are arguments of `ltcl.viewer.serve`. Space, an arrow or page key there is a key pressed.
@@ -37,10 +40,10 @@ class Window(contextlib.AbstractContextManager):
 
     page = "projector.html"
     questions = ("projector", "next")
-    pixels, white = 1, 1.0
 
     def __init__(self, title: str, **address: Any) -> None:
-        self.title, self.pattern, self._drawn = title, None, 0.0
+        super().__init__(None, title, {}, None)
+        self._drawn = 0.0
         self._is_drawn, self._pressed = threading.Event(), threading.Event()
         self._viewer = serve(self, **address)
         self.url = self._viewer.url
@@ -75,18 +78,18 @@ class Window(contextlib.AbstractContextManager):
 
     def hello(self) -> dict[str, Any]:
         """What a window has to know."""
-        return {"title": self.title, "keys": True}
+        return super().hello() | {"keys": True}
 
-    def answer(self, do: str, asked: dict[str, Any], callback: Any) -> tuple[dict, dict]:
-        """Hear that a window is there or has drawn, or that a key was pressed."""
-        if do == "projector":
-            self._drawn = time.monotonic()
-        (self._is_drawn if do == "projector" else self._pressed).set()
+    def projector(self) -> Reply:
+        """One is there, or has drawn."""
+        self._drawn = time.monotonic()
+        self._is_drawn.set()
         return {}, {}
 
-    def codes(self, pattern: np.ndarray, white: float) -> np.ndarray:
-        """They are what is shown."""
-        return pattern
+    def next(self) -> Reply:
+        """A key was pressed."""
+        self._pressed.set()
+        return {}, {}
 
 
 def play(
@@ -103,42 +106,63 @@ def play(
     `frames_per_second` are those shown; `latency` is the median of seconds from when a frame was due until a
     window had drawn it.
     """
+    inverse, background = settings.get("inverse"), settings.get("background")
+    settings["clamp"] = True
 
     def picture(frame: Frame) -> np.ndarray:
         light, grid = frame.picture(), scene.T.camera_grid
         return light if light.shape[:2] == grid else images.resize(light, grid)
 
-    if isinstance(gain, str):
+    if isinstance(gain, str) or inverse is not None:  # whose settings are checked so, once
         every = max((film.count or _SAMPLE) // _SAMPLE, 1)
-        sample = [np.atleast_3d(picture(frame)) for frame in islice(film, 0, every * _SAMPLE, every)]
-        frames = np.stack([np.broadcast_to(each, (*each.shape[:2], 3)) for each in sample])
-        gain = compensate(scene.T, frames, gain=gain, **settings).gain
-    now, period, title = time.monotonic, 1.0 / (film.fps or 25.0), window.title
-    start = spent = 0.0  # when frame 0 was due; seconds that a frame takes to compute
-    due = sent = taken = 0.0  # of the frame on show: when it was due, and sent; seconds to send and draw it
+        sampled = islice(film, 0, every * _SAMPLE if isinstance(gain, str) else 1, every)
+        sample = [np.atleast_3d(picture(frame)) for frame in sampled]
+        pictures = np.stack([np.broadcast_to(each, (*each.shape[:2], 3)) for each in sample])
+        gain = compensate(scene.T, pictures, gain=gain, **settings).gain
+
+    def pattern(desired: np.ndarray) -> np.ndarray:
+        if inverse is None:
+            return compensate(scene.T, desired, gain=gain, **settings).pattern
+        target = gain * np.atleast_3d(desired)  # and its light alone: the error of that costs as much
+        target = target if background is None else target - np.atleast_3d(background)
+        return inverse.pattern(target if target.shape[2] == 3 else target[..., 0])
+
+    now, period, title, frames = time.monotonic, 1.0 / (film.fps or 25.0), window.title, iter(film)
+    computing, drawing = deque([0.0], _RECENT), deque([0.0], _RECENT)  # seconds of frames
+
+    def prepare(start: float, earliest: float) -> tuple[int, np.ndarray] | None:
+        """Number and codes of the newest frame that is due when it can be shown, at `earliest` or later."""
+        for frame in frames:
+            begun = now()
+            if start + (frame.number + 1) * period >= max(begun + median(computing), earliest):
+                codes = scene.codes(pattern(picture(frame)), 1.0)
+                computing.append(now() - begun)
+                return frame.number, codes
+        return None
+
+    start, due, sent = math.inf, 0.0, 0.0  # when frame 0 was due; the one on show was due, and sent
     late, facts, shown = list[float](), dict[str, Any](), 0
-    for frame in film:
-        if shown and start + (frame.number + 0.5) * period < max(now() + spent, sent + taken):
-            continue  # it would be late
-        begun = now()
-        pattern = compensate(scene.T, picture(frame), gain=gain, clamp=True, **settings).pattern
-        codes = scene.codes(pattern, 1.0)
-        if shown:  # kernels are built for the first
-            spent = now() - begun
-            time.sleep(max(start + frame.number * period - now(), 0.0))
-        begun = now()
-        drawn = window.show(codes)
-        if shown and now() - begun < _PAUSE:
-            late.append(drawn - due)
-            taken = drawn - sent
-        else:  # the film waited for a window
-            start = now() - frame.number * period
-        sent = now()
-        due, shown = start + frame.number * period, shown + 1
-        facts = {"shown": shown, "dropped": frame.number - shown, "gain": gain}
-        facts |= {"frames_per_second": shown / (now() - start), "latency": median(late or [0.0])}
-        text = "{frames_per_second:.1f} frames/s, {dropped} dropped, latency {latency:.3f} s".format(**facts)
-        window.title = f"{title}: {text}"
-        progress("playing", frame.number, film.count, detail=f": {text}")
+    with ThreadPoolExecutor(1) as thread:
+        ahead = thread.submit(prepare, start, 0.0)
+        while (prepared := ahead.result()) is not None:
+            number, codes = prepared
+            wait = start + number * period - now() if shown else 0.0
+            drawn = max(now() + wait, sent + median(drawing)) + median(drawing)
+            ahead = thread.submit(prepare, start, drawn)
+            time.sleep(max(wait, 0.0))
+            begun = now()
+            drawn = window.show(codes)
+            if shown and now() - begun < _PAUSE:
+                late.append(drawn - due)
+                drawing.append(drawn - sent)
+            else:  # the film waited for a window
+                start = now() - number * period
+            sent = now()
+            due, shown = start + number * period, shown + 1
+            facts = {"shown": shown, "dropped": number - shown, "gain": gain}
+            facts |= {"frames_per_second": shown / (now() - start), "latency": median(late or [0.0])}
+            text = "{frames_per_second:.1f} frames/s, {dropped} dropped, latency {latency:.3f} s"
+            window.title = f"{title}: {(text := text.format(**facts))}"
+            progress("playing", number, film.count, detail=f": {text}")
     window.wait(_PAUSE)
     return facts

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -194,6 +196,10 @@ def test_patterns_come_one_after_the_other(tmp_path: Path, advance: Any) -> None
     ):
         assert rigs.show(tmp_path, window, advance, photograph) == 3
         window.wait(1.0)
+        headers = {"Origin": window.url.rsplit("/", 2)[0]}
+        for path, data, code in (("result/report.json", None, 404), ("picture?name=a.png", b"", 400)):
+            with pytest.raises(HTTPError, match=str(code)):  # a window has neither
+                urlopen(Request(f"{window.url}{path}", data, headers))  # noqa: S310
         window.close()
     for found, pattern in zip(shown, patterns, strict=True):
         np.testing.assert_array_equal(found[..., 0], np.rint(255 * pattern))
@@ -219,6 +225,25 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(device, tmp_path: P
     assert facts["latency"] < slow + 0.1  # and does not add up
     assert (facts["dropped"] > 5) == bool(slow)
     assert "dropped" in window.title
+
+
+@pytest.mark.parametrize("is_grey", [False, True])
+def test_an_inverse_shows_what_compensate_would(device, tmp_path: Path, is_grey: bool) -> None:
+    T = ltcl.scenes.dihedral(4, albedo=0.6 if is_grey else (0.7, 0.5, 0.3)).transport()
+    for k in range(2):
+        images.write(tmp_path / f"{k}.png", 0.3 + 0.2 * random.random((*T.grid, 3) if k else T.grid))
+    source, background = open_frames(tmp_path), np.full((*T.grid, *(3,) * (not is_grey)), 0.05, np.float32)
+    rules: Any = {"inverse": ltcl.invert(T, 1e-4), "background": background, "rtol": 1e-3, "clamp": True}
+    with Window("film", open_browser=False) as window, looking(window.url) as shown:
+        scene = Scene(T, "T", {}, None)
+        assert play(scene, source, window, 0.5, lambda *_, **__: None, **rules)["shown"] == 2
+        window.close()
+    for found, frame in zip(shown, source, strict=True):
+        light = ltcl.compensate(T, frame.picture(), gain=0.5, **rules).pattern
+        exact = np.atleast_3d(scene.codes(light, 1.0))
+        np.testing.assert_allclose(found.astype(int), exact.astype(int), atol=1)
+    with pytest.raises(errors.InputError, match="inverse"):
+        play(scene, source, window, 0.5, print, inverse=ltcl.invert(ltcl.scenes.dihedral(5).transport()))
 
 
 def port() -> int:
