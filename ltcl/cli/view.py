@@ -130,7 +130,7 @@ def show(
     def progress(shot: Any, done: int, total: int) -> None:
         context.progress(f"photograph {shot.number}: {shot.seconds:g} s, {shot.save_as}", done, total)
 
-    advance = "arrival" if arrival else every or "key"
+    advance = "arrival" if arrival else "key" if every is None else every
     with Window(str(folder)) if browser else contextlib.nullcontext(display) as screen:
         if isinstance(screen, Window):
             typer.echo(f"{screen.url} shows {folder}", err=True)

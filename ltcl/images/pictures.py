@@ -13,6 +13,7 @@ import contextlib
 import html
 import io
 import os
+import re
 import threading
 import warnings
 from collections.abc import Iterator
@@ -208,7 +209,7 @@ def decoding(path: Path) -> Iterator[None]:
             kind = MemoryLimitError if isinstance(error, MemoryLimitError) else FileError
             raise kind(f"{path}: {error}") from None
         except Exception as error:
-            reason = " ".join(f"{error}".split()) or type(error).__name__
+            reason = re.sub(r" <\S+ object at \w+>", "", " ".join(f"{error}".split())) or type(error).__name__
             raise FileError(f"{path}: is truncated, damaged or no picture: {reason:.200}") from error
         finally:
             cv2.utils.logging.setLogLevel(level)

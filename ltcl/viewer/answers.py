@@ -59,8 +59,9 @@ class Scene:
 
     def hello(self) -> dict[str, Any]:
         """What a page has to know; `grid` is None where there is no T."""
-        T, facts = self.T, {"title": self.title, "grid": None, "scan": "scan" in self.questions}
-        if T is None:
+        facts: dict[str, Any] = {name: name in self.questions for name in ("scan", "next")}
+        facts |= {"title": self.title, "grid": None}
+        if (T := self.T) is None:
             return facts
         facts |= {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
         facts |= {"version": __version__, "device": T.device.name}

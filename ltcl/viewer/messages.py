@@ -38,7 +38,8 @@ def encode(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = 
     for name, array in (arrays or {}).items():
         values, scale, dtype = array.reshape(*array.shape[:2], -1), 1.0, "u1"
         if array.dtype != np.uint8:
-            scale, dtype = max(float(values.max()), -float(values.min()), _DARK), "f2"
+            most, dtype = max(float(values.max()), -float(values.min()), _DARK), "f2"
+            scale = checks.number(f"the largest value of {name}", most)
             values = values.astype(np.float32, copy=False) * np.float32(1.0 / scale)
             values += _ROUNDED  # to what half floats near 0 hold: NumPy is slow where one underflows
             values -= _ROUNDED

@@ -187,7 +187,7 @@ class Scan(Scene):
             self._warnings[shot.pattern] = found.describe(numbers)
 
     def _finish(self) -> None:
-        """The transport is there: everything else can be asked for."""
+        """The transport is there: all that a Scene has, in one assignment, as pages ask meanwhile."""
         T, setup = load(self.project.store, on_dark="mask", device=self._device), Setup.of(self.project.store)
-        super().__init__(T, self.title, {}, setup)
-        self.questions = (*Scene.questions, "scan")
+        questions = (*Scene.questions, "scan")
+        self.__dict__ = vars(self) | vars(Scene(T, self.title, {}, setup)) | {"questions": questions}

@@ -97,7 +97,7 @@ class Client:
         self.socket, self.scene, self.turns, self.clients = socket, scene, turns, clients
         self.questions: dict[str, tuple[float, dict[str, Any]]] = {}
         self.busy, self.tasks, self.loop = set[str](), asyncio.TaskGroup(), asyncio.get_running_loop()
-        self.changed, self.followed = asyncio.Event(), set[str]()
+        self.changed, self.followed, self.hello = asyncio.Event(), set[str](), scene.hello()
 
     async def receive(self) -> None:
         """Take questions until WebSocketDisconnect, or InputError for what is none."""
@@ -137,11 +137,12 @@ class Client:
 
     async def watch(self) -> None:
         """Send what is new in the folder of a scan; and what its transport is, once there is one."""
-        seen, hello = 0, self.scene.hello()
+        seen = 0
         while True:
             facts, pictures, seen = await asyncio.to_thread(self.scene.news, seen)
             await self.send(messages.encode({"do": "scan", **facts}, pictures))
-            if hello != (hello := self.scene.hello()):
+            if self.hello["grid"] != (hello := self.scene.hello())["grid"]:
+                self.hello = hello
                 await self.send(messages.encode({"do": "hello", **hello}))
             await asyncio.sleep(_LOOK)
 
@@ -167,12 +168,13 @@ class Client:
 
         try:
             facts, pictures = self.scene.answer(do, asked, between)
+            return messages.encode({"id": number, "do": do, **facts}, pictures)
         except _Superseded:
             return None
         except Exception as error:  # noqa: BLE001 - the next question may go well
             kind = "" if isinstance(error, LtclError) else f"internal error: {type(error).__name__}: "
-            facts, pictures = {"error": kind + " ".join(str(error).split())}, {}
-        return messages.encode({"id": number, "do": do, **facts}, pictures)
+            line = kind + " ".join(str(error).split())
+            return messages.encode({"id": number, "do": do, "error": line})
 
 
 class _Http(H11Protocol):
@@ -222,10 +224,12 @@ class Viewer(contextlib.AbstractContextManager):
 
     def __init__(self, scene: Any, host: str, port: int, open_browser: bool) -> None:
         try:
+            if not host:  # which would be anywhere
+                raise OSError("it is empty")
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             place = host, checks.count("port", port, least=0, most=65535)
-            token = _token(port) if port else ""
-            listening = socket.create_server(place, family=family)
+            token, both = _token(port) if port else "", host == "::" and socket.has_dualstack_ipv6()
+            listening = socket.create_server(place, family=family, dualstack_ipv6=both)
         except OSError as error:
             raise InputError(f"host is {host!r}, port {port}: {error}; they must be free here") from None
         address, self._port = listening.getsockname()[:2]
@@ -279,7 +283,7 @@ class Viewer(contextlib.AbstractContextManager):
         """All requests pass here; those that may not get 403 and no word about what there is."""
         named = [(name, value.decode("latin-1")) for name, value in scope["headers"]]
         hosts, origins = ([value for name, value in named if name == key] for key in (b"host", b"origin"))
-        own = scope["server"][0]  # the address that was connected to; as its names, no other site can have it
+        own = scope["server"][0].removeprefix("::ffff:")  # which was connected to: no other site can have it
         own = {f"{name}:{self._port}" for name in (*self._names, f"[{own}]" if ":" in own else own)}
         token, slash, path = scope["path"].removeprefix("/").partition("/")
         reads = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
@@ -324,7 +328,7 @@ class Viewer(contextlib.AbstractContextManager):
         try:
             await websocket.accept()
             async with client.tasks:
-                await client.send(messages.encode({"do": "hello", **self._scene.hello()}))
+                await client.send(messages.encode({"do": "hello", **client.hello}))
                 await client.receive()
         except* InputError as errors:
             await asyncio.wait_for(websocket.close(1008, f"{errors.exceptions[0]}"[:100]), PATIENCE)

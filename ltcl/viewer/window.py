@@ -46,7 +46,7 @@ class Window(Scene, contextlib.AbstractContextManager):
         self._drawn = 0.0
         self._is_drawn, self._pressed = threading.Event(), threading.Event()
         self._viewer = serve(self, **address)
-        self.url = self._viewer.url
+        self.url, self.close = self._viewer.url, self._viewer.close  # windows keep what they show
 
     def show(self, codes: np.ndarray) -> float:
         """Show codes (h, w[, 3]), uint8 or in [0, 1], when a window is there that drew those before; when."""
@@ -69,16 +69,8 @@ class Window(Scene, contextlib.AbstractContextManager):
         self._pressed.clear()
         return was_pressed
 
-    def close(self) -> None:
-        """End it; windows keep what they show."""
-        self._viewer.close()
-
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def hello(self) -> dict[str, Any]:
-        """What a window has to know."""
-        return super().hello() | {"keys": True}
 
     def projector(self) -> Reply:
         """One is there, or has drawn."""
@@ -107,7 +99,7 @@ def play(
     window had drawn it.
     """
     inverse, background = settings.get("inverse"), settings.get("background")
-    settings["clamp"] = True
+    settings["clamp"] = scene.T.is_square  # else light is found within the bounds only
 
     def picture(frame: Frame) -> np.ndarray:
         light, grid = frame.picture(), scene.T.camera_grid

@@ -58,6 +58,7 @@ OTHERS = [
     ("compensate --transports {nan} {empty} --out {out}", ["--transports", "empty holds frames"]),
     ("acquire run {simulated} --take {empty}", ["--take", "virtual"]),
     ("show {empty} --every 2 --arrival", ["--every is 2", "--arrival"]),
+    ("show {empty} --every 0", ["is 0"]),
 ]
 
 

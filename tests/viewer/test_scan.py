@@ -66,7 +66,8 @@ def test_photographs_come_with_histograms_and_warnings(tmp_path: Path) -> None:
     images.write(files[0], codes / 255, encoding="linear", bits=8)
     files[1].write_bytes(b"no picture")
     with serve(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
-        assert page.hello == {"do": "hello", "title": tmp_path.name, "grid": None, "scan": True}
+        facts = {"do": "hello", "title": tmp_path.name, "grid": None, "scan": True, "next": False}
+        assert page.hello == facts
         page.send("scan")
         first = news(page, state="new", done=2)
         np.testing.assert_array_equal(first["0"][..., 0], codes)
@@ -118,7 +119,8 @@ def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
     truth = ltcl.scenes.dihedral(4, albedo=0.6).transport()
     ltcl.save(tmp_path / "T.npz", truth)
     scan = project(tmp_path, VIRTUAL)
-    with serve(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
+    serving = serve(Scan(tmp_path, None), open_browser=False)
+    with serving as viewer, Page(viewer.url) as page, Page(viewer.url) as other:
         page.send("scan")
         assert news(page, state="new")["done"] == 0
         with scan.rig() as rig:
@@ -131,8 +133,28 @@ def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
         unit[1, 2] = 1.0
         column = page.ask("column", pixel=[1, 2])["picture"][..., 0]
         np.testing.assert_allclose(column, T @ unit, atol=2e-3 * column.max())
+        other.send("scan")  # which came before the end, and asks after it
+        assert news(other, state="final")
+        assert other.next().items() >= {"do": "hello", "grid": [4, 8]}.items()
     with serve(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
         assert (page.hello["grid"], page.hello["scan"]) == ([4, 8], True)
+
+
+def test_a_page_that_comes_as_a_scan_ends_reads_no_half_of_it(tmp_path: Path, monkeypatch: Any) -> None:
+    ltcl.save(tmp_path / "T.npz", ltcl.scenes.dihedral(4, albedo=0.6).transport())
+    acquisition = project(tmp_path, VIRTUAL)
+    scan, grids, make = Scan(tmp_path, None), [], Scene.__init__
+
+    def hello(scene: Scene, *arguments: Any) -> None:
+        make(scene, *arguments)
+        grids.append(scan.hello()["grid"])
+
+    with acquisition.rig() as rig:
+        ltcl.acquire(rig, store=acquisition.store, **acquisition.settings)
+    monkeypatch.setattr(Scene, "__init__", hello)
+    assert scan.news(0)[0]["warnings"] == []
+    assert grids == [None]
+    assert scan.hello()["grid"] == (4, 8)
 
 
 def test_batches_of_a_scan_that_was_stopped(tmp_path: Path) -> None:
@@ -225,6 +247,20 @@ def test_a_film_is_compensated_frame_by_frame_and_never_late(device, tmp_path: P
     assert facts["latency"] < slow + 0.1  # and does not add up
     assert (facts["dropped"] > 5) == bool(slow)
     assert "dropped" in window.title
+
+
+def test_a_film_for_a_rectangular_T_keeps_to_the_bounds(device, tmp_path: Path) -> None:
+    T = ltcl.Transport(random.random((20, 12), np.float32), (3, 4), camera_grid=(4, 5))
+    images.write(tmp_path / "0.png", np.full((4, 5), 0.9))
+    source = open_frames(tmp_path)
+    scene = Scene(T, "T", {}, None)
+    with Window("film", open_browser=False) as window, looking(window.url) as shown:
+        assert play(scene, source, window, 1.0, lambda *_, **__: None)["shown"]
+        window.close()
+    (frame,) = source
+    light = ltcl.compensate(T, frame.picture(), gain=1.0).pattern
+    exact = np.atleast_3d(scene.codes(light, 1.0))
+    np.testing.assert_allclose(shown[0].astype(int), exact.astype(int), atol=1)
 
 
 @pytest.mark.parametrize("is_grey", [False, True])

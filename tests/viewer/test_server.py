@@ -7,6 +7,7 @@ import asyncio
 import io
 import json
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -226,7 +227,9 @@ def test_uploads_are_relit_and_wrong_ones_refused(colour):
         assert upload(page, "large.png", png(np.zeros((40, 50), np.uint8)))["shape"] == [40, 50, 1]
         assert page.ask("relight", picture=2)["picture"].max() == 0
         for name, content in {"a.txt": b"text", "a.png": b"text", "a.exr": b"text", "": b"x"}.items():
-            assert list(upload(page, name, content)) == ["error"]
+            (wrong,) = upload(page, name, content).items()
+            assert wrong[0] == "error"
+            assert " object at " not in wrong[1]
         for number in range(3, 25):
             upload(page, f"{number}.png", png(codes))
         kept = page.ask("pictures")["pictures"]
@@ -290,6 +293,13 @@ def test_wrong_questions_get_one_line_and_the_next_one_is_answered(colour, do, f
         assert "\n" not in line
         assert "internal" not in line
         assert "picture" in page.ask("column", pixel=[0, 0])
+
+
+def test_light_beyond_what_numbers_hold_is_refused(device):
+    with viewing(T := TRANSPORTS["rectangular"]()) as page:
+        light = np.ones((*T.grid, 1), np.float16)
+        assert "picture is inf" in page.ask("relight", {"pattern": (light, 1e38)})["error"]
+        assert "picture" in page.ask("relight", {"pattern": (light, 1.0)})
 
 
 class Slow:
@@ -384,9 +394,18 @@ def test_a_viewer_in_a_notebook_is_a_frame(colour):
 def test_an_address_that_cannot_be_had_is_refused(colour):
     with ltcl.view(colour, open_browser=False) as viewer:
         port = int(viewer.url.split(":")[2].split("/")[0])
-        for host, wrong in (("127.0.0.1", port), ("127.0.0.1", -1), ("127.0.0.1", 1 << 17), ("256.1.1.1", 0)):
+        own = [("127.0.0.1", wrong) for wrong in (port, -1, 1 << 17)]
+        for host, wrong in (*own, ("256.1.1.1", 0), ("", 0)):
             with pytest.raises(errors.InputError, match="port"):
                 ltcl.view(colour, host=host, port=wrong, open_browser=False)
+
+
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
+def test_an_address_of_ipv6_is_found_by_ipv4_too(colour):
+    with ltcl.view(colour, host="::", open_browser=False) as viewer:
+        place = viewer.url.split(":", 2)[2]
+        for name in ("127.0.0.1", "[::1]"):
+            assert urllib.request.urlopen(f"http://{name}:{place}").status == 200
 
 
 def test_the_command_runs_until_ctrl_c(tmp_path):

@@ -16,7 +16,7 @@ function fit() {
 let keys = false; // whether they are for what shows patterns one after the other
 
 connection.addEventListener("open", async ({ detail }) => {
-  keys = Boolean(detail.keys);
+  keys = detail.next;
   await connection.ask("projector");
   document.body.dataset.state = "ready";
 });
