@@ -175,7 +175,7 @@ class Scene:
                 _check_pixels(path)
                 picture = images.read(path)
             except LtclError as error:
-                raise InputError(str(error).replace(str(path), repr(name))) from None
+                raise InputError(str(error).removeprefix(f"{path}: ")) from None
         shape = [*picture.shape, 1][:3]
         return {"picture": self.add(name, picture), "name": name, "shape": shape}
 

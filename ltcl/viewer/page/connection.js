@@ -7,9 +7,12 @@ const LONGEST_WAIT = 5000; // ms between two tries
 const AT_ONCE = { bounces: Infinity, compensate: Infinity }; // a newer one of these ends the one under way
 
 export class Connection extends EventTarget {
-  // Events: "open" (its detail is what the server says of T), "lost", "busy", "idle", and pushes by name.
+  // Events: "open" (its detail is what the server says of T), "lost", "busy", "ready", and pushes by name.
   constructor() {
     super();
+    for (const state of ["lost", "busy", "ready"]) {
+      this.addEventListener(state, () => { document.body.dataset.state = state; });
+    }
     this.kinds = new Map(); // of questions under way: those that were sent, and the newest after them
     this.questions = 0;
     this.tries = 0;
@@ -69,7 +72,7 @@ export class Connection extends EventTarget {
       if (!queue.sent.length) this.kinds.delete(message.do);
       if (typeof message.error === "string") question.fail(new Error(message.error)); // numbers are results
       else question.answer(message);
-      if (!this.kinds.size) this.tell("idle");
+      if (!this.kinds.size) this.tell("ready");
     }
   }
 }

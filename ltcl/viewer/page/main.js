@@ -22,15 +22,18 @@ let current = null;
 async function ask(kind, fields, arrays) {
   try {
     const answer = await connection.ask(kind, fields, arrays);
-    if (answer) say("");
+    if (answer) say("", kind);
     return answer;
   } catch (error) {
-    say(error.message);
+    say(error.message, kind);
     return null;
   }
 }
 
-function say(text) {
+// What is wrong with a question of this kind; an answer to one takes that away, and nothing else.
+function say(text, kind = "") {
+  if (!text && kind && kind !== $("banner").dataset.kind) return;
+  $("banner").dataset.kind = kind;
   $("banner").hidden = !text;
   if ($("banner").textContent !== text) $("banner").textContent = text;
 }
@@ -58,17 +61,12 @@ connection.addEventListener("open", async ({ detail: hello }) => {
 });
 
 connection.addEventListener("lost", () => {
-  document.body.dataset.state = "lost";
   say("Not connected; trying again…");
   fetch(location.pathname, { method: "HEAD" }).then(({ ok }) => {
     if (!ok) say("The viewer was started again, with another address: open that one");
   }, () => {});
 });
-connection.addEventListener("busy", () => { document.body.dataset.state = "busy"; });
-connection.addEventListener("idle", () => {
-  document.body.dataset.state = "ready";
-  $("progress").hidden = true;
-});
+connection.addEventListener("ready", () => { $("progress").hidden = true; });
 connection.addEventListener("progress", ({ detail: { residual } }) => {
   const share = Math.min(Math.max(-Math.log10(residual) / 3 || 0, 0.03), 1); // of the way to 1e-3
   $("progress").hidden = false;
@@ -147,21 +145,20 @@ async function known() {
 }
 
 // Give a file to the view in sight: it takes it itself, or the server does, and the view gets its number.
-async function open(file) {
+async function give(file) {
   const view = current;
   if (await views[view].take?.(file)) return;
-  document.body.dataset.state = "busy";
-  const answer = await fetch(`picture?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
-  if (!answer.ok) say(`${file.name}: ${await answer.text()}`);
-  else {
-    const { picture } = await answer.json();
-    await known();
-    const select = $(`${view}-source`);
-    if (!select || view !== current) return;
-    select.value = picture;
-    select.dispatchEvent(new Event("change"));
-  }
+  const address = `picture?name=${encodeURIComponent(file.name)}`;
+  const { error, picture } = await (await fetch(address, { method: "POST", body: file })).json();
+  if (error) throw new Error(error);
+  await known();
+  const select = $(`${view}-source`);
+  if (!select || view !== current) return;
+  select.value = picture;
+  select.dispatchEvent(new Event("change"));
 }
+
+const open = (file) => give(file).catch(({ message }) => say(`${file.name}: ${message}`, "pictures"));
 
 for (const input of document.querySelectorAll("input[type=file]")) {
   input.onchange = () => {

@@ -18,9 +18,7 @@ let keys = false; // whether they are for what shows patterns one after the othe
 connection.addEventListener("open", async ({ detail }) => {
   keys = detail.next;
   await connection.ask("projector");
-  document.body.dataset.state = "ready";
 });
-connection.addEventListener("lost", () => { document.body.dataset.state = "lost"; }); // the pattern stays
 connection.addEventListener("show", async ({ detail: { title, arrays: { codes } } }) => {
   document.title = `${title}: projector`;
   if (canvas.width !== codes.w || canvas.height !== codes.h) {
@@ -38,8 +36,8 @@ async function full() {
 }
 addEventListener("resize", fit);
 addEventListener("click", full);
-addEventListener("keydown", ({ key, target }) => {
-  if (key.toLowerCase() === "f" && target !== hint) full();
+addEventListener("keydown", ({ key }) => {
+  if (key.toLowerCase() === "f") full();
   if (keys && [" ", "ArrowRight", "ArrowDown", "PageDown"].includes(key)) connection.ask("next");
 });
 addEventListener("fullscreenchange", () => {

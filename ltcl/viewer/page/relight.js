@@ -82,7 +82,6 @@ export function relight({ $, ask, press, hello }) {
   }
 
   function animate(frame) {
-    begin();
     const step = (now) => {
       motion = requestAnimationFrame(step);
       if (!changed) frame(now / 1000); // the last one is on its way
@@ -108,15 +107,16 @@ export function relight({ $, ask, press, hello }) {
 
   async function take(file) {
     still();
-    const own = turn;
     if (file.type.startsWith("video/")) {
+      begin();
+      const own = turn;
       URL.revokeObjectURL(video.src);
       video.src = URL.createObjectURL(file);
-      await video.play();
+      await video.play().catch((error) => { if (own === turn) throw error; });
       if (own === turn) animate(() => cover(video, video.videoWidth, video.videoHeight));
       return true;
     }
-    const bitmap = await createImageBitmap(file).catch(() => null); // EXR and the like: the server reads them
+    const own = turn, bitmap = await createImageBitmap(file).catch(() => null); // EXR and the like: the server reads them
     if (!bitmap || own !== turn) return Boolean(bitmap);
     begin();
     cover(bitmap, bitmap.width, bitmap.height);
@@ -162,6 +162,7 @@ export function relight({ $, ask, press, hello }) {
   };
   $("relight-spot").onclick = () => {
     if ($("relight-spot").getAttribute("aria-pressed") === "true") return still();
+    begin();
     animate(spot);
     press($("relight-spot"), true);
   };
