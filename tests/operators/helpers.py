@@ -34,12 +34,10 @@ FORMATS: dict[str, Any] = {
 }
 ROWS = ("csr", "dense")  # those that relaxation and walks can read
 # How a product may be launched on CPUs and GPUs.
-LAUNCHES = {
-    "item": Variant("", 16, shared=False),
-    "item64": Variant("", 64, shared=False),
-} | {
+LAUNCHES = {"item": Variant("", 16, shared=False)} | {
+    # Fewer items than columns and more, neither a power of two: sums in trees work for any size.
     f"group{items}": Variant("_group", items, shared=True)
-    for items in (7, 32, 256)  # sums in trees work for any size
+    for items in (7, 100)
 }
 
 

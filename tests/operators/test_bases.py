@@ -36,7 +36,7 @@ def some(n: int, share: int = 3) -> np.ndarray:
 
 
 @pytest.mark.parametrize("small", [0, 12, 4096], ids=["a launch each", "small ones together", "all in one"])
-@pytest.mark.parametrize("name", [*NAMES, "pyramid"])
+@pytest.mark.parametrize("name", ["haar", "db4", "pyramid"])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_transforms_meet_their_twins(shaped, monkeypatch, grid, name, small):
     for module in (bases, wavelets):  # pixels of the levels that one launch does
@@ -121,7 +121,7 @@ import scipy.sparse
 import ltcl
 from ltcl.operators import Pyramid, SubsetBasis, Tiles, Wavelet
 device = ltcl.open_device()
-assert device.max_group == {size}
+assert device.max_group == 8
 device.kind = "gpu"
 x = np.random.default_rng(0).random((70 * 90, 3)).astype(np.float32)
 W = Wavelet(device, (70, 90))
@@ -136,11 +136,9 @@ assert abs(Tiles(device, scipy.sparse.csr_array(A)) @ x - A @ x).max() < 0.01
 """
 
 
-@pytest.mark.parametrize("size", [8, 64])
-def test_small_work_groups_will_do_in_the_shape_of_a_gpu(size):
-    environment = {**os.environ, "POCL_MAX_WORK_GROUP_SIZE": str(size)}
-    script = SMALL_GROUPS.format(size=size)
-    subprocess.run([sys.executable, "-c", script], env=environment, check=True, timeout=120)
+def test_small_work_groups_will_do_in_the_shape_of_a_gpu():
+    environment = {**os.environ, "POCL_MAX_WORK_GROUP_SIZE": "8"}
+    subprocess.run([sys.executable, "-c", SMALL_GROUPS], env=environment, check=True, timeout=120)
 
 
 @pytest.mark.parametrize(

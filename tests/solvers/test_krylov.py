@@ -190,7 +190,7 @@ def test_launches_waits_and_allocations_of_a_step(device, monkeypatch, method, k
 
 
 SIZES = pytest.mark.parametrize(("rows", "k"), [(1, 1), (53, 5), (257, 3), (40, 70), (5001, 1)])
-GROUPS = pytest.mark.parametrize("group", [1, 7, 256])
+GROUPS = pytest.mark.parametrize("group", [1, 100])  # sums in trees work for any size
 
 
 @SIZES
