@@ -13,6 +13,10 @@ from typing import Any
 class LtclError(Exception):
     """Base of every exception that ltcl raises on purpose."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Without it Dask makes a FileError that a worker sent by `ValueError.__new__`, which fails.
+        return type(self), self.args, self.__dict__
+
 
 class InputError(LtclError, ValueError):
     """An argument has an unusable value: shape, range, NaN, structure."""

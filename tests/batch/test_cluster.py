@@ -7,6 +7,8 @@ import importlib
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -103,6 +105,21 @@ def test_an_error_is_raised_at_the_place_of_its_item(client):
     assert [next(results) for _ in range(7)] == [*range(7)]
     with pytest.raises(InputError, match="number is 7"):
         next(results)
+
+
+ERRORS = """
+import ltcl.errors  # before Dask, which from then on pickles all exceptions there are in a way of its own
+import pickle, distributed
+for kind in vars(ltcl.errors).values():
+    if isinstance(kind, type) and issubclass(kind, Exception):
+        error = pickle.loads(pickle.dumps(kind("a is bad")))
+        assert (type(error), str(error)) == (kind, "a is bad")
+"""
+
+
+def test_errors_of_workers_arrive_as_they_are():
+    """A FileError, which is an OSError, too, ended the whole run: `ValueError.__new__` does not make one."""
+    subprocess.run([sys.executable, "-c", ERRORS], check=True, timeout=120)
 
 
 def test_what_was_killed_is_done_by_others_and_joins_again(client):
