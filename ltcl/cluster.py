@@ -117,11 +117,13 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
 
     These have a GPU each; or share `device`, by default that of LTCL_DEVICE, or the CPU, each with all of its
     cores: with fewer, sums are rounded in another order than without a cluster. By default they are as many
-    as there are GPUs, or one. ClusterError where nothing answers.
+    as there are GPUs, or one. InputError for what is no address, ClusterError where nothing answers.
     """
     distributed = _distributed()
     from dask import config
 
+    if cluster != "local" and not cluster.rpartition(":")[2].isdecimal():  # Dask would try for a minute
+        raise InputError(f"cluster is {cluster!r}; it must be 'local' or a scheduler's host:port")
     if cluster != "local" and workers is not None:
         raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
     # Else a worker that takes 15 s to start again, on a busy machine, is given up.

@@ -14,8 +14,7 @@ class LtclError(Exception):
     """Base of every exception that ltcl raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Without it Dask makes a FileError that a worker sent by `ValueError.__new__`, which fails.
-        return type(self), self.args, self.__dict__
+        return type(self), self.args, self.__dict__  # else Dask makes a FileError by `ValueError.__new__`
 
 
 class InputError(LtclError, ValueError):

@@ -353,6 +353,8 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
     ("options", "text"),
     [
         (["--cluster", "127.0.0.1:9"], "no scheduler answers"),
+        (["--cluster", "nonsense"], "'nonsense'; it must be 'local' or a scheduler's host:port"),
+        (["--cluster", ""], "cluster is ''"),
         (["--workers", "2"], "--workers is 2"),
         (["--cluster", "127.0.0.1:9", "--workers", "2"], "workers is 2"),
     ],
