@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The site: `python -m pip install ".[docs]" && sphinx-build -W --keep-going docs site`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import ltcl
+
+project = "ltcl"
+author = "ltcl developers"
+copyright = author  # noqa: A001 - Sphinx names it so
+version = release = ltcl.__version__
+
+extensions = [
+    "myst_parser",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["tutorials", "examples"]  # read by sphinx-gallery, which writes the pages below `auto_`
+
+myst_enable_extensions = ["dollarmath", "deflist", "fieldlist"]
+myst_heading_anchors = 3
+numpydoc_show_class_members = False
+
+sphinx_gallery_conf: dict[str, Any] = {
+    "examples_dirs": ["tutorials", "examples"],
+    "gallery_dirs": ["auto_tutorials", "auto_examples"],
+    "filename_pattern": r"\.py$",  # all of them run
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_memory": False,
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "ltcl"
+html_theme_options = {"show_prev_next": False, "navigation_with_keys": False}
