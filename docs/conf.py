@@ -9,7 +9,7 @@ import ltcl
 
 project = "ltcl"
 author = "ltcl developers"
-copyright = author  # noqa: A001 - Sphinx names it so
+copyright = author
 version = release = ltcl.__version__
 
 extensions = [
