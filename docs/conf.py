@@ -1,9 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The site: `python -m pip install ".[docs]" && sphinx-build -W --keep-going docs site`."""
+"""The site: `python -m pip install ".[docs]" && sphinx-build -W --keep-going docs site`.
+
+Nothing in it is asked of another host: formulas are MathML, which browsers draw themselves.
+"""
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
+
+from docutils import nodes
+from docutils.utils.math import latex2mathml
+from sphinx.application import Sphinx
+
+sys.path.insert(0, str(Path(__file__).parent))
+import generated
 
 import ltcl
 
@@ -17,13 +29,21 @@ extensions = [
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
+    "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
 ]
 exclude_patterns = ["tutorials", "examples"]  # read by sphinx-gallery, which writes the pages below `auto_`
+templates_path = ["templates"]
+nitpicky = False  # types in docstrings are words, not names
 
-myst_enable_extensions = ["dollarmath", "deflist", "fieldlist"]
-myst_heading_anchors = 3
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_heading_anchors = 4
+autodoc_typehints = "none"  # docstrings have them
+autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
 
 sphinx_gallery_conf: dict[str, Any] = {
     "examples_dirs": ["tutorials", "examples"],
@@ -33,8 +53,41 @@ sphinx_gallery_conf: dict[str, Any] = {
     "abort_on_example_error": True,
     "download_all_examples": False,
     "show_memory": False,
+    "write_computation_times": False,  # a page that takes its tables from another host
 }
 
 html_theme = "pydata_sphinx_theme"
 html_title = "ltcl"
-html_theme_options = {"show_prev_next": False, "navigation_with_keys": False}
+html_show_copyright = False
+html_theme_options = {
+    "show_prev_next": False,
+    "navigation_with_keys": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": [],
+    "footer_end": [],
+}
+html_sidebars = {"index": []}
+html_math_renderer = "mathml"
+
+
+def _inline(translator: Any, node: nodes.math) -> None:
+    translator.body.append(latex2mathml.tex2mathml(node.astext(), as_block=False))
+    raise nodes.SkipNode
+
+
+def _display(translator: Any, node: nodes.math_block) -> None:
+    formula = latex2mathml.tex2mathml(node.astext(), as_block=True)
+    translator.body.append(f'<div class="math">{formula}</div>\n')
+    raise nodes.SkipNode
+
+
+def _append(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Pages whose end is written from the program, or from the schema of its reports."""
+    if docname in generated.PAGES:
+        source[0] += generated.PAGES[docname]()
+
+
+def setup(app: Sphinx) -> None:
+    """What Sphinx calls."""
+    app.add_html_math_renderer("mathml", (_inline, None), (_display, None))
+    app.connect("source-read", _append)

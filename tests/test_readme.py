@@ -49,7 +49,7 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
 
 def test_the_page_on_noise_runs(device, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "noise.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guide" / "noise.md").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(code, names)  # noqa: S102

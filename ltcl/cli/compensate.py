@@ -98,7 +98,7 @@ def compensate(
 
     Of a folder or a video of frames, writes the numbered patterns and frames.json batch by batch, with one
     gain for all; Ctrl-C keeps what is done, for --resume. With --cluster workers solve, and do --transports;
-    docs/cluster.md shows how.
+    docs/guide/cluster.md shows how.
     """
     from ltcl.acquisition import Setup
 

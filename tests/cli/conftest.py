@@ -19,6 +19,7 @@ import ltcl
 from ltcl import images, scenes
 from ltcl.cli.main import main
 from ltcl.device import Device
+from tests import json_schema
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,16 @@ Program = Callable[..., Outcome]
 
 @pytest.fixture(scope="session")
 def program() -> Program:
-    """`ltcl` with these arguments."""
+    """`ltcl` with these arguments; what --json prints is held against its schema."""
 
     def run(*arguments: object) -> Outcome:
         out, err = io.StringIO(), io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = main([str(argument) for argument in arguments])
-        return Outcome(code, out.getvalue(), err.getvalue())
+        outcome = Outcome(code, out.getvalue(), err.getvalue())
+        if "--json" in arguments:
+            json_schema.check(arguments, outcome.document)
+        return outcome
 
     return run
 

@@ -101,7 +101,7 @@ def test_frames_and_videos_hold_codes(program, store, tmp_path, rig):
 def test_a_copy_is_told_where_its_calibration_is(program, store, waves, transport, tmp_path, rig):
     for name, command in {"compress": ["compress", store, "--out"], "convert": ["convert", store]}.items():
         copy = tmp_path / f"{name}.npz"
-        assert f"--calibration {store}" in program(*command, copy).err
+        assert f"--calibration {store}" in program(*command, copy, "--json").err
         out = ["--calibration", store, "--rtol", "0.02", "--out", tmp_path / "out"]
         assert program("compensate", copy, waves, *out).code == 0
         assert error_of(codes_in(tmp_path / "out" / "waves_pattern.png"), rig) < 0.04

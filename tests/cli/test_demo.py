@@ -12,6 +12,7 @@ import pytest
 
 from ltcl import demo, images
 from ltcl.errors import InputError, InputTypeError
+from tests import json_schema
 
 from .conftest import Outcome, Program
 
@@ -46,6 +47,7 @@ def test_files_and_steps_are_listed(done):
     files |= {"contact_sheet.png", "convergence.png", "report.json"}
     assert {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == files
     assert all(text in outcome.out for text in (f"{len(files)} files", str(out / "contact_sheet.png")))
+    json_schema.check(["demo"], {"folder": str(out), "files": sorted(files), **report})
     steps = [line.removeprefix("ltcl: ") for line in outcome.err.splitlines()]
     assert steps == [*demo.STEPS] == [*report["seconds"]]
     for name in ("size", "progress"):

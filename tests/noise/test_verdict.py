@@ -16,6 +16,7 @@ import ltcl
 from ltcl.cli.main import main
 from ltcl.noise import Noise
 from ltcl.verdict import Verdict, verdict
+from tests import json_schema
 from tests.noise.measured import measure, noise_of, truth
 
 random = np.random.default_rng()
@@ -209,7 +210,8 @@ def test_reports_end_in_it(capsys, tmp_path):
     assert judged.numbers["negative_bounce"] < 1e-3
     for command in ("info", "analyze"):
         assert main([command, str(tmp_path / "T.npz"), "--json"]) == 0
-        (entry,) = json.loads(capsys.readouterr().out)
+        json_schema.check([command], document := json.loads(capsys.readouterr().out))
+        (entry,) = document
         assert entry["verdict"]["text"] == judged.text
         assert entry["verdict"]["numbers"]["bounce_3"] == pytest.approx(judged.numbers["bounce_3"], rel=1e-3)
         assert main([command, str(tmp_path / "T.npz")]) == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Two ranks of `mpiexec` on this machine: what `mpi_ranks.py` has, and what docs/mpi.md shows."""
+"""Two ranks of `mpiexec` on this machine: what `mpi_ranks.py` has, and what docs/guide/mpi.md shows."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_rank_that_ends_alone_ends_the_other(tmp_path, case):
 
 
 def test_the_page_and_the_command_line(tmp_path, monkeypatch):
-    page = (ROOT / "docs/mpi.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/guide/mpi.md").read_text(encoding="utf-8")
     (script,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     command = re.search(r"mpiexec -n 2 ltcl (compensate T.zarr picture.png --mpi --out patterns)", page)
     assert command is not None

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -32,6 +33,7 @@ from ltcl.viewer import serve
 from ltcl.viewer.answers import Scene
 from ltcl.viewer.scan import Scan
 from ltcl.viewer.window import Window, play
+from tests import json_schema
 from tests.viewer.page import Page
 
 PATIENCE = 30.0  # seconds
@@ -340,4 +342,4 @@ def test_the_commands_run(tmp_path: Path, command: str) -> None:
             with looking(url, keys=True) as shown:
                 assert process.wait(PATIENCE) == 0
             assert len(shown) >= 2
-            assert '"shown": ' in process.stdout.read()
+        json_schema.check([command], json.load(process.stdout))
