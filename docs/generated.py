@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Ends of reference pages, as MyST: the commands, from the program; the fields of their JSON, from its schema."""
+"""Ends of reference pages, as MyST: the commands, from the program; fields of their JSON, from its schema."""
 
 from __future__ import annotations
 
