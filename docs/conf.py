@@ -30,10 +30,12 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx_copybutton",
+    "sphinx_design",
     "sphinx_gallery.gen_gallery",
 ]
 exclude_patterns = ["tutorials", "examples"]  # read by sphinx-gallery, which writes the pages below `auto_`
 templates_path = ["templates"]
+default_role = "py:obj"  # `compensate` in a docstring is a link
 nitpicky = False  # types in docstrings are words, not names
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]

@@ -27,7 +27,7 @@ def _command(command: Any, name: str) -> Iterator[str]:
         yield _prose(command.help)
     if not hasattr(command, "commands"):
         usage = command.get_usage(context).removeprefix("Usage: ").replace("{", "").replace("}", "")
-        yield f"\n```text\n{' '.join(usage.split())}\n```\n\n| | |\n|---|---|"
+        yield f"\n```text\n{' '.join(usage.split())}\n```\n\n| option | what it does |\n|---|---|"
         for parameter in command.params:
             if not parameter.hidden:
                 names, text = parameter.get_help_record(context)
@@ -63,7 +63,7 @@ def fields() -> str:
         lines += [f"\n(json-{name})=\n## {title}\n", schema["description"], ""]
         rows, choices = [*_rows(schema, "", parts)], schema.get("items", schema).get("anyOf", ())
         lines += [f"Each is a {' or a '.join(map(_type, choices))}."] * bool(choices)
-        lines += ["| field | type | |", "|---|---|---|", *rows] if rows else []
+        lines += ["| field | type | meaning |", "|---|---|---|", *rows] if rows else []
     return "\n".join(lines)
 
 

@@ -15,13 +15,26 @@ from ltcl.acquisition import Project
 from ltcl.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+GUIDE = ROOT / "docs" / "guide"
+README, ACQUISITION, SAMPLING, COMPRESSION = (
+    path.read_text(encoding="utf-8")
+    for path in (
+        ROOT / "README.md",
+        *(GUIDE / f"{name}.md" for name in ("acquisition", "sampling", "compression")),
+    )
+)
 
 
-def block(pattern: str) -> str:
-    found = re.search(pattern, README, re.DOTALL)
+def block(pattern: str, page: str = README) -> str:
+    found = re.search(pattern, page, re.DOTALL)
     assert found is not None
     return found[1]
+
+
+def test_the_readme_is_short_and_its_links_lead_somewhere():
+    assert README.count("\n") <= 120
+    links = re.findall(r"\]\(([^)#]+)", README)
+    assert [link for link in links if not (ROOT / link).is_file()] == []
 
 
 def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
@@ -30,15 +43,17 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
     exec(block(r"```python\n(.*?)```"), names)  # noqa: S102 - our own README
     assert Path("corner.png").is_file()
     assert "0.0% of the pattern clipped" in capsys.readouterr().out
-    few_pixels, from_photographs = re.findall(r"```py\n(.*?)```", README, re.DOTALL)
-    exec(few_pixels, names)  # noqa: S102
+    from_photographs = block(r"```py\n(.*?)```", ACQUISITION)
+    exec(block(r"```py\n(.*?)```", SAMPLING), names)  # noqa: S102
     few = names["few"]
     assert (few.standard_error <= 1e-3).all()
+    exec(block(r"```py\n(.*?)```", COMPRESSION), names)  # noqa: S102
+    assert names["inverse"].error <= 0.02
     commands = block(r"on the files these lines have made:\s+```\n(.*?)```").splitlines()
     assert len(commands) > 5
     for command in commands:
         _run(command, capsys)
-    for command in block(r"tells what else could stand there:\s+```sh\n(.*?)```").splitlines():
+    for command in block(r"tells what else could stand there:\s+```sh\n(.*?)```", ACQUISITION).splitlines():
         _run(command, capsys)
     exec(from_photographs, names)  # noqa: S102
     rig = names["rig"]
@@ -49,7 +64,7 @@ def test_what_the_readme_shows_runs(device, tmp_path, monkeypatch, capsys):
 
 def test_the_page_on_noise_runs(device, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "guide" / "noise.md").read_text(encoding="utf-8")
+    page = (GUIDE / "noise.md").read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(code, names)  # noqa: S102
@@ -70,9 +85,9 @@ def _run(command, capsys):
     assert main(arguments) == 0, capsys.readouterr().err
 
 
-def test_the_rigs_of_the_readme_are_ones(tmp_path):
+def test_the_rigs_of_the_guide_are_ones(tmp_path):
     kinds = []
-    for text in re.findall(r"```toml\n(.*?)```", README, re.DOTALL):
+    for text in re.findall(r"```toml\n(.*?)```", ACQUISITION, re.DOTALL):
         (tmp_path / "acquisition.toml").write_text(text)
         project = Project.open(tmp_path)
         assert project.outlook()[1]["grid"] == (48, 64)
