@@ -31,6 +31,7 @@ def missing(archive: Path) -> set[str]:
         with zipfile.ZipFile(archive) as wheel:
             return wanted - set(wheel.namelist())
     wanted = checkout("ltcl", "kernels", "tests", "bench") | {"LICENSE", "README.md", "pyproject.toml"}
+    wanted |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md")}
     with tarfile.open(archive) as sdist:
         return wanted - {name.partition("/")[2] for name in sdist.getnames()}
 

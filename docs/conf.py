@@ -60,6 +60,8 @@ sphinx_gallery_conf: dict[str, Any] = {
 
 html_theme = "pydata_sphinx_theme"
 html_title = "ltcl"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_show_copyright = False
 html_theme_options = {
     "show_prev_next": False,

@@ -55,8 +55,8 @@ def _prose(text: str) -> str:
 def fields() -> str:
     """A section for each command, then one for each part that several have: fields, types, meanings."""
     parts = json.loads(SCHEMA.read_text(encoding="utf-8"))["$defs"]
-    program = typer.main.get_command(app).commands
-    named = {label: words for name, each in program.items() for label, words in _names(name, each)}
+    program: Any = typer.main.get_command(app)
+    named = {label: words for name, each in program.commands.items() for label, words in _names(name, each)}
     lines = []
     for name, schema in sorted(parts.items(), key=lambda part: [*named, part[0]].index(part[0])):
         title = f"ltcl {named[name]}" if name in named else _words(name)

@@ -61,7 +61,7 @@ class Verdict:
 
     `text` has at most two sentences. T is good for `compensation` and `bounces` where errors by noise are at
     most 2 % in pictures, 5 % in bounces 1 to 3, and no damage spoils them; None where that is unknown.
-    `causes` are those of `numbers` that deviate, most important first; docs/reference/json.md says what each is.
+    `causes` are those of `numbers` that deviate, most important first; docs/reference/json.md lists them.
     """
 
     text: str

@@ -31,5 +31,5 @@ def test_types_and_the_console_script_come_along() -> None:
 def test_archives_hold_the_kernels_and_all_that_tests_need() -> None:
     targets = PROJECT["tool"]["hatch"]["build"]["targets"]
     assert targets["wheel"]["force-include"] == {"kernels": "ltcl/kernels"}
-    needed = {"/ltcl", "/kernels", "/tests", "/bench", "/CHANGELOG.md", "/LICENSE", "/README.md"}
+    needed = {"/ltcl", "/kernels", "/tests", "/bench", "/docs", "/CHANGELOG.md", "/LICENSE", "/README.md"}
     assert needed <= set(targets["sdist"]["include"])

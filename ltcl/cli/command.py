@@ -32,7 +32,7 @@ EXIT_CODES = (
     "**Exit codes:** 0 done; 1 refused or failed, said in one line; 2 wrong usage; 3 'ltcl acquire run' "
     "waits for photographs that a person has to take; 70 an error in ltcl itself; 130 Ctrl-C.\n\n"
     'With **--json** stdout holds one JSON document, also of a command that fails: {"error": what is wrong, '
-    '"type": its class in ltcl.errors, "exit_code": as above}. docs/reference/json.md lists the fields of the others.'
+    '"type": its class in ltcl.errors, "exit_code": as above}. docs/reference/json.md has all fields.'
 )
 _NOTE = 25  # level of a note, between INFO and WARNING
 _PERIOD = 300.0  # seconds of the past from which the time left is estimated
