@@ -14,10 +14,10 @@ from docutils import nodes
 from docutils.utils.math import latex2mathml
 from sphinx.application import Sphinx
 
-sys.path.insert(0, str(Path(__file__).parent))
-import generated
-
 import ltcl
+
+DOCS = Path(__file__).resolve().parent
+sys.path += [str(DOCS), str(DOCS.parent / "bench")]  # gallery_figures; what the paper's figures share with it
 
 project = "ltcl"
 author = "ltcl developers"
@@ -53,9 +53,9 @@ sphinx_gallery_conf: dict[str, Any] = {
     "filename_pattern": r"\.py$",  # all of them run
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
+    "write_computation_times": False,  # its page would load scripts from elsewhere
     "download_all_examples": False,
     "show_memory": False,
-    "write_computation_times": False,  # a page that takes its tables from another host
 }
 
 html_theme = "pydata_sphinx_theme"
@@ -87,8 +87,10 @@ def _display(translator: Any, node: nodes.math_block) -> None:
 
 def _append(app: Sphinx, docname: str, source: list[str]) -> None:
     """Pages whose end is written from the program, or from the schema of its reports."""
-    if docname in generated.PAGES:
-        source[0] += generated.PAGES[docname]()
+    from generated import PAGES
+
+    if docname in PAGES:
+        source[0] += PAGES[docname]()
 
 
 def setup(app: Sphinx) -> None:

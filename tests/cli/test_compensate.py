@@ -192,6 +192,14 @@ def test_commands_share_a_folder_and_list_their_files(results):
         assert text["files"][-1] == f"{command}.json"
 
 
+def test_many_transports_get_a_folder_each(program, transport, picture, tmp_path):
+    pattern = str(transport.with_name("corne[r].npz"))
+    report = program("compensate", "--transports", pattern, picture, "--out", tmp_path, "--json").json
+    (scene,) = report["scenes"]
+    assert scene["folder"] == str(tmp_path / "corner")
+    assert {*scene["files"]} == files_in(tmp_path / "corner")
+
+
 def test_a_failed_run_changes_nothing(program, transport, picture, tmp_path):
     assert program("compensate", transport, picture, "--out", tmp_path).code == 0
     before = {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)}
