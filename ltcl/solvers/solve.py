@@ -137,19 +137,19 @@ def solve(
     ====================  =======================================================================
     jacobi, neumann       none
     richardson            omega: damping, above 0; the best for the free bounds
-    chebyshev             spectrum: (lower, upper), between which that of S lies; the free bounds
-    |                     arnoldi: steps that refine it, 0 or at least 2; 2, or 0 with a spectrum
+    chebyshev             spectrum: (lower, upper), between which that of S lies; the free bounds.
+                          arnoldi: steps that refine it, 0 or at least 2; 2, or 0 with a spectrum
     gauss_seidel          block: rows of a block, for speed alone
     sor                   omega: in (0, 2); 1. block: as above
     block_gauss_seidel    block: rows solved together; 128
     southwell             rows: relaxed in one step; a 64th of the picture
     cg                    weights: (N,) of the inner product; those of S
     gmres                 restart: directions of a cycle; 20
-    monte_carlo           samples: walks of each pixel; 256. seed: below 2^64; 0
-    |                     pixels: (P,) of them to estimate; all. error: standard error wanted,
-    |                     in units of x; the last samples of a pixel are then at most 2^20
-    |                     albedo: m of eq. 24. adjoint: walks from b, without pixels and
-    |                     error; False. gather: one exact product at the end; False
+    monte_carlo           samples: walks of each pixel; 256. seed: below 2^64; 0.
+                          pixels: (P,) of them to estimate; all. error: standard error wanted,
+                          in units of x; the last samples of a pixel are then at most 2^20.
+                          albedo: m of eq. 24. adjoint: walks from b, without pixels and
+                          error; False. gather: one exact product at the end; False
     hybrid                samples: columns of each row; 32. seed, gather: as above
     bicgstab, direct      none; nor has auto
     ====================  =======================================================================
