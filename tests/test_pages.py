@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import importlib
 import inspect
 import json
@@ -49,6 +50,28 @@ def test_every_public_name_is_on_the_page_of_python() -> None:
             value = getattr(module, name)
             is_there = id(value) in objects or f"`{module.__name__}.{name}`" in PYTHON
             assert is_there or inspect.ismodule(value), f"{module.__name__}.{name}"
+
+
+EXAMPLES = "\n".join(re.findall(r"```pycon\n(.*?)```", PYTHON, re.DOTALL))
+
+
+def test_every_public_name_has_an_example() -> None:
+    """In its docstring, in that of a method, or on the page; of an error the message is one."""
+    without = []
+    for name in re.findall(r"^   (ltcl\.[\w.]+)$", PYTHON, re.MULTILINE):
+        own = resolve(name)
+        inner = vars(own).values() if inspect.isclass(own) else ()
+        documents = [inspect.getdoc(each) or "" for each in (own, *inner) if hasattr(each, "__doc__")]
+        shown = re.search(rf"\b{name.rpartition('.')[2]}\b", EXAMPLES)
+        if not (shown or name.startswith("ltcl.errors.") or any(">>>" in text for text in documents)):
+            without.append(name)
+    assert without == []
+
+
+@pytest.mark.usefixtures("device")
+def test_the_examples_on_the_page_run() -> None:
+    examples = doctest.DocTestParser().get_doctest(EXAMPLES, {}, "python.md", "python.md", 0)
+    assert doctest.DocTestRunner().run(examples).failed == 0, "see the report above"
 
 
 def texts() -> str:
