@@ -238,9 +238,7 @@ class _Crew:
                 error = ClusterError(f"an item lost its workers {_TRIES} times; it may be what ends them")
                 break
             for each in lost:  # all have gone, and Dask must not choose others
-                if (
-                    each is task or each.tries < _TRIES - 1
-                ):  # the last try is alone: others may end the worker
+                if each is task or each.tries < _TRIES - 1:  # the last try alone: others may end workers
                     self.submit(each)
             try:
                 with self.client.as_current():

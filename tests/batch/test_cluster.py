@@ -362,7 +362,9 @@ def test_a_cluster_that_is_none_is_refused_in_one_line(film, tmp_path, capsys, o
 
 def test_a_name_of_no_machine_is_refused_at_once(monkeypatch):
     monkeypatch.setattr("distributed.Client", None)
-    with pytest.raises(ClusterError, match="cluster is 'nonsense.invalid:8786', where no scheduler answers"):
+    with pytest.raises(
+        ClusterError, match=r"cluster is 'nonsense\.invalid:8786', where no scheduler answers"
+    ):
         connect("nonsense.invalid:8786").__enter__()
 
 
