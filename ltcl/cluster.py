@@ -352,7 +352,9 @@ def _work(token: str, item: bytes) -> tuple[Any, tuple[str, str] | None]:
                 _functions[token] = loads(_functions[token])
         except Exception as error:  # noqa: BLE001 - of whatever reads a part of it
             return None, (get_worker().address, f"{type(error).__name__}: {error}")
-        result = _functions[token](loads(item))
+        result = _attempt(_functions[token], loads(item))
+        if isinstance(result, LtclError):
+            raise result
         _pickled(result, "the result cannot be sent from a worker", buffer_callback=lambda buffer: False)
         return result, None
 

@@ -14,8 +14,7 @@ class LtclError(Exception):
     """Base of every exception that ltcl raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For another process: the message alone, as what else it holds may lie on a device."""
-        return type(self), self.args
+        return type(self), self.args, self.__dict__  # else Dask makes a FileError by `ValueError.__new__`
 
 
 class InputError(LtclError, ValueError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,6 @@ def test_every_error_comes_back_from_a_worker(kind):
     """Where Dask was imported after ltcl it pickles errors by tblib, which may leave out `__init__`."""
     install(kind)
     error = kind("a file")
-    error.held = lambda: None  # which cannot be pickled
     copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - ours
     assert (type(copy), str(copy), vars(copy)) == (kind, "a file", vars(kind("a file")))
 
@@ -57,6 +57,16 @@ def test_a_scene_that_ends_its_workers_is_named_and_the_rest_goes_on(client):
     results = error.value.results
     assert [*results[:1], *results[3:]] == ["a", "d", "e"]
     assert [type(each) for each in results[1:3]] == [ClusterError] * 2
+
+
+def test_what_an_error_holds_stays_with_the_worker(client):
+    def fail(scene: str) -> None:
+        error = errors.ConvergenceError(f"{scene} is none")
+        error.held = threading.Lock()  # which cannot be pickled
+        raise error
+
+    with pytest.raises(BatchError, match=r"1 of 1 scenes failed: a: a is none"):
+        ltcl.batch.map(fail, "a", client=client)
 
 
 def test_a_result_that_cannot_be_sent_is_the_error_of_its_scene(client):
