@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pytest plugin of CI: a skipped test fails, and so does a run in which no test meets a device.
 
+Failures are named as they happen: a run that is ended has said what failed.
+
 One reason to skip is accepted: that the folder `../shared/data` is absent, which holds captures that
 are not part of the project. Expected failures (`xfail`) are no skips.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -41,6 +45,12 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
     report = yield
     _refuse_skip(report)
     return report
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Name what failed at once, in the process that collects reports."""
+    if report.failed and "PYTEST_XDIST_WORKER" not in os.environ:
+        print(f"\nFAILED {report.nodeid} ({report.when})", file=sys.stderr, flush=True)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

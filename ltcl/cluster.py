@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 logger = logging.getLogger(__name__)
-_TRIES = 20  # of an item whose workers are lost, before it is taken for the reason
+_TRIES = 3  # of an item whose workers are lost, before it is taken for the reason
 _PATIENCE = 60.0  # seconds without a worker: what was killed has been started again by then
 _PERIOD = 1.0  # seconds between two looks at the list of workers
 _PCI = ("pci_domain_id_nv", "pci_bus_id_nv", "pci_slot_id_nv")  # what CUDA_VISIBLE_DEVICES does not renumber
@@ -48,6 +48,7 @@ def stream(
     *,
     window: int = 3,
     share_gpu: bool = False,
+    errors: bool = False,
 ) -> Iterator[Any]:
     """Yield function(item) of each item, in their order, computed on the workers of a Dask client.
 
@@ -62,15 +63,17 @@ def stream(
         Items on the way for each worker: one is computed, others are there when it ends.
     share_gpu : bool
         Whether several workers may use one GPU; else all but the first are excluded. A CPU can be shared.
+    errors : bool
+        Whether the error of an item is yielded in its place, and not raised, which ends the stream.
 
     A worker that is excluded is named with the reason in a warning.
 
     Raises
     ------
     ClusterError
-        No worker can take part or, for a minute, none is left; the scheduler is lost; an item loses workers.
+        No worker can take part or, for a minute, none is left; the scheduler is lost.
     LtclError
-        Of `function`, at the place of its item.
+        Of `function`, at the place of its item; of one that ends its workers, or whose result cannot be sent.
 
     Examples
     --------
@@ -80,9 +83,9 @@ def stream(
     [1, 2, 3]
     """
     if client is None:
-        yield from map(function, items)
+        yield from (_attempt(function, item) for item in items) if errors else map(function, items)
         return
-    crew = _Crew(client, require(client), _pickled(function), share_gpu)
+    crew = _Crew(client, require(client), _pickled(function), share_gpu, errors)
     window = checks.count("window", window)
     try:
         for item in items:
@@ -94,6 +97,14 @@ def stream(
             yield crew.result()
     finally:
         crew.leave()
+
+
+def _attempt(function: Callable[[Any], Any], item: Any) -> Any:
+    """Its result, or an LtclError without what it holds, which may lie on the device."""
+    try:
+        return function(item)
+    except LtclError as error:
+        return type(error)(*error.args)
 
 
 def is_there(client: Any, path: Any) -> bool:
@@ -122,15 +133,19 @@ def connect(cluster: str, workers: int | None = None, device: str | None = None)
     distributed = _distributed()
     from dask import config
 
-    if cluster != "local" and not cluster.rpartition(":")[2].isdecimal():  # Dask would try for a minute
+    port = cluster.rpartition(":")[2]
+    if cluster != "local" and not (port.isdecimal() and int(port) < 1 << 16):  # Dask would try for a minute
         raise InputError(f"cluster is {cluster!r}; it must be 'local' or a scheduler's host:port")
     if cluster != "local" and workers is not None:
         raise InputError(f"workers is {workers}, but the cluster at {cluster} has its own")
     # Else a worker that takes 15 s to start again, on a busy machine, is given up.
     patience = {"distributed.deploy.lost-worker-timeout": f"{_PATIENCE}s"}
     place = _processes(workers, device) if cluster == "local" else contextlib.nullcontext(cluster)
-    with place as address, config.set(patience):
+    quiet = distributed.utils.silence_logging_cmgr(logging.CRITICAL)  # of whoever is lost: one error says it
+    with place as address, config.set(patience), quiet:
         try:
+            if cluster != "local":
+                distributed.comm.resolve_address(cluster)  # else Dask tries for a while
             client = distributed.Client(address, set_as_default=False)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())
@@ -162,15 +177,15 @@ def _distributed() -> Any:
     return distributed
 
 
-def _pickled(value: Any) -> bytes:
+def _pickled(value: Any, what: str = "what workers need cannot be sent to them", **how: Any) -> bytes:
     """Bytes: Dask looks for no keys in them, and a worker reads them when it has ltcl."""
     from distributed.protocol.pickle import dumps
 
     try:
-        return dumps(value)
-    except (TypeError, AttributeError, ValueError) as error:
+        return dumps(value, **how)
+    except Exception as error:  # of whatever it holds
         reason = " ".join(str(error).split())
-        raise InputTypeError(f"what workers need cannot be sent to them: {reason:.200}") from error
+        raise InputTypeError(f"{what}: {reason:.200}") from error
 
 
 @dataclass(eq=False)
@@ -189,6 +204,7 @@ class _Crew:
     scheduler: str  # its address
     function: bytes
     share_gpu: bool
+    errors: bool  # whether they are results
     tasks: deque[_Task] = field(default_factory=deque)  # in order, until their results are yielded
     ready: dict[str, str | None] = field(default_factory=dict)  # addresses of workers, and their GPUs
     excluded: set[str] = field(default_factory=set)
@@ -199,12 +215,12 @@ class _Crew:
 
     def submit(self, task: _Task) -> None:
         """Send a task to the workers that are ready, when there are some."""
-        if task.tries == _TRIES:
-            raise ClusterError(f"an item lost its workers {_TRIES} times; it may be what ends them")
         self.look()
         while not self.ready:
             time.sleep(_PERIOD / 10)
             self.look()
+        if task.future is not None:
+            task.future.release()  # tracebacks of waits in vain hold it, too
         task.workers, task.tries = frozenset(self.ready), task.tries + 1
         rules: Any = {"workers": [*task.workers], "pure": False}
         with warnings.catch_warnings(action="ignore"):  # of large arguments, which `window` bounds
@@ -214,31 +230,38 @@ class _Crew:
         """What the first task gives, however many workers it takes."""
         from distributed import CancelledError, KilledWorker, wait
 
-        task, patience = self.tasks[0], _PERIOD
+        task, patience, result = self.tasks[0], _PERIOD, None
         while True:
             self.look()
-            for each in self.tasks:
-                if not each.workers & self.ready.keys():  # all have gone, and Dask must not choose others
+            lost = [each for each in self.tasks if not each.workers & self.ready.keys()]
+            if task in lost and task.tries == _TRIES:
+                error = ClusterError(f"an item lost its workers {_TRIES} times; it may be what ends them")
+                break
+            for each in lost:  # all have gone, and Dask must not choose others
+                if each is task or each.tries < _TRIES - 1:  # the last try alone: others may end workers
                     self.submit(each)
             try:
                 with self.client.as_current():
                     wait(task.future, timeout=_PERIOD)  # `result` that waits in vain leaves tracebacks behind
-                result, error, refusal = task.future.result(timeout=patience)
+                error, refusal = task.future.exception() if task.future.status == "error" else None, None
+                if isinstance(error, KilledWorker):
+                    raise error
+                if error is None:
+                    result, refusal = task.future.result(timeout=patience)
             except (OSError, CancelledError, KilledWorker) as failure:
-                if task.future.status == "error" and not isinstance(failure, KilledWorker):
-                    raise  # of the function
                 if not isinstance(failure, TimeoutError):
                     self.looked, task.workers = -math.inf, frozenset()  # look, and submit it again
                 elif task.future.status == "finished":  # large, or on a worker that has died
                     patience *= 2.0
                 continue
             if refusal is None:
-                self.tasks.popleft().future.release()  # tracebacks of waits in vain hold it, too
-                if error is not None:
-                    raise error
-                return result
+                break
             self.admit(*refusal)
             task.workers, task.tries = frozenset(), 0
+        self.tasks.popleft().future.release()
+        if error is not None and not (self.errors and isinstance(error, LtclError)):
+            raise error
+        return result if error is None else error
 
     def leave(self) -> None:
         """Leave nothing on the scheduler and the workers, also where a traceback holds this."""
@@ -316,23 +339,24 @@ def describe() -> tuple[str, str | None]:
     return device.name, f"{platform.node()} {' '.join(place)}" if device.kind == "gpu" else None
 
 
-def _work(token: str, item: bytes) -> tuple[Any, LtclError | None, tuple[str, str] | None]:
-    """Result or error of an item; or the address of this worker, and why it has no such function."""
+def _work(token: str, item: bytes) -> tuple[Any, tuple[str, str] | None]:
+    """Result of an item; or the address of this worker, and why it has no such function."""
     from distributed import get_worker
     from distributed.protocol.pickle import loads
 
     with _running:
         if token not in _functions:  # started again, at the same address
-            return None, None, (get_worker().address, "")
+            return None, (get_worker().address, "")
         try:
             if isinstance(_functions[token], bytes):
                 _functions[token] = loads(_functions[token])
         except Exception as error:  # noqa: BLE001 - of whatever reads a part of it
-            return None, None, (get_worker().address, f"{type(error).__name__}: {error}")
-        try:
-            return _functions[token](loads(item)), None, None
-        except LtclError as error:  # without what it holds, which may lie on the device
-            return None, type(error)(*error.args), None
+            return None, (get_worker().address, f"{type(error).__name__}: {error}")
+        result = _attempt(_functions[token], loads(item))
+        if isinstance(result, LtclError):
+            raise result
+        _pickled(result, "the result cannot be sent from a worker", buffer_callback=lambda buffer: False)
+        return result, None
 
 
 def _leave(token: str) -> None:

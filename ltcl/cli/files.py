@@ -282,8 +282,6 @@ def _transform(
     formats.find(out, inverse=is_inverse)
     if not is_inverse and out.suffix.lower() not in (".npz", ".zarr"):
         raise InputError(f"--out is {out}; what {context.name} makes must be a .npz or a .zarr")
-    if out.exists() and file.exists() and out.samefile(file):
-        raise InputError(f"--out is {out}, which is TRANSPORT itself; it must be another file")
     T = options.load(context, file)
     result = make(T, progress=partial(context.progress, total=1.0))
     (store.save_inverse if is_inverse else store.save)(out, result)

@@ -154,7 +154,9 @@ TASK = (*TRANSPORT, solve_options, picture_options)
 
 def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
     """Open the device, then load: a mistyped device does not wait for a large file."""
-    device: Any = context.options["device"]
+    device, out = context.options["device"], context.options.get("out")
+    if out is not None and out.exists() and path.exists() and out.samefile(path):
+        raise InputError(f"--out is {out}, which is TRANSPORT itself; it must be another place")
     if context.options.get("mpi"):
         from mpi4py import MPI
 

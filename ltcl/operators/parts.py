@@ -13,6 +13,7 @@ platform, as many as it is fast, and all work at once.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -213,7 +214,7 @@ def _trial(device: Device) -> float:
 
 def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
     """Whether all `matrices` are on a disk, and their R in float32 would not fit the device or the host."""
-    if not all(hasattr(T, "row_blocks") or isinstance(_root(T), np.memmap) for T in matrices):
+    if not all(hasattr(T, "row_blocks") or isinstance(_root(intact(T)), np.memmap) for T in matrices):
         return False
     dense = [4 * T.size for T in matrices if isinstance(T, np.ndarray)]
     entries = sum(dense) + sum(8 * T.nnz for T in matrices if not isinstance(T, np.ndarray))
@@ -241,6 +242,15 @@ def row_blocks(matrix: Any) -> Iterator[tuple[int, Any]]:
     return read_ahead(_reader(matrix, rows), range(0, matrix.shape[0], rows))
 
 
+def intact(array: Any) -> Any:
+    """`array`; FileError where it is mapped to a file that is shorter by now: reading ends the process."""
+    root = _root(array)
+    path = getattr(root, "filename", None)
+    if path is not None and os.path.exists(path) and os.path.getsize(path) < root.offset + root.nbytes:
+        raise FileError(f"{path}: has become shorter; it must stay as it is while T is used")
+    return array
+
+
 def _reader(matrix: np.ndarray, rows: int) -> Callable[[int], tuple[int, np.ndarray]]:
     """Reads some rows from one on; of a mapped file not by page faults, which are several times slower."""
     root, (height, width) = _root(matrix), matrix.shape
@@ -258,7 +268,7 @@ def _reader(matrix: np.ndarray, rows: int) -> Callable[[int], tuple[int, np.ndar
         except MemoryError as error:
             raise MemoryLimitError(f"{path}: {error}") from error
         if values.size < count:
-            raise FileError(f"{path}: has become shorter; it must stay as it is while T is used")
+            intact(matrix)
         return first, values.reshape(-1, width)
 
     return read

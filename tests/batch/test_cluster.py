@@ -25,28 +25,10 @@ from ltcl import images
 from ltcl.batch import compensate_frames
 from ltcl.cli.main import main
 from ltcl.cluster import connect, stream
-from ltcl.errors import BatchError, ClusterError, FileError, InputError, InputTypeError
+from ltcl.errors import ClusterError, FileError, InputError, InputTypeError
 from tests.problems import lambertian
 
-WORKERS: dict[str, Any] = {"n_workers": 2, "threads_per_worker": 1, "host": "127.0.0.1", "silence_logs": 50}
-WORKERS |= {"scheduler_kwargs": {"dashboard": False, "dashboard_address": "127.0.0.1:0"}}
-
-
-@pytest.fixture(scope="module")
-def cluster(private_cache) -> Iterator[Client]:
-    """Of two workers, each with the device that ltcl opens by default, and what tests remember."""
-    slowly = dask.config.set({"distributed.deploy.lost-worker-timeout": "120s"})  # on a busy machine
-    environment = {"LTCL_CACHE": str(private_cache)}
-    with slowly, LocalCluster(**WORKERS, env=environment) as cluster, Client(cluster) as client:
-        yield client
-
-
-@pytest.fixture
-def client(cluster) -> Client:
-    """Both workers, those that an earlier test killed, too."""
-    cluster.wait_for_workers(2)
-    cluster.run(lambda: ltcl.open_device().name)
-    return cluster
+from .conftest import WORKERS
 
 
 def pids(client: Client, *workers: str) -> list[int]:
@@ -105,21 +87,6 @@ def test_an_error_is_raised_at_the_place_of_its_item(client):
     assert [next(results) for _ in range(7)] == [*range(7)]
     with pytest.raises(InputError, match="number is 7"):
         next(results)
-
-
-ERRORS = """
-import ltcl.errors  # before Dask, which from then on pickles all exceptions there are in a way of its own
-import pickle, distributed
-for kind in vars(ltcl.errors).values():
-    if isinstance(kind, type) and issubclass(kind, Exception):
-        error = pickle.loads(pickle.dumps(kind("a is bad")))
-        assert (type(error), str(error)) == (kind, "a is bad")
-"""
-
-
-def test_errors_of_workers_arrive_as_they_are():
-    """A FileError, which is an OSError, too, ended the whole run: `ValueError.__new__` does not make one."""
-    subprocess.run([sys.executable, "-c", ERRORS], check=True, timeout=120)
 
 
 def test_what_was_killed_is_done_by_others_and_joins_again(client):
@@ -273,6 +240,45 @@ def test_another_T_in_the_file_of_a_worker_is_refused(client, film, tmp_path, ca
     assert not (tmp_path / "out").exists()
 
 
+KILLS = """
+import os, signal, sys
+from ltcl.batch import manifest
+from ltcl.cli.main import main
+
+def write(folder, head, records, write=manifest.write):
+    write(folder, head, records)
+    if len(records) == 8:
+        os.kill(int(sys.argv[1]), signal.SIGKILL)
+
+manifest.write = write
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+def test_a_killed_scheduler_is_one_line_and_the_next_run_goes_on(film, tmp_path):
+    words = ["compensate", *map(str, (film / "T.npz", film / "in")), "--rtol", "0.01", "--appearance"]
+    words += ["--batch", "4", "--out", str(tmp_path / "out"), "--quiet"]
+    file, dask = str(tmp_path / "scheduler.json"), [sys.executable, "-m", "dask"]
+    commands = ["scheduler --host 127.0.0.1 --port 0", "worker --nthreads 1 --no-nanny"]
+    started = [[*dask, *each.split(), "--no-dashboard", "--scheduler-file", file] for each in commands]
+    processes = [subprocess.Popen(each, stderr=subprocess.DEVNULL) for each in started]
+    try:
+        with Client(scheduler_file=file) as client:
+            client.wait_for_workers(1)
+            address = client.scheduler_info()["address"]
+        kills = [sys.executable, "-c", KILLS, str(processes[0].pid), *words, "--cluster", address]
+        run = subprocess.run(kills, stderr=subprocess.PIPE, text=True, timeout=200)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    assert (run.returncode, run.stderr.count("\n")) == (1, 1), run.stderr
+    assert "was lost; 8 frame(s) are done" in run.stderr
+    assert main([*words, "--resume"]) == 0
+    patterns = {name: data for name, data in everything(film / "serial").items() if "json" not in name}
+    assert everything(tmp_path / "out").items() >= patterns.items()
+
+
 @pytest.mark.parametrize("on_cluster", [False, True])
 def test_broken_frames_are_left_out_and_named(request, film, device, tmp_path, on_cluster):
     client = request.getfixturevalue("client") if on_cluster else None
@@ -312,21 +318,6 @@ def test_a_lost_scheduler_is_one_line_and_the_next_run_goes_on(film, device, tmp
     assert everything(tmp_path) == everything(film / "serial")
 
 
-@pytest.mark.parametrize("on_cluster", [False, True])
-def test_scenes_one_task_each_and_those_that_fail_are_named(request, film, tmp_path, on_cluster):
-    client = request.getfixturevalue("client") if on_cluster else None
-    paths, calls = [film / "T.npz", tmp_path / "none.npz", film / "T.npz", tmp_path / "nor.npz"], []
-
-    def light(path: Path) -> float:
-        return float(ltcl.load(path).first_bounce.sum())
-
-    with pytest.raises(BatchError, match=r"2 of 4 .*none\.npz: .*nor\.npz: ") as error:
-        ltcl.batch.map(light, paths, client=client, progress=lambda *now: calls.append(now))
-    assert calls == [("scenes", number, 4) for number in (1, 2, 3, 4)]
-    assert error.value.results[::2] == [pytest.approx(SCENE.F.sum(), rel=0.2)] * 2
-    assert all(isinstance(each, FileError) for each in error.value.results[1::2])
-
-
 def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_path, capsys):
     desired = tmp_path / "desired.png"
     images.write(desired, np.full(GRID, 0.2))
@@ -355,24 +346,26 @@ def test_the_command_line_does_frames_and_scenes_on_a_cluster(client, film, tmp_
         (["--cluster", "127.0.0.1:9"], "no scheduler answers"),
         (["--cluster", "nonsense"], "'nonsense'; it must be 'local' or a scheduler's host:port"),
         (["--cluster", ""], "cluster is ''"),
+        (["--cluster", "127.0.0.1:99999"], "99999'; it must be"),
         (["--workers", "2"], "--workers is 2"),
         (["--cluster", "127.0.0.1:9", "--workers", "2"], "workers is 2"),
     ],
 )
 def test_a_cluster_that_is_none_is_refused_in_one_line(film, tmp_path, capsys, options, text):
+    out = str(tmp_path / "out")
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
-        frames = [
-            "compensate",
-            str(film / "T.npz"),
-            str(film / "in"),
-            "--out",
-            str(tmp_path / "out"),
-            *options,
-        ]
-        assert main(frames) == 1
+        assert main(["compensate", *map(str, (film / "T.npz", film / "in")), "--out", out, *options]) == 1
     error = capsys.readouterr().err
     assert (text in error, error.count("\n")) == (True, 1), error
     assert not (tmp_path / "out").exists()
+
+
+def test_a_name_of_no_machine_is_refused_at_once(monkeypatch):
+    monkeypatch.setattr("distributed.Client", None)
+    with pytest.raises(
+        ClusterError, match=r"cluster is 'nonsense\.invalid:8786', where no scheduler answers"
+    ):
+        connect("nonsense.invalid:8786").__enter__()
 
 
 def test_local_workers_have_the_compute_units_of_a_serial_run():

@@ -42,6 +42,7 @@ def refusal(path: Path, data: bytes) -> str | None:
         return None
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
+    assert " object at 0x" not in message
     return message
 
 

@@ -413,7 +413,7 @@ def test_sockets_are_counted(running):
 
 
 def test_one_that_does_not_read_delays_nobody_and_is_closed(monkeypatch, device):
-    monkeypatch.setattr(server, "PATIENCE", 2.0)
+    monkeypatch.setattr(server, "PATIENCE", 4.0)
     pixels = 1 << 20  # a picture of 2 MB, more than what lies in sockets
     T = scipy.sparse.csr_array((np.ones(pixels), (np.arange(pixels), np.arange(pixels) % 4)))
     T = ltcl.Transport(T, (2, 2), camera_grid=(1024, 1024))
@@ -422,11 +422,11 @@ def test_one_that_does_not_read_delays_nobody_and_is_closed(monkeypatch, device)
         small.connect(("127.0.0.1", int(page.origin.split(":")[2])))
         address = viewer.url.replace("http", "ws", 1) + "socket"
         with connect(address, sock=small, origin=Origin(page.origin), max_queue=1) as deaf:
-            for number in range(40):
+            for number in range(60):
                 with contextlib.suppress(ConnectionClosed):
                     deaf.send(json.dumps({"id": number, "do": "column", "pixel": [0, 0]}))
                 start = time.monotonic()
                 assert "pattern" in page.ask("row", pixel=[0, 0])
-                assert time.monotonic() - start < 1.5
+                assert time.monotonic() - start < 3.5  # of a busy machine
                 time.sleep(0.1)
             assert len(viewer._clients) == 1
