@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import ltcl
+
+DOCS = Path(__file__).resolve().parent
+sys.path += [str(DOCS), str(DOCS.parent / "bench")]  # gallery_figures; what the paper's figures share with it
 
 project = "ltcl"
 author = "ltcl developers"
@@ -31,6 +36,8 @@ sphinx_gallery_conf: dict[str, Any] = {
     "filename_pattern": r"\.py$",  # all of them run
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
+    "image_scrapers": ["gallery_figures"],
+    "capture_repr": (),  # what a block prints is enough
     "download_all_examples": False,
     "show_memory": False,
 }

@@ -122,7 +122,7 @@ def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", widt
     if not rows:
         raise InputError("rows hold no picture; there must be at least one to draw")
     shown = [{name: as_picture(name, image) for name, image in row.items()} for row in rows]
-    scale = max(width / 1000, 0.6)  # of text
+    scale = max(width / 1000, 0.85)  # of text
     margin, gap, top, drawn = round(0.025 * width), round(0.016 * width), 20 * scale, []
     top += 34 * scale * bool(title) + 24 * scale * (subtitle.count("\n") + bool(subtitle)) + 6 * scale
     for row in shown:
@@ -146,12 +146,13 @@ def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", widt
 
 def _draw_picture(figure: Figure, box: tuple[float, float, float, float], image: np.ndarray) -> None:
     w, h = max(round(box[2]), 1), max(round(box[3]), 1)
+    black = resize((np.atleast_3d(image) == 0).all(axis=-1).astype(np.float32), (h, w)) == 1
     if times := w // image.shape[1]:  # enlarged to more than is drawn: squares with sharp edges
         image = image.repeat(times + 1, axis=0).repeat(times + 1, axis=1)
     codes = np.atleast_3d(to_srgb(np.clip(resize(image, (h, w)), 0, 1)))
     codes = np.broadcast_to(codes, (h, w, 3))
     paper = np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)])
-    codes = np.where(codes.max(axis=-1, keepdims=True) > 0, codes, paper)
+    codes = np.where(black[..., None], paper, codes)
     axes = axes_at(figure, box)
     axes.imshow(np.rint(255 * codes).astype(np.uint8), interpolation="none", aspect="auto")
     axes.axis("off")
