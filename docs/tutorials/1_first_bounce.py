@@ -59,9 +59,7 @@ result = ltcl.compensate(transport, wanted, gain="auto")
 print(f"error {result.error:.1%}, at {result.gain:.0%} of the brightness")
 
 then = result.appearance / result.gain
-figure = pictures(
-    {"throw this pattern": view(result.pattern), "and this is seen": view(then)}, width=640
-)
+figure = pictures({"throw this pattern": view(result.pattern), "and this is seen": view(then)}, width=640)
 
 # %%
 # The pattern is green and blue where the walls are red, and darker where other walls will add their light.

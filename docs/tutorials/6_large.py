@@ -82,8 +82,12 @@ record = json.loads(Path("../../bench/results/resolution131k-xeon-pocl3.0.json")
 facts = record["facts"]
 print(record["device"], "- 2 cores\n")
 print(f"T in full                     {facts['bytes of R, were it dense'] / 1e9:8.0f} GB in three colours")
-print(f"compressed, for bounces       {float(facts['bytes of T, for bounces and for patterns'].split(',')[0]) / 1e6:8.1f} MB")
-print(f"compressed, for patterns      {float(facts['bytes of T, for bounces and for patterns'].split(',')[1]) / 1e6:8.1f} MB")
+print(
+    f"compressed, for bounces       {float(facts['bytes of T, for bounces and for patterns'].split(',')[0]) / 1e6:8.1f} MB"
+)
+print(
+    f"compressed, for patterns      {float(facts['bytes of T, for bounces and for patterns'].split(',')[1]) / 1e6:8.1f} MB"
+)
 print(f"to compress it                {facts['compressing A, s'] / 60:8.1f} minutes")
 print(f"to compensate a picture       {facts['compensate in colour, ms']:8.1f} ms")
 for claim in record["claims"][:4]:

@@ -146,7 +146,7 @@ def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", widt
 
 def _draw_picture(figure: Figure, box: tuple[float, float, float, float], image: np.ndarray) -> None:
     w, h = max(round(box[2]), 1), max(round(box[3]), 1)
-    black = resize((np.atleast_3d(image) == 0).all(axis=-1).astype(np.float32), (h, w)) == 1
+    black = resize((np.atleast_3d(image) == 0).all(axis=-1).astype(np.float32), (h, w)) > 0.999
     if times := w // image.shape[1]:  # enlarged to more than is drawn: squares with sharp edges
         image = image.repeat(times + 1, axis=0).repeat(times + 1, axis=1)
     codes = np.atleast_3d(to_srgb(np.clip(resize(image, (h, w)), 0, 1)))
