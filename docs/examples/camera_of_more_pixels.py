@@ -3,11 +3,9 @@
 A camera of more pixels
 =======================
 
-The camera has more pixels than the projector: T is then not square, and has no inverse. ltcl finds the pattern whose picture is
-closest to the wanted one, as the camera sees it.
+The camera has more pixels than the projector: T is then not square, and has no inverse. ltcl finds the
+pattern whose picture is closest to the wanted one, as the camera sees it.
 """
-
-import numpy as np
 
 import ltcl
 from ltcl.acquisition import camera_map

@@ -13,7 +13,7 @@ import ltcl
 from ltcl.plots import pictures
 
 corner = ltcl.scenes.box(14, sides=3, albedo=[(0.9, 0.25, 0.2), (0.45, 0.5, 0.9), (0.85, 0.85, 0.8)])
-T = corner.transport()
+T = corner.transport(first_bounce="exact")
 
 pattern = np.zeros((14, 42, 3))
 pattern[:, :14] = 1.0  # the left wall

@@ -3,8 +3,8 @@
 A noisy T, denoised
 ===================
 
-One column of T, as it was measured and after ``ltcl.denoise``: the light of one projector pixel on the other wall. No other measurement
-was used, only what is known about light.
+One column of T, as it was measured and after ``ltcl.denoise``: the light of one projector pixel on the
+other wall. No other measurement was used, only what is known about light.
 """
 
 import numpy as np

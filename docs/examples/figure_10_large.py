@@ -3,17 +3,16 @@
 Figure 10: every pixel lights every other
 =========================================
 
-A picture on a corner of two coloured walls, the pattern that makes it, and its light by bounces. T is never formed: its
-rows are compressed as they come.
+A picture on a corner of two coloured walls, the pattern that makes it, and its light by bounces. T is never
+formed: its rows are compressed as they come.
 
-``bench/resolution131k.py`` does this for 131 072 pixels; here are 2048, by the same code. The record of the large one stands in
-:doc:`../auto_tutorials/6_large`.
+``bench/resolution131k.py`` does this for 131 072 pixels; here are 2048, by the same code. The record of the
+large one stands in :doc:`../auto_tutorials/6_large`.
 """
 
+import ltcl
 import resolution131k as large
 from _harness import Options
-
-import ltcl
 
 rows = large.Bounce(32, large.REFERENCE)
 built = large.build(Options(smoke=True, json=None, plot=None, device=ltcl.open_device()), rows)

@@ -3,8 +3,8 @@
 One pixel alone
 ===============
 
-Random walks find the direct light of single pixels, without the others. Each value has a standard error; ask
-for a smaller one, and more walks are taken.
+Random walks find the direct light of single pixels, without the others. Each value has a standard error;
+ask for a smaller one, and more walks are taken.
 """
 
 import numpy as np

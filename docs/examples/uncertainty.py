@@ -3,8 +3,9 @@
 How sure is a bounce?
 =====================
 
-A measured T is noisy, and so are the bounces that are found with it. ``std`` says by how much, pixel by pixel. Here the truth is
-known: where ltcl says one standard deviation, about two thirds of the errors are within it.
+A measured T is noisy, and so are the bounces that are found with it. ``std`` says by how much, pixel by
+pixel. Here the truth is known: where ltcl says one standard deviation, about two thirds of the errors are
+within it.
 """
 
 import numpy as np
@@ -14,8 +15,9 @@ from ltcl.plots import pictures
 
 corner = ltcl.scenes.dihedral(14, albedo=0.75)
 true = corner.transport().to_numpy()
-noise = 1e-3 * np.random.default_rng(0).normal(size=true.shape)
-T = ltcl.Transport(true + noise, corner.grid)
+random = np.random.default_rng(0)
+measured, again = (true + 3e-4 * random.normal(size=true.shape) for _ in range(2))
+T = ltcl.Transport(measured, corner.grid, noise=ltcl.Transport(again, corner.grid))  # two measurements tell
 
 white = (true @ np.ones(len(true))).reshape(corner.grid)
 parts = ltcl.separate(T, white, bounces=2)
@@ -31,10 +33,8 @@ rows = []
 for k in (0, 1):
     error = np.abs(parts.bounces[k] - exact.bounces[k])
     std = parts.std.bounces[k]
-    within = np.mean(error < std)
-    print(
-        f"bounce {k + 1}: {within:.0%} of the errors are within one deviation, {np.mean(error < 2 * std):.0%} within two"
-    )
+    one, two = np.mean(error < std), np.mean(error < 2 * std)
+    print(f"bounce {k + 1}: {one:.0%} of the errors are within one deviation, {two:.0%} within two")
     bright, times = 0.8 / parts.bounces[k].max(), 0.8 / error.max()
     rows.append(
         {

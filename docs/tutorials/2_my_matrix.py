@@ -3,20 +3,21 @@
 I have a matrix
 ===============
 
-You have measured or computed light transport yourself, and it is in a file. This page reads it, asks whether it is
-good enough, and uses it: with its noise, and with pixels that no light reaches.
+You have measured or computed light transport yourself, and it is in a file. This page reads it, asks
+whether it is good enough, and uses it: with its noise, and with pixels that no light reaches.
 """
 
 # %%
 # What ltcl expects
 # -----------------
 #
-# One matrix T for each colour. Column j is the picture that the camera sees when projector pixel j alone is lit with
-# light of 1, unrolled row by row. The picture is on the same grid as the projector, so T is square. The numbers
-# are *linear* light: twice the light, twice the number. Undo the gamma of the camera first.
+# One matrix T for each colour. Column j is the picture that the camera sees when projector pixel j alone is
+# lit with light of 1, unrolled row by row. The picture is on the same grid as the projector, so T is
+# square. The numbers are *linear* light: twice the light, twice the number. Undo the gamma of the camera
+# first.
 #
-# We make such a file here: two white walls that meet in a corner, 12 x 24 pixels. To be like a measured one it has noise, and
-# three projector pixels miss the walls.
+# We make such a file here: two white walls that meet in a corner, 12 x 24 pixels. To be like a measured one
+# it has noise, and three projector pixels miss the walls.
 
 import tempfile
 from pathlib import Path
@@ -42,8 +43,8 @@ scipy.io.savemat(folder / "T.mat", {"LTM": measured})
 # Read it
 # -------
 #
-# An ``.npy`` file holds the numbers only. The grid, height and width, you have to tell. A ``.mat`` file has names
-# in it: without ``variable=`` ltcl looks for ``LTM``.
+# An ``.npy`` file holds the numbers only. The grid, height and width, you have to tell. A ``.mat`` file has
+# names in it: without ``variable=`` ltcl looks for ``LTM``.
 
 T = ltcl.load(folder / "T.npy", grid=(12, 24))
 same = ltcl.load(folder / "T.mat", grid=(12, 24))
@@ -88,8 +89,8 @@ analysis = ltcl.analyze(T)
 print(analysis.verdict.text)
 
 # %%
-# Here it finds fault with bounces: noise can make one a little negative, which no light is. And it names the part of the
-# picture where the three pixels are.
+# Here it finds fault with bounces: noise can make one a little negative, which no light is. And it names
+# the part of the picture where the three pixels are.
 #
 # How large the noise is was not told: it is estimated from T itself, where T should be smooth.
 
@@ -109,8 +110,8 @@ figure = pictures({name: corner.view(light, size=320, supersample=2) for name, l
 # How sure are bounces?
 # ---------------------
 #
-# Noise of T makes the bounces uncertain, and the more so the later the bounce. ``std`` has a number for each pixel.
-# Read it before you believe a small bounce.
+# Noise of T makes the bounces uncertain, and the more so the later the bounce. ``std`` has a number for
+# each pixel. Read it before you believe a small bounce.
 
 parts = ltcl.separate(T, white, bounces=3)
 for number, (light, std) in enumerate(zip(parts.bounces, parts.std.bounces, strict=True), start=1):
@@ -120,8 +121,8 @@ for number, (light, std) in enumerate(zip(parts.bounces, parts.std.bounces, stri
 # Less noise
 # ----------
 #
-# ``denoise`` makes use of what is known about light: what pixel i sends to j, pixel j sends to i, and far from the
-# direct light T is smooth.
+# ``denoise`` makes use of what is known about light: what pixel i sends to j, pixel j sends to i, and far
+# from the direct light T is smooth.
 
 better = ltcl.denoise(T)
 

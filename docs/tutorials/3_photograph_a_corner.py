@@ -3,23 +3,24 @@
 Photograph your own corner
 ==========================
 
-With any projector, and a camera or phone that can hold its settings. ltcl tells you what to project and how long to
-expose; you take the photographs; ltcl checks each of them and makes the transport of your corner.
+With any projector, and a camera or phone that can hold its settings. ltcl tells you what to project and how
+long to expose; you take the photographs; ltcl checks each of them and makes the transport of your corner.
 
-There is a :doc:`checklist to print <../checklist>`. This page does the whole thing once, with a small simulated
-corner in place of yours, and then makes every mistake, to show what ltcl says.
+There is a :doc:`checklist to print <../checklist>`. This page does the whole thing once, with a small
+simulated corner in place of yours, and then makes every mistake, to show what ltcl says.
 """
 
 # %%
 # The set-up
 # ----------
 #
-# 1. Put the projector in front of the corner so that its picture fills both walls. Put the camera beside it, on a
-#    tripod. It must see all of the projected picture.
-# 2. Switch off what is automatic in the camera: exposure, ISO, white balance, focus, flash. Let it save raw files (or PNG, TIFF),
-#    never JPEG.
+# 1. Put the projector in front of the corner so that its picture fills both walls. Put the camera beside it,
+#    on a tripod. It must see all of the projected picture.
+# 2. Switch off what is automatic in the camera: exposure, ISO, white balance, focus, flash. Let it save raw
+#    files (or PNG, TIFF), never JPEG.
 # 3. Make the room dark, and leave it so: a small lamp that stays on does no harm, one that changes does.
-# 4. Write how many pixels you want into a file ``scan/acquisition.toml``. Begin with few; time grows with their number.
+# 4. Write how many pixels you want into a file ``scan/acquisition.toml``. Begin with few; the time grows with
+#    their number.
 #
 # .. code-block:: toml
 #
@@ -35,10 +36,11 @@ corner in place of yours, and then makes every mistake, to show what ltcl says.
 #
 #    ltcl acquire run scan            # says which photograph is next; writes patterns/ and shots.csv
 #    ltcl show scan                   # shows the patterns, one after the other, on the projector
-#    ltcl acquire run scan --take CARD    # copies your photographs from the folder CARD, in their order, and goes on
+#    ltcl acquire run scan --take CARD  # copies your photographs from the folder CARD, in their order
 #
-# You do this six to eight times: ltcl first needs to see white and black to know how long to expose, then stripes to know where
-# each pixel lands, then the patterns of the scan. ``ltcl acquire run scan`` can be stopped at any time, and goes on where it was.
+# You do this six to eight times: ltcl first needs to see white and black to know how long to expose, then
+# stripes to know where each pixel lands, then the patterns of the scan. ``ltcl acquire run scan`` can be
+# stopped at any time, and goes on where it was.
 #
 # The same in Python, with a stand-in for you
 # -------------------------------------------
@@ -111,8 +113,9 @@ setup = Setup.of(folder / "T.zarr")
 print(f"pictures by T are wrong by {error:.2%}")
 
 # %%
-# Now a picture goes onto the walls: a bright band across the corner. ``background`` is the light of the room, which was measured,
-# too. ``setup.codes`` are what the projector must be fed, by its measured response.
+# Now a picture goes onto the walls: a bright band across the corner. ``background`` is the light of the
+# room, which was measured, too. ``setup.codes`` are what the projector must be fed, by its measured
+# response.
 
 wanted = np.full(corner.grid, 0.35) * T.first_bounce.mean()
 wanted[1:3] *= 2
@@ -129,9 +132,9 @@ figure = pictures(
 # Every mistake, and what ltcl says then
 # --------------------------------------
 #
-# Each line below is a copy of the photographs with one mistake made in it. The message is what ltcl really said when this page
-# was built. ltcl compares each group of photographs with what it knows already before it keeps them, so
-# nothing is lost: mend or retake what is named, and run the same command again.
+# Each line below is a copy of the photographs with one mistake made in it. The message is what ltcl really
+# said when this page was built. ltcl compares each group of photographs with what it knows already before
+# it keeps them, so nothing is lost: mend or retake what is named, and run the same command again.
 
 
 def change(name, edit):
@@ -198,7 +201,7 @@ for name, mistake in MISTAKES.items():
     shutil.rmtree(copy)
 
 # %%
-# Where to go on: the same with :doc:`a webcam and a second display <4_webcam>`, which needs no person at all;
-# what to do with T is in :doc:`2_my_matrix`.
+# Where to go on: the same with :doc:`a webcam and a second display <4_webcam>`, which needs no person at
+# all; what to do with T is in :doc:`2_my_matrix`.
 
 # sphinx_gallery_thumbnail_number = 2
