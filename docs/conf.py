@@ -38,6 +38,7 @@ sphinx_gallery_conf: dict[str, Any] = {
     "abort_on_example_error": True,
     "image_scrapers": ["gallery_figures"],
     "capture_repr": (),  # what a block prints is enough
+    "write_computation_times": False,  # its page would load scripts from elsewhere
     "download_all_examples": False,
     "show_memory": False,
 }

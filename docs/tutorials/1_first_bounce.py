@@ -113,14 +113,14 @@ figure = pictures(
 # What you have done, in the words of the paper
 # ---------------------------------------------
 #
-# ===================  ======================  =====================================================
+# ===================  ======================  =================================================
 # in this page         in the paper            what it is
-# ===================  ======================  =====================================================
-# ``transport``        T                       picture = T pattern; one column for each projector pixel
+# ===================  ======================  =================================================
+# ``transport``        T                       picture = T pattern; a column for each projector pixel
 # ``result.pattern``   p                       the pattern, so that T p is the picture that you want
-# ``parts.direct``     l\ :sub:`d`             the direct light ``parts.bounces``    A l\ :sub:`d`, ...
-# bounce 1, bounce 2 and so on
-# ===================  ======================  =====================================================
+# ``parts.direct``     l\ :sub:`d`             the direct light
+# ``parts.bounces``    A l\ :sub:`d`, ...      bounce 1, bounce 2 and so on
+# ===================  ======================  =================================================
 #
 # Where to go on: :doc:`with a matrix that you have <2_my_matrix>`, :doc:`with a corner of your own
 # <3_photograph_a_corner>`, or ``ltcl view`` in a terminal, which shows all of this in the browser with

@@ -20,8 +20,8 @@ from ltcl.scenes import viewer
 _VIEW = 800  # pixels along the longer side of a view
 _TITLE = "A picture projected into a coloured corner"
 _SUBTITLE = (
-    "The walls colour it, and light each other. Under the pattern of ltcl the corner looks flat and white.\n"
-    "Below: the light of the first picture taken apart, by how often it met a wall before it was seen."
+    "The walls colour it and light each other. With the pattern of ltcl they look like a flat white screen.\n"
+    "Below: the light of the first picture taken apart, by how often it went from wall to wall."
 )
 
 
