@@ -24,7 +24,8 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["tutorials", "examples"]  # read by sphinx-gallery, which writes the pages below `auto_`
+# Sphinx-gallery reads these, and writes pages below `auto_`; one on times would load scripts from elsewhere.
+exclude_patterns = ["tutorials", "examples", "**sg_execution_times.rst"]
 
 myst_enable_extensions = ["dollarmath", "deflist", "fieldlist"]
 myst_heading_anchors = 3
@@ -38,7 +39,8 @@ sphinx_gallery_conf: dict[str, Any] = {
     "abort_on_example_error": True,
     "image_scrapers": ["gallery_figures"],
     "capture_repr": (),  # what a block prints is enough
-    "write_computation_times": False,  # its page would load scripts from elsewhere
+    "write_computation_times": False,
+    "remove_config_comments": True,
     "download_all_examples": False,
     "show_memory": False,
 }

@@ -22,3 +22,5 @@ figure = fig4.draw(found)
 
 for n in (0, 1, 2, 5, 10, 20, 30):
     print(f"{n:2} terms: {found.errors[n]:.1e}")
+
+# sphinx_gallery_thumbnail_number = 8

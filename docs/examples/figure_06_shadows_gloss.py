@@ -15,3 +15,5 @@ import ltcl
 shade = fig6.with_shadows(6, ltcl.open_device())
 gloss = fig6.with_gloss(4, smoke=True)
 figure = fig6.draw(shade, gloss)
+
+# sphinx_gallery_thumbnail_number = 6

@@ -26,3 +26,5 @@ figure = large.draw(names, images)
 for name, error in zip(names, errors, strict=True):
     print(f"{name}: {error:.2%}")
 print(f"{built.T.nbytes / 1e6:.2f} MB in place of {3 * 4 * rows.shape[0] ** 2 / 1e6:.0f} MB")
+
+# sphinx_gallery_thumbnail_number = 3

@@ -126,4 +126,4 @@ figure = pictures(
 # <3_photograph_a_corner>`, or ``ltcl view`` in a terminal, which shows all of this in the browser with
 # sliders. ``ltcl demo`` makes the pictures of this page with more pixels.
 
-# sphinx_gallery_thumbnail_number = 3
+# sphinx_gallery_thumbnail_number = 9

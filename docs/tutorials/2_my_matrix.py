@@ -149,4 +149,4 @@ ltcl.save(folder / "T.npz", better)
 #
 # Formats and their limits stand in the README; noise, dark pixels and deviations in :doc:`../noise`.
 
-# sphinx_gallery_thumbnail_number = 1
+# sphinx_gallery_thumbnail_number = 7

@@ -204,4 +204,4 @@ for name, mistake in MISTAKES.items():
 # Where to go on: the same with :doc:`a webcam and a second display <4_webcam>`, which needs no person at
 # all; what to do with T is in :doc:`2_my_matrix`.
 
-# sphinx_gallery_thumbnail_number = 2
+# sphinx_gallery_thumbnail_number = 9

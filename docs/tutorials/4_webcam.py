@@ -133,4 +133,4 @@ before = len(rig.photographs)
 T = ltcl.acquire(rig, geometry="aligned", strategy="hadamard", store=store)
 print(f"{len(rig.photographs) - before} new photographs")
 
-# sphinx_gallery_thumbnail_number = 2
+# sphinx_gallery_thumbnail_number = 9

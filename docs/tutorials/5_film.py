@@ -94,4 +94,4 @@ for record in done.records[::4]:
 # T make it fast first: ``ltcl compress``, then ``ltcl invert`` (:doc:`6_large`). Films over several
 # machines: :doc:`../cluster`.
 
-# sphinx_gallery_thumbnail_number = 1
+# sphinx_gallery_thumbnail_number = 10

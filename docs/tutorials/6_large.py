@@ -107,4 +107,4 @@ for claim in record["claims"][:4]:
 # - One solve over many machines: :doc:`../mpi`.
 # - T comes from walls that you know: ``ltcl.scenes.FormFactor`` computes it in each product.
 
-# sphinx_gallery_thumbnail_number = 1
+# sphinx_gallery_thumbnail_number = 3

@@ -111,4 +111,4 @@ for name, operator in {
 # leaves all of its vectors there. So use SciPy's or PyLops' solvers for what ltcl lacks, and ltcl's for
 # what it has. Measured ratios are in the README.
 
-# sphinx_gallery_thumbnail_number = 1
+# sphinx_gallery_thumbnail_number = 2

@@ -46,3 +46,5 @@ figure = pictures(
         f"the region 20 times as important\noff by {off(weighted):.0%}": view(weighted.appearance),
     }
 )
+
+# sphinx_gallery_thumbnail_number = 4

@@ -43,3 +43,5 @@ figure = pictures(
         "both together": view(result.appearance),
     }
 )
+
+# sphinx_gallery_thumbnail_number = 2

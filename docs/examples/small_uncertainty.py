@@ -44,3 +44,5 @@ for k in (0, 1):
         }
     )
 figure = pictures(*rows)
+
+# sphinx_gallery_thumbnail_number = 3

@@ -44,3 +44,5 @@ for name, light in [
 ]:
     total = light.sum(axis=(0, 1))
     print(f"{name}: {np.round(total / total.sum(), 2)}")
+
+# sphinx_gallery_thumbnail_number = 6

@@ -26,3 +26,5 @@ for name, matrix in columns.items():
     note = f"\nmean error {off:.1e}" if off else ""
     shown[name + note] = 100 * matrix[:, pixel].reshape(corner.grid)
 figure = pictures(shown)
+
+# sphinx_gallery_thumbnail_number = 3

@@ -43,3 +43,5 @@ axes.legend(frameon=False, labelcolor="linecolor")
 few = ltcl.solve(S, b, "monte_carlo", pixels=[pixel], error=2e-3)
 print(f"{few.x[0]:.4f} ± {few.standard_error[0]:.4f}, exact {truth:.4f}")
 print(few.reason)
+
+# sphinx_gallery_thumbnail_number = 1

@@ -24,3 +24,5 @@ print(f"error {result.error:.1%}: what is finer than a pixel of the projector ca
 figure = pictures(
     {"wanted, 30 x 60": wanted, "pattern, 10 x 20": result.pattern, "seen, 30 x 60": result.appearance}
 )
+
+# sphinx_gallery_thumbnail_number = 4

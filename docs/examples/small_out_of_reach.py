@@ -38,3 +38,5 @@ figure = pictures(
     {"wanted": view(wanted), "seen": view(result.appearance), "missing, and too much": view(shown)},
     width=1000,
 )
+
+# sphinx_gallery_thumbnail_number = 4

@@ -34,3 +34,5 @@ mixes = {
     "later bounces only more\n1, 3, 6": mixed(1, 3, 6),
 }
 figure = pictures({name: view(0.8 * light) for name, light in mixes.items()})
+
+# sphinx_gallery_thumbnail_number = 4
