@@ -145,7 +145,7 @@ def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", widt
 
 
 def _draw_picture(figure: Figure, box: tuple[float, float, float, float], image: np.ndarray) -> None:
-    w, h = max(round(box[2]), 1), max(round(box[3]), 1)
+    left, top, w, h = (max(round(side), 1) for side in box)  # whole pixels, which Agg does not resample
     black = resize((np.atleast_3d(image) == 0).all(axis=-1).astype(np.float32), (h, w)) > 0.999
     if times := w // image.shape[1]:  # enlarged to more than is drawn: squares with sharp edges
         image = image.repeat(times + 1, axis=0).repeat(times + 1, axis=1)
@@ -153,7 +153,7 @@ def _draw_picture(figure: Figure, box: tuple[float, float, float, float], image:
     codes = np.broadcast_to(codes, (h, w, 3))
     paper = np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)])
     codes = np.where(black[..., None], paper, codes)
-    axes = axes_at(figure, box)
+    axes = axes_at(figure, (left, top, w, h))
     axes.imshow(np.rint(255 * codes).astype(np.uint8), interpolation="none", aspect="auto")
     axes.axis("off")
 
