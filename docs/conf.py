@@ -38,7 +38,7 @@ sphinx_gallery_conf: dict[str, Any] = {
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
     "image_scrapers": ["gallery_figures"],
-    "capture_repr": (),  # what a block prints is enough
+    "capture_repr": ("_repr_html_",),
     "write_computation_times": False,
     "remove_config_comments": True,
     "download_all_examples": False,

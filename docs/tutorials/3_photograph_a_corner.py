@@ -48,6 +48,7 @@ simulated corner in place of yours, and then makes every mistake, to show what l
 # ``camera`` is a corner of two white walls with a camera in front. ``photographer`` does what you would do:
 # look at the list, show the pattern, take the photograph, save it under the name on the list.
 
+import html
 import io
 import shutil
 import tempfile
@@ -132,9 +133,10 @@ figure = pictures(
 # Every mistake, and what ltcl says then
 # --------------------------------------
 #
-# Each line below is a copy of the photographs with one mistake made in it. The message is what ltcl really
-# said when this page was built. ltcl compares each group of photographs with what it knows already before
-# it keeps them, so nothing is lost: mend or retake what is named, and run the same command again.
+# For each line of the table the photographs were copied, and one mistake made in them. The message is what
+# ltcl really said when this page was built. ltcl compares each group of photographs with what it knows
+# already before it keeps them, so nothing is lost: mend or retake what is named, and run the same command
+# again.
 
 
 def change(name, edit):
@@ -188,17 +190,27 @@ MISTAKES = {
     "a file is broken": lambda files: files[70].write_bytes(files[70].read_bytes()[:200]),
 }
 
+
+class Table(list):
+    """Mistakes and messages; a notebook, and this page, show it as a table."""
+
+    def _repr_html_(self):
+        rows = "".join(f"<tr><td>{name}</td><td>{html.escape(said)}</td></tr>" for name, said in self)
+        return f"<table class='table'><tr><th>mistake</th><th>what ltcl says</th></tr>{rows}</table>"
+
+
+table = Table()
 for name, mistake in MISTAKES.items():
     copy = folder.with_name("copy")
     shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("T.zarr*"))
     mistake(sorted((copy / "photographs").iterdir()))
     try:
         scan(copy)
-        said = "(nothing: it did no harm)"
+        table.append((name, "nothing: it did no harm"))
     except LtclError as error:
-        said = str(error).replace(str(copy), "scan")
-    print(f"{name.upper()}\n    {said}\n")
+        table.append((name, str(error).replace(str(copy), "scan")))
     shutil.rmtree(copy)
+table
 
 # %%
 # Where to go on: the same with :doc:`a webcam and a second display <4_webcam>`, which needs no person at
