@@ -121,7 +121,7 @@ print(f"pictures by T are wrong by {error:.2%}")
 wanted = np.full(corner.grid, 0.35) * T.first_bounce.mean()
 wanted[1:3] *= 2
 result = ltcl.compensate(T, wanted, background=setup.ambient, gain="auto")
-print(f"error {result.error:.1%}")
+print(f"error {result.error:.2%}")
 
 before = ltcl.images.from_srgb(camera.photograph(wanted / wanted.max(), 1.0) / 255)
 after = ltcl.images.from_srgb(camera.photograph(setup.codes(result.pattern), 1.0) / 255)
@@ -137,6 +137,8 @@ figure = pictures(
 # ltcl really said when this page was built. ltcl compares each group of photographs with what it knows
 # already before it keeps them, so nothing is lost: mend or retake what is named, and run the same command
 # again.
+#
+# The code is long, as there are many mistakes. The table is below it.
 
 
 def change(name, edit):
@@ -195,8 +197,11 @@ class Table(list):
     """Mistakes and messages; a notebook, and this page, show it as a table."""
 
     def _repr_html_(self):
-        rows = "".join(f"<tr><td>{name}</td><td>{html.escape(said)}</td></tr>" for name, said in self)
-        return f"<table class='table'><tr><th>mistake</th><th>what ltcl says</th></tr>{rows}</table>"
+        cell = "<td style='text-align: left'>{}</td>"
+        lines = [("<b>mistake</b>", "<b>what ltcl says</b>")]
+        lines += [(name, html.escape(said)) for name, said in self]
+        rows = ["<tr>" + "".join(map(cell.format, line)) + "</tr>" for line in lines]
+        return f"<table class='table'>{''.join(rows)}</table>"
 
 
 table = Table()

@@ -12,7 +12,7 @@ brightness, so that nothing flickers. A run that was stopped goes on where it wa
 # -----------------
 #
 # The walls are computed here; yours come from :doc:`photographs <3_photograph_a_corner>` or from a
-# :doc:`file <2_my_matrix>`. The film is a dozen frames: the sun moves over a landscape. A folder of
+# :doc:`file <2_my_matrix>`. The film is a dozen frames: the camera pans over a landscape. A folder of
 # numbered pictures is a film, and so is any video file, ``film.mp4``.
 
 import tempfile
