@@ -9,6 +9,7 @@ the remark cannot outlive its reason.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -131,11 +132,17 @@ def signed(scene: Scene, values: np.ndarray, gain: float = 1.0) -> np.ndarray:
 
 
 def _view(scene: Scene, values: np.ndarray) -> np.ndarray:
-    image = scene.view(values, SIZE)
+    image = scene.view(values, SIZE, supersample=2)
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=-1)
 
 
+@functools.cache
+def _coverage(scene: Scene) -> np.ndarray:
+    """Share of each pixel of a view that walls fill."""
+    return scene.view(np.ones(scene.grid), SIZE, supersample=2)
+
+
 def _on_page(scene: Scene, image: np.ndarray) -> np.ndarray:
-    coverage = scene.view(np.ones(scene.grid), SIZE)[..., None]
+    coverage = _coverage(scene)[..., None]
     paper = from_srgb(np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)]))
     return np.clip(to_srgb(from_srgb(image) * coverage + paper * (1 - coverage)), 0, 1)

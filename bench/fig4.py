@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 import _boxes as boxes
 import _figures as figures
+import ltcl
 from _boxes import FLOOR, NEUTRAL
 from _figures import Claim
 from _harness import options
@@ -41,6 +42,14 @@ class Series:
     def errors(self) -> np.ndarray:
         """Relative error of each sum."""
         return np.linalg.norm(self.sums - self.l_d, axis=(1, 2)) / np.linalg.norm(self.l_d)
+
+
+def measure(n: int, device: ltcl.Device) -> Series:
+    """The series on the closed box, n x n patches a wall."""
+    scene, l_d = boxes.coloured_box(n)
+    T = scene.transport(first_bounce=scene.first_bounce, device=device)
+    series = boxes.terms(T.systems, boxes.all_bounces(scene, l_d), TERMS)
+    return Series(scene, l_d, series, np.cumsum(series, axis=0))
 
 
 def bleeding(scene: Scene, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -156,14 +165,10 @@ def draw_contents(figure: Figure) -> None:
 
 def main() -> None:
     given = options(__doc__ or "")
-    scene, l_d = boxes.coloured_box(4 if given.smoke else 16)
-    T = scene.transport(first_bounce=scene.first_bounce, device=given.device)
-    l_out = boxes.all_bounces(scene, l_d)
-    series = boxes.terms(T.systems, l_out, TERMS)
-    found = Series(scene, l_d, series, np.cumsum(series, axis=0))
+    found = measure(4 if given.smoke else 16, given.device)
     facts = {
-        "patches": l_d.shape[1],
-        "largest albedo": float(scene.albedo.max()),
+        "patches": found.l_d.shape[1],
+        "largest albedo": float(found.scene.albedo.max()),
         "relative error after n terms": [float(f"{error:.3g}") for error in found.errors],
     }
     title = "Figure 4: terms of the inverse series"

@@ -70,6 +70,15 @@ class Found:
         return [*self.closed.values(), *self.opened.values(), self.below]
 
 
+def measure(n: int, device: ltcl.Device) -> Found:
+    """All boxes, n x n patches a wall; norms of those of half as many."""
+    name = f"side(s), albedo {OPEN_ALBEDO}"
+    closed = {m: race(f"closed, albedo {m}", n, 6, m, device) for m in ALBEDOS}
+    opened = {sides: race(f"{sides} {name}", n, sides, OPEN_ALBEDO, device) for sides in SIDES}
+    below, of_series = race("5 sides, albedo 0.6", n, 5, 0.6, device), swings(n, device)
+    return Found(of_series, {m: norms(n // 2, m, device) for m in BELOW_HALF}, closed, opened, below)
+
+
 def claims(found: Found) -> list[Claim]:
     signs = np.array([np.sign(swing[:9] - 1) for swing in found.swings.values()])
     left = {name: abs(swing[8] - 1) / abs(swing[4] - 1) for name, swing in found.swings.items()}
@@ -165,11 +174,7 @@ def draw_races(axes: Axes, races: Mapping[float, Race]) -> None:
 
 def main() -> None:
     given = options(__doc__ or "")
-    n, device, name = 4 if given.smoke else 16, given.device, f"side(s), albedo {OPEN_ALBEDO}"
-    closed = {m: race(f"closed, albedo {m}", n, 6, m, device) for m in ALBEDOS}
-    opened = {sides: race(f"{sides} {name}", n, sides, OPEN_ALBEDO, device) for sides in SIDES}
-    below, of_series = race("5 sides, albedo 0.6", n, 5, 0.6, device), swings(n, device)
-    found = Found(of_series, {m: norms(n // 2, m, device) for m in BELOW_HALF}, closed, opened, below)
+    found = measure(4 if given.smoke else 16, given.device)
     facts = {r.name: f"{r.said}; Chebyshev 1e-5 in {r.chebyshev.products} products" for r in found.races}
     figures.conclude(given, "Figure 5: convergence", claims(found), facts, lambda: draw(found))
 

@@ -73,6 +73,14 @@ class Recovery:
         return max(ltcl.solve(S, l, "chebyshev", rtol=RTOL).products for S, l in pairs)
 
 
+def with_shadows(n: int, device: ltcl.Device) -> Recovery:
+    """The box with a block in it, under a lamp."""
+    room = box(n, 5, SHADED, occluder=BLOCK, device=device)
+    scene, l_d, systems, l_out = boxes.lit(room, LAMP, device)
+    sums = np.cumsum(boxes.terms(systems, l_out, MOST), axis=0)
+    return Recovery(scene, l_d, sums, systems, tuple(scene.A), scene.picture)
+
+
 def with_gloss(n: int, smoke: bool) -> Recovery:
     """The glossy box: every patch sends light in `directions`, and R is that of all of them."""
     scene = glossy_box(n, smoke)
@@ -161,10 +169,7 @@ def draw(shade: Recovery, gloss: Recovery) -> Figure:
 
 def main() -> None:
     given = options(__doc__ or "")
-    room = box(4 if given.smoke else 14, 5, SHADED, occluder=BLOCK, device=given.device)
-    scene, l_d, systems, l_out = boxes.lit(room, LAMP, given.device)
-    sums = np.cumsum(boxes.terms(systems, l_out, MOST), axis=0)
-    shade = Recovery(scene, l_d, sums, systems, tuple(scene.A), scene.picture)
+    shade = with_shadows(4 if given.smoke else 14, given.device)
     gloss = with_gloss(4 if given.smoke else 12, given.smoke)
     scene = glossy_box(4 if given.smoke else 6, given.smoke)  # smaller, as one camera and projector see it
     T = scene.transport(scene.first_bounce, given.device, on_dark="mask")

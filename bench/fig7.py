@@ -249,6 +249,25 @@ def slowdown(points: list[Point], slow: str, fast: str) -> tuple[int, float]:
     return last.pixels, last.seconds / found[last.pixels]
 
 
+def recorded(facts: dict[str, Any]) -> list[Point]:
+    """The points of a record."""
+    points = []
+    for name, method in METHODS.items():
+        of = (
+            facts[f"{method.label}, {what}"]
+            for what in ("N", "ms", "error", "products", "MB", "numbers a row")
+        )
+        for n, ms, error, products, size, kept in zip(*of, strict=True):
+            way = Way(lambda: np.zeros(0), error, ms / 1e3, products, round(1e6 * size), kept)
+            points.append(Point(name, n, ms / 1e3, way))
+    return points
+
+
+def all_laws(points: list[Point]) -> dict[str, Law]:
+    """Those of every method but the peer."""
+    return {name: law(*curve(points, name)) for name in METHODS if name != "peer"}
+
+
 def claims(points: list[Point], laws: dict[str, Law]) -> list[Claim]:
     errors = [p.way.error for p in points]
     least, most = min(errors), max(errors)
@@ -303,7 +322,7 @@ def draw(points: list[Point], laws: dict[str, Law]) -> Figure:
 def main() -> None:
     given = options(__doc__ or "")
     points = [p for n in (SMOKE if given.smoke else SIZES) for p in measure(given, n)]
-    laws = {} if given.smoke else {name: law(*curve(points, name)) for name in METHODS if name != "peer"}
+    laws = {} if given.smoke else all_laws(points)
     facts: dict[str, Any] = {"albedo": ALBEDO}
     for name, method in METHODS.items():
         mine = [p for p in points if p.method == name]

@@ -45,6 +45,19 @@ class Inversion:
         return ltcl.solve(self.S, self.l_out, "monte_carlo", samples=samples, seed=seed, **KINDS[kind]).x
 
 
+def invert(n: int, device: ltcl.Device) -> Inversion:
+    """The box under its lamp, n x n patches a wall."""
+    scene, (l_d,), (S,), (l_out,) = boxes.lit(box(n, sides=5, albedo=ALBEDO), LAMP, device)
+    return Inversion(scene, S, l_out, l_d)
+
+
+def measure(found: Inversion, seeds: int = SEEDS) -> dict[str, np.ndarray]:
+    """Errors by kind, (COUNTS, seeds)."""
+    samples = [(int(count), seed) for count in COUNTS for seed in range(seeds)]
+    errors = {k: [found.error(found.run(*each, k)) for each in samples] for k in KINDS}
+    return {kind: np.reshape(values, (len(COUNTS), seeds)) for kind, values in errors.items()}
+
+
 def claims(found: Inversion, errors: dict[str, np.ndarray]) -> list[Claim]:
     plain, gathered = (found.error(found.run(FEW, 0, kind)) for kind in ("plain", "final gather"))
     many, due = found.error(found.run(MANY, 0, "plain")), (FEW / MANY) ** 0.5
@@ -89,12 +102,8 @@ def draw(found: Inversion, errors: dict[str, np.ndarray]) -> Figure:
 
 def main() -> None:
     given = options(__doc__ or "")
-    room = box(6 if given.smoke else 32, sides=5, albedo=ALBEDO)
-    scene, (l_d,), (S,), (l_out,) = boxes.lit(room, LAMP, given.device)
-    found = Inversion(scene, S, l_out, l_d)
-    samples = [(int(count), seed) for count in COUNTS for seed in range(SEEDS)]
-    shape = len(COUNTS), SEEDS
-    errors = {k: np.reshape([found.error(found.run(*each, k)) for each in samples], shape) for k in KINDS}
+    found = invert(6 if given.smoke else 32, given.device)
+    errors = measure(found)
     facts = {"pixels": len(found.l_d), "albedo": ALBEDO, "samples": COUNTS.tolist()}
     for kind, values in errors.items():
         facts[f"relative error, {kind}"] = np.round(values.mean(axis=1), 5).tolist()

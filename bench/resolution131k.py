@@ -127,7 +127,7 @@ def pictures(rows: Bounce, built: Built) -> tuple[list[np.ndarray], list[float]]
 def draw(names: list[str], images: list[np.ndarray]) -> Figure:
     figure = figures.page(
         270,
-        "131072 pixels, each of which lights every other",
+        f"{np.prod(images[0].shape[:2])} pixels, each of which lights all of the other wall",
         "A picture on a corner of two walls, the pattern that makes it, and its light by bounces (4 times).",
     )
     walls, gains, views = dihedral(2), (1.0, 0.6, 1.0, *(BOUNCES * [4.0])), []

@@ -33,10 +33,11 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["tutorials", "examples"]  # read by sphinx-gallery, which writes the pages below `auto_`
 templates_path = ["templates"]
 default_role = "py:obj"  # `compensate` in a docstring is a link
 nitpicky = False  # types in docstrings are words, not names
+# Sphinx-gallery reads these, and writes pages below `auto_`; one on times would load scripts from elsewhere.
+exclude_patterns = ["tutorials", "examples", "**sg_execution_times.rst"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 4
@@ -53,7 +54,10 @@ sphinx_gallery_conf: dict[str, Any] = {
     "filename_pattern": r"\.py$",  # all of them run
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
-    "write_computation_times": False,  # its page would load scripts from elsewhere
+    "image_scrapers": ["gallery_figures"],
+    "capture_repr": ("_repr_html_",),
+    "write_computation_times": False,
+    "remove_config_comments": True,
     "download_all_examples": False,
     "show_memory": False,
 }

@@ -40,15 +40,19 @@ def test_every_solution_has_its_curve_and_name() -> None:
 
 
 def sheet() -> object:
-    panel = plots.Panel("A label", "a note", np.full((30, 40, 3), (0.5, 0.2, 0.1), np.float32))
-    rows = [[panel] * k for k in (3, 2, 5)]
-    return plots.contact_sheet("Title", "subtitle", rows, ("Plot", SOLUTIONS, 0.01))
+    picture = np.full((30, 40, 3), (0.5, 0.2, 0.1), np.float32)
+    named = {"A label\na note": picture, "grey": picture[..., 0]}
+    return plots.pictures(named, {"small": picture[:2, :2]}, title="Title")
 
 
-def test_contact_sheet_shows_the_pictures_as_they_are(tmp_path: Path) -> None:
+def test_pictures_are_shown_as_they_are_under_their_names(tmp_path: Path) -> None:
     plots.save(sheet(), tmp_path / "sheet.png")  # pyright: ignore[reportArgumentType]
     picture = images.read(tmp_path / "sheet.png")
-    assert (np.abs(picture - (0.5, 0.2, 0.1)).max(axis=-1) < 0.01).sum() > 3 * 450 * 330
+    shown = (np.abs(picture - (0.5, 0.2, 0.1)).max(axis=-1) < 0.01).sum()
+    assert shown == pytest.approx(467 * 350 + 950**2, rel=0.01)
+    for rows in ((), ({},), ({"a": np.ones(3)},)):
+        with pytest.raises(InputError):
+            plots.pictures(*rows)
 
 
 def test_unknown_extension_and_failure_leave_the_old_file(tmp_path: Path) -> None:

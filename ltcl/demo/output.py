@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The demo's folder: views of the corner, linear pictures on the walls' grid, plots, the report.
 
-Views are exposed to compare: each at the brightness at which it comes closest to the target, with that factor
-in its note; bounces at that of the uncompensated picture times the factor in theirs. The files in ``linear/``
-hold the values as they are.
+Views are exposed to compare: each at the brightness at which it comes closest to the target, bounces at that
+of the uncompensated picture times the factor in their note; report.json has the factors. All are drawn at
+once, along the same rays. The files in ``linear/`` hold the values as they are.
 """
 
 from __future__ import annotations
@@ -15,33 +15,31 @@ import numpy as np
 
 from ltcl import images, plots, report
 from ltcl.demo.experiment import ALBEDO, COLOURS, RTOL, Experiment
+from ltcl.scenes import viewer
 
 _VIEW = 800  # pixels along the longer side of a view
+_TITLE = "A picture projected into a coloured corner"
+_SUBTITLE = (
+    "The walls colour it and light each other. With the pattern of ltcl they look like a flat white screen.\n"
+    "Below: the light of the first picture taken apart, by how often it went from wall to wall."
+)
 
 
 def write_pictures(results: Experiment, folder: Path) -> None:
     """Views and plots into `folder`, linear values into its subfolder ``linear``."""
-    panels = {}
-    for name, (label, note, exposure, picture) in _pictures(results).items():
+    shown, scene = _pictures(results), results.scene
+    exposed = [exposure * picture for _, exposure, picture in shown.values()]
+    stacked = viewer.draw(scene.viewer, scene.walls, np.concatenate(exposed, axis=2), _VIEW, supersample=2)
+    views = {label: stacked[..., 3 * k : 3 * k + 3] for k, (label, _, _) in enumerate(shown.values())}
+    for name, (label, _, picture) in shown.items():
         images.write(folder / "linear" / f"{name}.exr", picture)
-        view = results.scene.view(exposure * picture, size=_VIEW, supersample=2)
-        images.write(folder / f"{name}.png", view)
-        panels[name] = plots.Panel(label, note, view)
+        images.write(folder / f"{name}.png", views[label])
     rho = results.analysis.channels[results.worst].spectral_radius
-    colour, gain = COLOURS[results.worst], results.compensation.gain
-    products = " + ".join(
-        str(channel["products"]) for channel in report.solution(results.compensation.solution)
-    )
-    title = f"Solving for the {colour} light, \u03c1(R) = {rho:.2f}"
+    title = f"Solving for the {COLOURS[results.worst]} light, \u03c1(R) = {rho:.2f}"
     plots.save(plots.convergence(results.race, RTOL, title), folder / "convergence.png")
-    subtitle = (
-        f"Bounces undone in {products} products, at {100 * gain:.0f} % of the desired brightness; "
-        f"\u03c1(R) = {rho:.2f} in {colour}, where the plain iteration diverges."
-    )
-    large, medium = ("target", "uncompensated", "compensated"), ("colours_only", "pattern")
-    rows = [[panels[name] for name in row] for row in (large, medium, [*panels][5:])]
-    heading = "A picture projected into a coloured corner"
-    sheet = plots.contact_sheet(heading, subtitle, rows, (title, results.race, RTOL))
+    story = [shown[name][0] for name in ("uncompensated", "pattern", "compensated")]
+    rows = [{label: views[label] for label in labels} for labels in (story, [*views][5:])]
+    sheet = plots.pictures(*rows, title=_TITLE, subtitle=_SUBTITLE, width=1600)
     plots.save(sheet, folder / "contact_sheet.png")
 
 
@@ -63,7 +61,7 @@ def report_of(results: Experiment, seconds: dict[str, float]) -> dict[str, Any]:
             "analysis": results.analysis.to_dict(),
             "target": {"mist": results.mist},
             "errors": {name: look.error for name, look in results.looks.items()},
-            "exposure_of_views": {name: exposure for name, (_, _, exposure, _) in _pictures(results).items()},
+            "exposure_of_views": {name: exposure for name, (_, exposure, _) in _pictures(results).items()},
             "compensation": {
                 "gain": compensation.gain,
                 "clipped": compensation.clipped,
@@ -82,20 +80,20 @@ def report_of(results: Experiment, seconds: dict[str, float]) -> dict[str, Any]:
     )
 
 
-def _pictures(results: Experiment) -> dict[str, tuple[str, str, float, np.ndarray]]:
-    """Label, note, exposure and linear values of each picture, by the name of its file."""
-    mist = f"{100 * results.mist:.0f} % mist added" if results.mist >= 0.005 else ""
-    pictures = {"target": ("Desired", mist, 1.0, results.target)}
-    labels = {"uncompensated": "As it is", "compensated": "Compensated", "colours_only": "Colours only"}
-    for name, label in labels.items():
-        look = results.looks[name]
-        shown = "" if name == "colours_only" else "shown "  # its panel has less room
-        note = f"{100 * look.error:.1f} % error, {shown}\u00d7 {look.exposure:.2g}"
-        pictures[name] = (label, note, look.exposure, look.seen)
-    pictures["pattern"] = ("Pattern", "what is projected", 1.0, results.compensation.pattern)
+def _pictures(results: Experiment) -> dict[str, tuple[str, float, np.ndarray]]:
+    """Label with its note, exposure and linear values of each picture, by the name of its file."""
+    pictures = {"target": ("Desired", 1.0, results.target)}
+    labels = {"uncompensated": "Projected as it is", "compensated": "What is seen then"}
+    for name, look in results.looks.items():
+        note = f"{100 * look.error:.1f} % error"
+        if name == "compensated":
+            note += f", {100 * results.compensation.gain:.0f} % of the brightness"
+        pictures[name] = f"{labels.get(name, 'Colours only')}\n{note}", look.exposure, look.seen
+    pattern = results.compensation.pattern
+    pictures["pattern"] = "The pattern that ltcl finds\nto be projected instead", 1.0, pattern
     exposure, direct = results.looks["uncompensated"].exposure, np.linalg.norm(results.bounces[0])
     for k, bounce in enumerate(results.bounces):
         times = float(direct / np.linalg.norm(bounce))
-        label = f"Bounce {k}" if k else "Direct light"
-        pictures[f"bounce_{k}"] = (label, f"\u00d7 {times:.1f}", times * exposure, bounce)
+        label = f"Bounce {k}\n{times:.1f} times as bright" if k else "Direct light\nas bright as above"
+        pictures[f"bounce_{k}"] = label, times * exposure, bounce
     return pictures

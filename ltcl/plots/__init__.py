@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Plots: how solves converge, what an analysis says, and the contact sheet of the demo.
+"""Plots: pictures under their names, how solves converge, and what an analysis says.
 
 Every function takes data and returns a matplotlib `Figure`; `save` writes it whole or not at all. Figures are
 drawn by Agg without pyplot, so nothing here needs a screen or touches global state. matplotlib is imported
@@ -8,7 +8,7 @@ by the first plot, not with this module.
 
 from __future__ import annotations
 
-from ltcl.plots.figures import Panel, analysis, contact_sheet, convergence
+from ltcl.plots.figures import analysis, convergence, pictures
 from ltcl.plots.page import save
 
-__all__ = ["Panel", "analysis", "contact_sheet", "convergence", "save"]
+__all__ = ["analysis", "convergence", "pictures", "save"]

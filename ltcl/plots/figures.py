@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How solves converge, what an analysis says, and the contact sheet of the demo."""
+"""Pictures under their names, how solves converge, and what an analysis says."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from ltcl import checks
 from ltcl.analysis import Analysis
 from ltcl.errors import InputError
 from ltcl.images import resize, to_srgb
+from ltcl.images.pictures import as_picture
 from ltcl.plots.page import COLOURS, FAINT, GRID, INK, OTHERS, PAPER, axes_at, figure_of, heading, label_at
 from ltcl.solvers import Solution
 
@@ -22,16 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _LOWEST = 1e-8  # of a residual worth drawing: float32 products end above
-_WIDTH, _MARGIN, _GAP, _TOP = 1600, 40, 26, 164  # of the contact sheet, in pixels
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A linear picture (h, w, 3), cut off beyond 0 and 1, with a label on its left shoulder and a note."""
-
-    label: str
-    note: str
-    image: np.ndarray = field(repr=False)
 
 
 def convergence(solutions: Mapping[str, Solution], rtol: float, title: str = "Convergence") -> Figure:
@@ -111,49 +101,60 @@ def analysis(analyses: Mapping[str, Analysis]) -> Figure:
     return figure
 
 
-def contact_sheet(
-    title: str,
-    subtitle: str,
-    rows: Sequence[Sequence[Panel]],
-    plot: tuple[str, Mapping[str, Solution], float],
-) -> Figure:
-    """A dark page with three rows of panels, large, medium and small, and a plot at the end of the second.
+def pictures(*rows: Mapping[str, Any], title: str = "", subtitle: str = "", width: int = 1000) -> Figure:
+    r"""Linear pictures in rows, each row as wide as the page, under their names.
 
-    `plot` holds title, solutions and tolerance of that convergence plot.
+    A picture is (h, w) or (h, w, 3), cut off beyond 0 and 1; black is the page, as beside the walls of a
+    view. Small ones are enlarged, each pixel a square. A second line of a name is a note, in small letters.
+    InputError: there is no picture, or one has another shape.
+
+    Examples
+    --------
+    >>> import ltcl
+    >>> scene = ltcl.scenes.dihedral(4)
+    >>> seen = scene.view(scene.transport() @ np.full(scene.grid, 0.5), size=64)
+    >>> figure = pictures({"seen": seen, "too bright\nthree times": 3 * seen}, title="A corner")
+    >>> [text.get_text() for text in figure.texts if text.get_text()]
+    ['A corner', 'seen', 'too bright', 'three times']
     """
-    inner, small = _WIDTH - 2 * _MARGIN, len(rows[2])
-    widths = (inner - 2 * _GAP) // 3, round(0.236 * inner), (inner - (small - 1) * _GAP) // max(1, small)
-    heights = [
-        round(max((w * panel.image.shape[0] / panel.image.shape[1] for panel in row), default=0))
-        for row, w in zip(rows, widths, strict=True)
-    ]
-    tops = [_TOP, _TOP + heights[0] + 74, _TOP + heights[0] + heights[1] + 148]
-    figure = figure_of(_WIDTH, tops[2] + heights[2] + 30)
-    heading(figure, _MARGIN, 32, title, 26)
-    label_at(figure, _MARGIN, 82, subtitle, size=15, color=FAINT)
-    for row, w, top in zip(rows, widths, tops, strict=True):
-        for place, panel in enumerate(row):
-            _draw_panel(figure, panel, _MARGIN + place * (w + _GAP), top, w)
-    left = _MARGIN + len(rows[1]) * (widths[1] + _GAP) + 70
-    label_at(figure, left, tops[1] - 10, plot[0], size=13.5, fontweight="bold", va="bottom")
-    axes = axes_at(figure, (left, tops[1], _WIDTH - _MARGIN - left - 128, heights[1] - 50))
-    _draw_convergence(axes, *plot[1:])
+    rows = tuple(row for row in rows if row)
+    width = checks.count("width", width, least=100)
+    if not rows:
+        raise InputError("rows hold no picture; there must be at least one to draw")
+    shown = [{name: as_picture(name, image) for name, image in row.items()} for row in rows]
+    scale = max(width / 1000, 0.85)  # of text
+    margin, gap, top, drawn = round(0.025 * width), round(0.016 * width), 20 * scale, []
+    top += 34 * scale * bool(title) + 24 * scale * (subtitle.count("\n") + bool(subtitle)) + 6 * scale
+    for row in shown:
+        side = (width - 2 * margin - (len(row) - 1) * gap) / len(row)
+        size = scale * float(np.clip(side / 300, 0.8, 1.15))
+        label, top = top, top + size * (24 + 18 * any("\n" in name for name in row))
+        for place, (name, image) in enumerate(row.items()):
+            box = margin + place * (side + gap), top, side, side * image.shape[0] / image.shape[1]
+            drawn.append((name, image, size, label, box))
+        top = max(box[1] + box[3] for *_, box in drawn) + 16 * scale
+    figure = figure_of(width, math.ceil(top))
+    heading(figure, margin, 18 * scale, title, 17 * scale)
+    label_at(figure, margin, (18 + 34 * bool(title)) * scale, subtitle, size=11 * scale, color=FAINT)
+    for name, image, size, line, box in drawn:
+        label, _, note = name.partition("\n")
+        heading(figure, box[0], line, label, 12 * size)
+        label_at(figure, box[0], line + 21 * size, note, size=10.5 * size, color=FAINT)
+        _draw_picture(figure, box, image)
     return figure
 
 
-def _draw_panel(figure: Figure, panel: Panel, left: int, top: int, width: int) -> None:
-    height = round(width * panel.image.shape[0] / panel.image.shape[1])
-    size, line = 17 if width > 400 else 13.5, top - 10
-    label_at(figure, left, line, panel.label, size=size, fontweight="bold", va="bottom")
-    # Pictures rarely fill their corners: the note keeps away from the next panel's label.
-    right = left + 0.96 * width
-    label_at(figure, right, line, panel.note, size=size - 1, color=FAINT, va="bottom", ha="right")
-    # Black, as beside the walls of a view, is the page.
+def _draw_picture(figure: Figure, box: tuple[float, float, float, float], image: np.ndarray) -> None:
+    left, top, w, h = (max(round(side), 1) for side in box)  # whole pixels, which Agg does not resample
+    black = resize((np.atleast_3d(image) == 0).all(axis=-1).astype(np.float32), (h, w)) > 0.999
+    if times := w // image.shape[1]:  # enlarged to more than is drawn: squares with sharp edges
+        image = image.repeat(times + 1, axis=0).repeat(times + 1, axis=1)
+    codes = np.atleast_3d(to_srgb(np.clip(resize(image, (h, w)), 0, 1)))
+    codes = np.broadcast_to(codes, (h, w, 3))
     paper = np.array([int(PAPER[i : i + 2], 16) / 255 for i in (1, 3, 5)])
-    shown = to_srgb(np.clip(resize(panel.image, (height, width)), 0, 1))
-    shown = np.where(shown.max(axis=-1, keepdims=True) > 0, shown, paper)
-    axes = axes_at(figure, (left, top, width, height))
-    axes.imshow(np.rint(255 * shown).astype(np.uint8), interpolation="none", aspect="auto")
+    codes = np.where(black[..., None], paper, codes)
+    axes = axes_at(figure, (left, top, w, h))
+    axes.imshow(np.rint(255 * codes).astype(np.uint8), interpolation="none", aspect="auto")
     axes.axis("off")
 
 

@@ -27,6 +27,7 @@ LONGEST = 32766  # pixels along an image that OpenCV can still address
 _MARGIN = 0.03  # of the larger side, left free around the walls
 _BAND = 32  # output rows drawn at a time, so that supersampling stays small in memory
 _EDGE = 1e-9  # of a wall: points so far beside it count as on it, lest seams show as cracks
+_AT_ONCE = 4  # channels that OpenCV interpolates fast
 _MOST_POINTS = 16  # along a patch: 256 points give a mean good to a fraction of a percent
 
 
@@ -104,7 +105,7 @@ def draw(
     supersample: int,
     screens: Sequence[Wall] = (),
 ) -> np.ndarray:
-    """Image (H, W[, 3]) float32 of a picture (h, w[, 3]) on the walls; 0 on screens and beside all."""
+    """Image (H, W[, c]) float32 of a picture (h, w[, c]) on the walls; 0 on screens and beside all."""
     visible = frame(viewer, (*walls, *screens))
     height, width = visible.pixels(size)
     scale = supersample * visible.scale(height, width)
@@ -214,7 +215,10 @@ def _read_wall(
 def _interpolate(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Values at pixel coordinates (..., 2), x first; the border pixel goes on outside the image."""
     x, y = np.ascontiguousarray(np.moveaxis(places, -1, 0), dtype=np.float32)
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if image.ndim == 2 or image.shape[2] <= _AT_ONCE:
+        return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    parts = [image[..., k : k + _AT_ONCE] for k in range(0, image.shape[2], _AT_ONCE)]
+    return np.concatenate([np.atleast_3d(_interpolate(part, places)) for part in parts], axis=-1)
 
 
 def _shrink(image: np.ndarray, factor: int) -> np.ndarray:

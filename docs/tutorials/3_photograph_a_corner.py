@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""
+Photograph your own corner
+==========================
+
+With any projector, and a camera or phone that can hold its settings. ltcl tells you what to project and how
+long to expose; you take the photographs; ltcl checks each of them and makes the transport of your corner.
+
+There is a :doc:`checklist to print <../checklist>`. This page does the whole thing once, with a small
+simulated corner in place of yours, and then makes every mistake, to show what ltcl says.
+"""
+
+# %%
+# The set-up
+# ----------
+#
+# 1. Put the projector in front of the corner so that its picture fills both walls. Put the camera beside it,
+#    on a tripod. It must see all of the projected picture.
+# 2. Switch off what is automatic in the camera: exposure, ISO, white balance, focus, flash. Let it save raw
+#    files (or PNG, TIFF), never JPEG.
+# 3. Make the room dark, and leave it so: a small lamp that stays on does no harm, one that changes does.
+# 4. Write how many pixels you want into a file ``scan/acquisition.toml``. Begin with few; the time grows with
+#    their number.
+#
+# .. code-block:: toml
+#
+#    [rig]
+#    kind = "folder"
+#    projector_grid = [4, 8]      # height, width
+#    projector = [1080, 1920]     # the pixels of your projector
+#
+# How it goes
+# -----------
+#
+# .. code-block:: sh
+#
+#    ltcl acquire run scan            # says which photograph is next; writes patterns/ and shots.csv
+#    ltcl show scan                   # shows the patterns, one after the other, on the projector
+#    ltcl acquire run scan --take CARD  # copies your photographs from the folder CARD, in their order
+#
+# You do this six to eight times: ltcl first needs to see white and black to know how long to expose, then
+# stripes to know where each pixel lands, then the patterns of the scan. ``ltcl acquire run scan`` can be
+# stopped at any time, and goes on where it was.
+#
+# The same in Python, with a stand-in for you
+# -------------------------------------------
+#
+# ``camera`` is a corner of two white walls with a camera in front. ``photographer`` does what you would do:
+# look at the list, show the pattern, take the photograph, save it under the name on the list.
+
+import html
+import io
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+import ltcl
+from ltcl.acquisition import FolderRig, Report, Setup, VirtualRig, camera_map
+from ltcl.errors import LtclError, PhotographMissing
+from ltcl.plots import pictures
+
+corner = ltcl.scenes.dihedral(4, albedo=0.7)
+place = camera_map(lambda x, y: ((x - 4) / 4, (y - 3) / 4), (22, 38), corner.grid)  # 4 of its pixels to one
+camera = VirtualRig(corner.transport(), corner.grid, camera_grid=(22, 38), camera_map=place, ambient=0.01)
+
+
+def photographer(folder, rig):
+    """Take all photographs that are on the list and not there yet."""
+    for number in rig.missing():
+        shot = rig.shots[number - 1]
+        codes = np.asarray(Image.open(folder / shot.pattern)) / 255
+        photograph = camera.photograph(codes, shot.seconds)
+        Image.fromarray(photograph).save(folder / f"{shot.save_as}.png")
+
+
+def scan(folder, photographer=None):
+    """Acquire; where photographs are missing call the photographer, if there is one."""
+    while True:
+        rig = FolderRig(folder, corner.grid)
+        try:
+            return ltcl.acquire(rig, store=folder / "T.zarr", strategy="pixel", frames=4)
+        except PhotographMissing as missing:
+            if photographer is None:
+                raise
+            print(f"{missing.missing:3} photographs, the first: {str(missing).partition(': ')[2][:47]} ...")
+            photographer(folder, rig)
+
+
+folder = Path(tempfile.mkdtemp()) / "scan"
+T = scan(folder, photographer)
+
+# %%
+# These are some of the photographs. The small dots of light are single pixels of the projector; the dim
+# light around them has bounced, and is what the scan is about.
+
+names = sorted((folder / "photographs").iterdir())
+shown = {"white": 1, "stripes, to find places": 20, "one pixel, short": 60, "one pixel, long": 61}
+figure = pictures({name: ltcl.images.read(names[k]) for name, k in shown.items()})
+
+# %%
+# What came of it
+# ---------------
+
+print(Report.of(folder / "T.zarr"))
+
+# %%
+# As this corner is simulated, its true transport is known, and so is the error:
+
+setup = Setup.of(folder / "T.zarr")
+(error,) = setup.relative_error(camera, T)
+print(f"pictures by T are wrong by {error:.2%}")
+
+# %%
+# Now a picture goes onto the walls: a bright band across the corner. ``background`` is the light of the
+# room, which was measured, too. ``setup.codes`` are what the projector must be fed, by its measured
+# response.
+
+wanted = np.full(corner.grid, 0.35) * T.first_bounce.mean()
+wanted[1:3] *= 2
+result = ltcl.compensate(T, wanted, background=setup.ambient, gain="auto")
+print(f"error {result.error:.2%}")
+
+before = ltcl.images.from_srgb(camera.photograph(wanted / wanted.max(), 1.0) / 255)
+after = ltcl.images.from_srgb(camera.photograph(setup.codes(result.pattern), 1.0) / 255)
+figure = pictures(
+    {"wanted": wanted / wanted.max(), "projected as it is": before, "the pattern of ltcl projected": after}
+)
+
+# %%
+# Every mistake, and what ltcl says then
+# --------------------------------------
+#
+# For each line of the table the photographs were copied, and one mistake made in them. The message is what
+# ltcl really said when this page was built. ltcl compares each group of photographs with what it knows
+# already before it keeps them, so nothing is lost: mend or retake what is named, and run the same command
+# again.
+#
+# The code is long, as there are many mistakes. The table is below it.
+
+
+def change(name, edit):
+    """Replace a photograph by what `edit` makes of it."""
+
+    def mistake(files):
+        path = files[name - 1]
+        Image.fromarray(edit(np.asarray(Image.open(path)))).save(path)
+
+    return mistake
+
+
+def exchange(files):
+    """Photographs 71 and 73 have each other's name."""
+    first, second = (files[k].read_bytes() for k in (70, 72))
+    files[70].write_bytes(second)
+    files[72].write_bytes(first)
+
+
+def moved(files):
+    """From photograph 80 on the camera looks elsewhere."""
+    for path in files[79:]:
+        Image.fromarray(np.roll(np.asarray(Image.open(path)), 2, axis=1)).save(path)
+
+
+def as_jpeg(image):
+    """The image after it was a JPEG."""
+    memory = io.BytesIO()
+    Image.fromarray(image).save(memory, "JPEG", quality=40)
+    return np.asarray(Image.open(memory))
+
+
+def auto_exposure(files):
+    """The camera chose a time itself; it notes that in the file."""
+    exif = Image.Exif()
+    exif[33434] = 0.5
+    Image.open(files[70]).save(files[70], exif=exif)
+
+
+LAMP = np.linspace(20, 90, 38)
+MISTAKES = {
+    "a photograph is missing": lambda files: files[70].unlink(),
+    "two photographs exchanged": exchange,
+    "the button pressed twice": lambda files: files[72].write_bytes(files[70].read_bytes()),
+    "a light switched on": change(75, lambda image: np.minimum(image + LAMP, 255).astype(np.uint8)),
+    "the camera was touched": moved,
+    "JPEG in place of raw or PNG": lambda files: [change(k, as_jpeg)(files) for k in range(40, 109)],
+    "automatic exposure": auto_exposure,
+    "the camera turned": change(71, np.rot90),
+    "one name for two files": lambda files: files[70].with_suffix(".tif").write_bytes(b""),
+    "a file is broken": lambda files: files[70].write_bytes(files[70].read_bytes()[:200]),
+}
+
+
+class Table(list):
+    """Mistakes and messages; a notebook, and this page, show it as a table."""
+
+    def _repr_html_(self):
+        cell = "<td style='text-align: left'>{}</td>"
+        lines = [("<b>mistake</b>", "<b>what ltcl says</b>")]
+        lines += [(name, html.escape(said)) for name, said in self]
+        rows = ["<tr>" + "".join(map(cell.format, line)) + "</tr>" for line in lines]
+        return f"<table class='table'>{''.join(rows)}</table>"
+
+
+table = Table()
+for name, mistake in MISTAKES.items():
+    copy = folder.with_name("copy")
+    shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("T.zarr*"))
+    mistake(sorted((copy / "photographs").iterdir()))
+    try:
+        scan(copy)
+        table.append((name, "nothing: it did no harm"))
+    except LtclError as error:
+        table.append((name, str(error).replace(str(copy), "scan")))
+    shutil.rmtree(copy)
+table
+
+# %%
+# Where to go on: the same with :doc:`a webcam and a second display <4_webcam>`, which needs no person at
+# all; what to do with T is in :doc:`2_my_matrix`.
+
+# sphinx_gallery_thumbnail_number = 9
