@@ -8,6 +8,7 @@ import signal
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import pytest
 import ltcl
 from ltcl.device import Device
 from ltcl.device.device import SPARE_BYTES
+from ltcl.device.kernels import Kernel
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SMALL = 4096  # bytes: a 53 x 53 matrix takes several slabs, its vectors still fit
@@ -50,6 +52,25 @@ def device(private_cache: Path) -> Device:
     return ltcl.open_device()
 
 
+def launched_as(device: Device, kind: str) -> Device:
+    """The same hardware; kernels are launched as on a "cpu" or a "gpu".
+
+    As on a GPU a CPU never runs them but here, where how it optimizes them is of no interest: that takes two
+    thirds of the time of compiling.
+    """
+    other = Device(device.description)
+    other.kind, kernel = kind, other.kernel
+
+    def unoptimized(file: str, name: str, **defines: Any) -> Kernel:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("PYOPENCL_BUILD_OPTIONS", "-cl-opt-disable")
+            return kernel(file, name, **defines)
+
+    if device.is_cpu and kind == "gpu":
+        vars(other)["kernel"] = unoptimized
+    return other
+
+
 @pytest.fixture
 def small_device(device: Device) -> Device:
     """The same hardware with buffers of 4 KiB at most, so that matrices are cut into slabs."""
@@ -61,9 +82,7 @@ def small_device(device: Device) -> Device:
 @pytest.fixture(scope="session", params=["cpu", "gpu"])
 def shaped(request: pytest.FixtureRequest, device: Device) -> Device:
     """The same hardware; kernels are launched as on a CPU or as on a GPU."""
-    other = Device(device.description)
-    other.kind = request.param
-    return other
+    return launched_as(device, request.param)
 
 
 @pytest.fixture(scope="session")

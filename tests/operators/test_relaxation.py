@@ -12,7 +12,7 @@ from ltcl.errors import MemoryLimitError
 from ltcl.operators import CSR, Dense, IdentityPlus
 from ltcl.operators.relaxation import Relaxation, Steps, Sweeps, relaxation
 from tests import gallery, reference
-from tests.conftest import SMALL
+from tests.conftest import SMALL, launched_as
 from tests.operators import helpers
 
 MATRICES = {
@@ -35,9 +35,7 @@ def launch(request, device) -> tuple[Device, int]:
     """A device whose kernels are launched as on a CPU or a GPU, and the size of its work-groups."""
     if request.param == "cpu" and not device.is_cpu:
         pytest.skip("strips hand on their turn within a launch, which OpenCL promises on no GPU")
-    other = Device(device.description)
-    other.kind = request.param[:3]
-    return other, SHAPES[request.param]
+    return launched_as(device, request.param[:3]), SHAPES[request.param]
 
 
 def matrix_of(launch: tuple[Device, int], form: str, name: str) -> tuple[CSR | Dense, np.ndarray]:
