@@ -77,6 +77,7 @@ def two(monkeypatch: pytest.MonkeyPatch, device: Device) -> list[discovery.Descr
     ]
     monkeypatch.delenv("LTCL_DEVICE", raising=False)
     monkeypatch.setattr(discovery, "list_devices", lambda: found)
+    monkeypatch.setattr(discovery, "_opened", {})  # none of another test, which had less memory
     return found
 
 

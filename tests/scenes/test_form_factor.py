@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import ltcl
-from ltcl.device import Device
 from ltcl.operators import IdentityPlus
 from ltcl.scenes import Block, FormFactor, Patches, box, cut, visibility
 from ltcl.scenes.builders import WALLS
@@ -20,13 +19,6 @@ from tests.operators import helpers
 from tests.scenes.closed_forms import closed_room, slope
 
 BLOCK = [[(0.25, 0.25, 0.0), (0.75, 0.5, 0.5)]]
-
-
-@pytest.fixture(params=["cpu", "gpu"])
-def launched(request: pytest.FixtureRequest, device: Device, monkeypatch: pytest.MonkeyPatch) -> Device:
-    """The device as it launches here, and as GPUs do: one patch a lane in place of eight."""
-    monkeypatch.setattr(Device, "is_cpu", property(lambda _: request.param == "cpu"))
-    return device
 
 
 def tiles(count: int) -> Patches:
@@ -53,10 +45,10 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_products_meet_their_twin(launched, name):
+def test_products_meet_their_twin(shaped, name):
     patches, blocks = SCENES[name]
     albedo = np.linspace(0.2, 0.9, len(patches))
-    A = FormFactor(patches, albedo, blocks, launched)
+    A = FormFactor(patches, albedo, blocks, shaped)
     G = reference.form_factor_entries(
         A._geometry.get()[:, : len(patches)], A._blocks.get()[: len(blocks or ())]
     )
@@ -71,7 +63,7 @@ def test_products_meet_their_twin(launched, name):
     for k in helpers.COLUMNS if name == "53 tiles" else (None, 5):
         x, y = gallery.vectors(len(patches), k), gallery.vectors(len(patches), k, 2)
         for apply, twin, bound in ((A.apply, matrix, size), (A.apply_transpose, matrix.T, size.T)):
-            out = apply(launched.upload(x), None, scale=-0.75, add=launched.upload(y)).get()
+            out = apply(shaped.upload(x), None, scale=-0.75, add=shaped.upload(y)).get()
             error = 32 * reference.product_error(bound, x, -0.75, y)
             helpers.close(out, reference.dense_matvec(twin, x, -0.75, y), error)
 
@@ -131,13 +123,13 @@ def test_launches_in_slabs_give_the_same(device, monkeypatch):
 
 
 @pytest.mark.parametrize(("count", "boxes", "samples"), [(1, 1, 1), (8, 2, 3), (9, 1, 4), (53, 5, 4)])
-def test_rays_meet_their_twin(launched, count, boxes, samples):
+def test_rays_meet_their_twin(shaped, count, boxes, samples):
     rng = np.random.default_rng(count)
     patches = Patches(*rng.uniform(-1, 1, (3, count, 3)) * np.array([3, 0.3, 0.3])[:, None, None])
     low = rng.uniform(-3, 2, (boxes, 3))
     blocks = np.stack([low, low + rng.uniform(0.2, 2, (boxes, 3))], axis=1)
-    seen = visibility(patches, blocks, launched, samples=samples)
-    rays = Rays(patches, blocks, launched, samples)
+    seen = visibility(patches, blocks, shaped, samples=samples)
+    rays = Rays(patches, blocks, shaped, samples)
     starts, ends = (p.get().reshape(samples**2, 3, -1)[..., :count] for p in (rays._starts, rays._ends))
     expected = reference.form_factor_visible(starts, ends, rays._normals.get()[:, :count], rays._blocks.get())
     # A ray that grazes a box or a plane to rounding counts either way: one in a hundred entries at most.
