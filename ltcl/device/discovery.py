@@ -14,6 +14,7 @@ import sys
 import threading
 import weakref
 from dataclasses import dataclass, field, replace
+from platform import machine
 from typing import Any
 
 from ltcl.device import kernels
@@ -21,12 +22,8 @@ from ltcl.device.device import Device
 from ltcl.errors import DeviceError, InputTypeError
 
 KINDS = ("gpu", "accelerator", "cpu", "simulator")  # the best first
-_FIXES = {
-    "linux": "pip install 'pyopencl[pocl]' (any x86-64 CPU), apt install pocl-opencl-icd (any CPU), or your "
-    "GPU vendor's OpenCL driver; PoCL needs a folder that it can write, which POCL_CACHE_DIR names",
-    "darwin": "macOS brings OpenCL; on newer machines: conda install -c conda-forge pocl",
-    "win32": "install the GPU vendor's driver, or Intel's CPU Runtime for OpenCL Applications",
-}
+_CONDA = "conda install -c conda-forge pyopencl pocl-cpu"  # which the wheels on PyPI lack there
+_FIXES = {"linux x86_64": "python -m pip install 'pyopencl[pocl]'", "darwin": _CONDA, "win32": _CONDA}
 _HIDING = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")  # may hide every driver
 
 _opened: weakref.WeakValueDictionary[str, Device] = weakref.WeakValueDictionary()
@@ -122,7 +119,10 @@ def open_device(select: str | Device | None = None) -> Device:
 
 def choose(devices: list[Description], select: str | None) -> Description:
     """The one of `devices`, best first, that `select` means."""
-    fix = f"install a driver: {_FIXES.get(sys.platform, _FIXES['linux'])}"
+    of_cpu = _FIXES.get(f"{sys.platform} {machine()}", "sudo apt install pocl-opencl-icd")
+    command = _FIXES.get(sys.platform, of_cpu)
+    folder = "PoCL needs a folder that it can write, which POCL_CACHE_DIR names"
+    fix = f"install a driver: {command}, or that of your GPU's vendor; {folder}"
     if not devices:
         set_by_user = [f"{name}={os.environ[name]}" for name in _HIDING if os.environ.get(name)]
         unset = f"unset {' and '.join(set_by_user)}, or " if set_by_user else ""
