@@ -170,10 +170,12 @@ def test_selection_of_nothing_lists_what_there_is(select, kind):
 @pytest.mark.parametrize(
     ("system", "machine", "fix"),
     [
-        ("linux", "x86_64", "pip install 'pyopencl"), ("linux", "aarch64", "apt install pocl-opencl-icd"),
-        ("darwin", "arm64", "conda-forge pyopencl pocl-cpu"), ("win32", "AMD64", "conda-forge pyopencl pocl-cpu"),
+        ("linux", "x86_64", "pip install 'pyopencl"),
+        ("linux", "aarch64", "apt install pocl-opencl-icd"),
+        ("darwin", "arm64", "conda-forge pyopencl pocl-cpu"),
+        ("win32", "AMD64", "conda-forge pyopencl pocl-cpu"),
     ],
-)  # fmt: skip
+)
 def test_no_device_at_all_names_a_command_and_what_may_hide_drivers(monkeypatch, system, machine, fix):
     monkeypatch.setattr(sys, "platform", system)
     monkeypatch.setattr(discovery, "machine", lambda: machine)
