@@ -7,14 +7,10 @@ import importlib
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
 
-import pytest
-import typer
 import yaml
 
 import ltcl
-from ltcl.cli.main import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -59,28 +55,3 @@ def test_the_changelog_of_a_version_fits_a_screen() -> None:
     newest = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## ")[1].splitlines()
     assert len(newest) <= 40
     assert max(map(len, newest)) <= 100
-
-
-PAGES = [ROOT / "SECURITY.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / ".github").rglob("*.md"))]
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_pages_for_contributors_name_what_exists(page: Path) -> None:
-    """Commands of ltcl, links, and files of the repository in code, but for those with a NAME to choose."""
-    text = page.read_text(encoding="utf-8")
-    program: Any = typer.main.get_command(app)
-    for first, second in re.findall(r"`ltcl ([a-z]+)(?: ([a-z]+))?", text):
-        command = program.commands[first]
-        assert second in getattr(command, "commands", {second: None}), (first, second)
-    links = [target.partition("#")[0] for target in re.findall(r"\]\((?!https?:)([^)]+)\)", text)]
-    files = re.findall(r"`((?:ltcl|kernels|tests|bench|docs|\.ci)/[\w./*]+)`", text)
-    assert [file for file in [*links, *files] if "NAME" not in file and not (ROOT / file).exists()] == []
-
-
-def test_issue_templates_have_a_name_and_say_what_they_are_for() -> None:
-    templates = [page for page in PAGES if page.parent.name == "ISSUE_TEMPLATE"]
-    assert {page.stem for page in templates} == {"bug", "scan", "question"}
-    for page in templates:
-        _, front, body = page.read_text(encoding="utf-8").split("---\n", 2)
-        assert {"name", "about", "labels"} == yaml.safe_load(front).keys()
-        assert "ltcl doctor" in body or page.stem == "question"

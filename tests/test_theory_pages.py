@@ -65,7 +65,11 @@ class Record:
     """A file of bench/results, whose name begins so."""
 
     def __init__(self, name: str) -> None:
-        (path,) = (ROOT / "bench" / "results").glob(f"{name}*.json")
+        found = [*(ROOT / "bench" / "results").glob(f"{name}*.json")]
+        assert len(found) == 1, (
+            f"records of {name}: {found}; a page quotes one, by its whole name"
+        )
+        (path,) = found
         self.content = json.loads(path.read_text(encoding="utf-8"))
         self.facts = self.content["facts"]
 
