@@ -66,9 +66,7 @@ class Record:
 
     def __init__(self, name: str) -> None:
         found = [*(ROOT / "bench" / "results").glob(f"{name}*.json")]
-        assert len(found) == 1, (
-            f"records of {name}: {found}; a page quotes one, by its whole name"
-        )
+        assert len(found) == 1, f"records of {name}: {found}; a page quotes one, by its whole name"
         (path,) = found
         self.content = json.loads(path.read_text(encoding="utf-8"))
         self.facts = self.content["facts"]
