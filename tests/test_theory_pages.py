@@ -7,7 +7,7 @@ import importlib
 import inspect
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -95,16 +95,15 @@ def of_beyond() -> Iterator[str]:
         Record("relax").row(question=question, competitor="one product")["ratio"]
         for question in ("runs of 16, strips of 63", "random, strips of 63", "dense 4096, strips of 8")
     ]
-    more: dict[str, Iterable[Any]] = {
-        **{name: steps(launches, name) for name in ("chebyshev", "gmres")},
-        **{name: [steps(launches, name)[0]] for name in ("cg", "bicgstab")},
-        "gauss_seidel": [f"{min(relax):.2f}", f"{max(relax):.2f}"],
-    }
-    order = "chebyshev gmres cg bicgstab gauss_seidel block_gauss_seidel southwell richardson jacobi"
+    yield from map(str, (*steps(launches, "chebyshev"), *steps(launches, "gmres")))
+    yield from (str(steps(launches, method)[0]) for method in ("cg", "bicgstab"))
+    yield from (f"{end(relax):.2f}" for end in (min, max))
+    yield str(steps(launches, "richardson")[0])
     assert products["jacobi"] == products["neumann"]
+    assert products["gauss_seidel"] == products["sor"]
+    order = "chebyshev gmres cg bicgstab gauss_seidel block_gauss_seidel southwell richardson jacobi"
     for method in order.split():
         yield from (str(count) for count in products[method].values() if count != "diverged")
-        yield from map(str, more.get(method, ()))
     yield f"{Record('walk').facts['steps, M/s']:.1f}"
     gather = Record("fig8").claim("30 samples a pixel suffice", r"error ([\d.]+%), without ([\d.]+%)")
     yield from reversed([*gather])
