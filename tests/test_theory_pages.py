@@ -110,8 +110,8 @@ def of_beyond() -> Iterator[str]:
     yield f"{Record('dense4k').row(competitor='LU kept, float32 (ours: an inverse kept)')['ratio']:.1f}"
     large = Record("resolution131k-xeon")
     yield from large.claim("pattern of 131072 pixels", r"error ([\d.]+%)")
-    stored = large.facts["bytes of T, for bounces and for patterns"].partition(",")[0]
-    yield f"{int(stored) / 1e6:.0f}"
+    stored = large.facts["bytes of T, for bounces and for patterns"].partition(",")[2]
+    yield f"{int(stored) / 1e6:.1f}"
     yield from Record("fig7").claim("series, eq. 10: slope", r"([\d.]+),")
     traced = Record("traced").facts
     corner, box = (traced[f"{scene}: bounces of one view, off"] for scene in ("corner", "box"))
