@@ -2,7 +2,8 @@
 """Install a wheel and a source archive as a user would, for each Python that ltcl is for, and use them.
 
 Each archive goes into an empty virtual environment of its own, away from the checkout. All other packages
-come as wheels, so that no compiler is needed. Then `ltcl doctor` and a small `ltcl demo` must end well.
+come as wheels: nothing is compiled. Then `ltcl doctor` and a small `ltcl demo` must end well, which takes an
+OpenCL driver; the wheel of PoCL on Linux x86-64 takes the linker and libraries that gcc brings.
 Pythons are those of the classifiers in pyproject.toml that PATH has; those that are missing are named, which
 is no error unless --all is given.
 
