@@ -10,11 +10,11 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import sys
 import threading
 import weakref
 from dataclasses import dataclass, field, replace
-from platform import machine
 from typing import Any
 
 from ltcl.device import kernels
@@ -23,7 +23,7 @@ from ltcl.errors import DeviceError, InputTypeError
 
 KINDS = ("gpu", "accelerator", "cpu", "simulator")  # the best first
 _CONDA = "conda install -c conda-forge pyopencl pocl-cpu"  # which the wheels on PyPI lack there
-_FIXES = {"linux x86_64": "python -m pip install 'pyopencl[pocl]'", "darwin": _CONDA, "win32": _CONDA}
+_FIXES = {"x86_64": "python -m pip install 'pyopencl[pocl]'", "darwin": _CONDA, "win32": _CONDA}
 _HIDING = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")  # may hide every driver
 
 _opened: weakref.WeakValueDictionary[str, Device] = weakref.WeakValueDictionary()
@@ -55,8 +55,7 @@ class Description:
 def list_devices() -> list[Description]:
     """Every OpenCL device, the best first; an empty list where no driver is installed.
 
-    >>> import ltcl
-    >>> all(":" in device.index for device in ltcl.list_devices())
+    >>> all(":" in device.index for device in list_devices())
     True
     """
     kernels.refuse_forked()
@@ -111,6 +110,8 @@ def open_device(select: str | Device | None = None) -> Device:
         platform = description.index.partition(":")[0] + ":"
         others = [open_device(d.index) for d in devices if d.index.startswith(platform) and d != description]
         description = replace(description, index="all") if others else description
+    if "Language 3." in description.driver and sys.platform == "linux" and not shutil.which("ld"):
+        raise DeviceError(f"{description.driver} needs the linker ld, which PATH lacks: sudo apt install gcc")
     with _opening:
         device = _opened.get(description.index) or Device(description)
         device.others = tuple(others)
@@ -119,8 +120,7 @@ def open_device(select: str | Device | None = None) -> Device:
 
 def choose(devices: list[Description], select: str | None) -> Description:
     """The one of `devices`, best first, that `select` means."""
-    of_cpu = _FIXES.get(f"{sys.platform} {machine()}", "sudo apt install pocl-opencl-icd")
-    command = _FIXES.get(sys.platform, of_cpu)
+    command = _FIXES.get(sys.platform) or _FIXES.get(os.uname().machine, "sudo apt install pocl-opencl-icd")
     folder = "PoCL needs a folder that it can write, which POCL_CACHE_DIR names"
     fix = f"install a driver: {command}, or that of your GPU's vendor; {folder}"
     if not devices:
