@@ -30,8 +30,10 @@ def missing(archive: Path) -> set[str]:
         wanted = checkout("ltcl") | {f"ltcl/{name}" for name in checkout("kernels")}
         with zipfile.ZipFile(archive) as wheel:
             return wanted - set(wheel.namelist())
-    wanted = checkout("ltcl", "kernels", "tests", "bench") | {"LICENSE", "README.md", "pyproject.toml"}
-    wanted |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    wanted = checkout("ltcl", "kernels", "tests", "bench", "docs/tutorials", "docs/examples", ".ci")
+    wanted |= {"pyproject.toml", "LICENSE", "CITATION.cff"}
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / ".github").rglob("*.md")]
+    wanted |= {path.relative_to(ROOT).as_posix() for path in pages}
     with tarfile.open(archive) as sdist:
         return wanted - {name.partition("/")[2] for name in sdist.getnames()}
 

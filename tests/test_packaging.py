@@ -8,6 +8,8 @@ import re
 import tomllib
 from pathlib import Path
 
+import yaml
+
 import ltcl
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,5 +33,25 @@ def test_types_and_the_console_script_come_along() -> None:
 def test_archives_hold_the_kernels_and_all_that_tests_need() -> None:
     targets = PROJECT["tool"]["hatch"]["build"]["targets"]
     assert targets["wheel"]["force-include"] == {"kernels": "ltcl/kernels"}
-    needed = {"/ltcl", "/kernels", "/tests", "/bench", "/docs", "/CHANGELOG.md", "/LICENSE", "/README.md"}
-    assert needed <= set(targets["sdist"]["include"])
+    needed = {"/ltcl", "/kernels", "/tests", "/bench", "/docs", "/.ci", "/.github"}
+    needed |= {"/LICENSE", "/CITATION.cff"}
+    pages = {f"/{path.name}" for path in ROOT.glob("*.md")}
+    assert {"/README.md", "/CHANGELOG.md", "/CONTRIBUTING.md", "/SECURITY.md"} <= pages
+    assert needed | pages <= set(targets["sdist"]["include"])
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper() -> None:
+    """Its schema is checked by `.ci/run`."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (citation["cff-version"], citation["type"]) == ("1.2.0", "software")
+    assert (citation["version"], citation["license"]) == (ltcl.__version__, PROJECT["project"]["license"])
+    (paper,) = citation["references"]
+    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    assert f"*{paper['title']}*, {paper['journal']}, {paper['year']}" in readme
+    assert all(author["family-names"] in readme for author in paper["authors"])
+
+
+def test_the_changelog_of_a_version_fits_a_screen() -> None:
+    newest = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## ")[1].splitlines()
+    assert len(newest) <= 40
+    assert max(map(len, newest)) <= 100

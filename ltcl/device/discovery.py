@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import sys
 import threading
 import weakref
@@ -21,12 +22,8 @@ from ltcl.device.device import Device
 from ltcl.errors import DeviceError, InputTypeError
 
 KINDS = ("gpu", "accelerator", "cpu", "simulator")  # the best first
-_FIXES = {
-    "linux": "pip install 'pyopencl[pocl]' (any x86-64 CPU), apt install pocl-opencl-icd (any CPU), or your "
-    "GPU vendor's OpenCL driver; PoCL needs a folder that it can write, which POCL_CACHE_DIR names",
-    "darwin": "macOS brings OpenCL; on newer machines: conda install -c conda-forge pocl",
-    "win32": "install the GPU vendor's driver, or Intel's CPU Runtime for OpenCL Applications",
-}
+_CONDA = "conda install -c conda-forge pyopencl pocl-cpu"  # which the wheels on PyPI lack there
+_FIXES = {"x86_64": "python -m pip install 'pyopencl[pocl]'", "darwin": _CONDA, "win32": _CONDA}
 _HIDING = ("OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "POCL_CACHE_DIR")  # may hide every driver
 
 _opened: weakref.WeakValueDictionary[str, Device] = weakref.WeakValueDictionary()
@@ -58,8 +55,7 @@ class Description:
 def list_devices() -> list[Description]:
     """Every OpenCL device, the best first; an empty list where no driver is installed.
 
-    >>> import ltcl
-    >>> all(":" in device.index for device in ltcl.list_devices())
+    >>> all(":" in device.index for device in list_devices())
     True
     """
     kernels.refuse_forked()
@@ -114,6 +110,8 @@ def open_device(select: str | Device | None = None) -> Device:
         platform = description.index.partition(":")[0] + ":"
         others = [open_device(d.index) for d in devices if d.index.startswith(platform) and d != description]
         description = replace(description, index="all") if others else description
+    if "Language 3." in description.driver and sys.platform == "linux" and not shutil.which("ld"):
+        raise DeviceError(f"{description.driver} needs the linker ld, which PATH lacks: sudo apt install gcc")
     with _opening:
         device = _opened.get(description.index) or Device(description)
         device.others = tuple(others)
@@ -122,7 +120,9 @@ def open_device(select: str | Device | None = None) -> Device:
 
 def choose(devices: list[Description], select: str | None) -> Description:
     """The one of `devices`, best first, that `select` means."""
-    fix = f"install a driver: {_FIXES.get(sys.platform, _FIXES['linux'])}"
+    command = _FIXES.get(sys.platform) or _FIXES.get(os.uname().machine, "sudo apt install pocl-opencl-icd")
+    folder = "PoCL needs a folder that it can write, which POCL_CACHE_DIR names"
+    fix = f"install a driver: {command}, or that of your GPU's vendor; {folder}"
     if not devices:
         set_by_user = [f"{name}={os.environ[name]}" for name in _HIDING if os.environ.get(name)]
         unset = f"unset {' and '.join(set_by_user)}, or " if set_by_user else ""

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
@@ -168,14 +169,31 @@ def test_selection_of_nothing_lists_what_there_is(select, kind):
 
 
 @pytest.mark.parametrize(
-    ("system", "fix"),
-    [("linux", "pocl"), ("darwin", "conda-forge"), ("win32", "Intel"), ("sunos5", "pocl")],
+    ("system", "machine", "fix"),
+    [
+        ("linux", "x86_64", "pip install 'pyopencl"),
+        ("linux", "aarch64", "apt install pocl-opencl-icd"),
+        ("darwin", "arm64", "conda-forge pyopencl pocl-cpu"),
+        ("win32", "AMD64", "conda-forge pyopencl pocl-cpu"),
+    ],
 )
-def test_no_device_at_all_names_a_driver_and_what_may_hide_it(monkeypatch, system, fix):
+def test_no_device_at_all_names_a_command_and_what_may_hide_drivers(monkeypatch, system, machine, fix):
     monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine=machine), raising=False)
     monkeypatch.setenv("OCL_ICD_VENDORS", "/nowhere")
     with pytest.raises(DeviceError, match=f"OCL_ICD_VENDORS=/nowhere.*{fix}"):
         discovery.choose([], "gpu")
+
+
+def test_a_driver_that_would_end_the_process_for_want_of_a_linker_is_refused(device, monkeypatch):
+    """PoCL 3 runs `ld`, and aborts where there is none."""
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("PATH", "/nowhere")
+    if "Language 3." in device.driver:
+        with pytest.raises(DeviceError, match=r"Language 3.* ld.* install gcc"):
+            ltcl.open_device(device.description.index)
+    else:
+        assert ltcl.open_device(device.description.index) is device
 
 
 def test_the_environment_names_the_default(device, monkeypatch):
