@@ -113,9 +113,9 @@ def product(A: Operator, x: np.ndarray) -> Callable[[], None]:
     return run
 
 
-def triad(device: Device, smoke: bool) -> tuple[Callable[[], None], int]:
-    """a b + c over arrays far larger than the caches: what memory gives; and its bytes, as STREAM counts."""
-    count = 1 << (16 if smoke else 25)
+def triad(device: Device, smoke: bool, parts: int = 1) -> tuple[Callable[[], None], int]:
+    """a b + c over arrays far larger than caches, or a part: what memory gives; bytes as STREAM counts."""
+    count = (1 << (16 if smoke else 25)) // parts
     b, c, out = (vectors.fill(device.empty(count), 1.0) for _ in range(3))
 
     def run() -> None:

@@ -3,6 +3,9 @@
 
 A product over p ranks takes t(p) = a + b E / p + c N with E stored entries and N pixels: calls; the entries
 of a rank; and the vector, whole on each, which is read from the device, exchanged, written back and added to.
+
+Products wait for memory, which cores share. The limit is what two ranks gain where they do nothing but read
+the same numbers, half of them each, in the same turns; beside it stands that of the triad, which also writes.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ import scipy.optimize
 import scipy.sparse
 
 import ltcl
-from _harness import Options, Row, options, report
+from _harness import Options, Row, options, report, triad
 from ltcl.operators import CSR, Dense, Distributed, IdentityPlus
 
 SIZES = {False: ((32_768, 256), (131_072, 256), (16_384, 16_384)), True: ((1024, 16), (4096, 16), (512, 512))}
@@ -44,6 +47,9 @@ def mpi(given: Options) -> tuple[list[Row], dict[str, Any]]:
         for who, target in (("1 rank", 1.8 if n != sizes[0][0] else None), ("no MPI", None)):
             pair = times[f"solve {who}"], times["solve 2 ranks"]
             rows.append(Row.of_times(f"Chebyshev by 2 ranks, {n} x {k}", who, *pair, "s", target))
+        for what in ("reading the same", "triad"):
+            limit, gain = (times[f"{each} 1 rank"] / times[f"{each} 2 ranks"] for each in (what, "solve"))
+            rows.append(Row(f"gain by 2 ranks, {n} x {k}", what, limit, gain, "times", gain / limit))
         facts[f"Allgatherv of {n}, ms"] = 1e3 * times["exchange"]
         facts[f"relative difference from the solution without MPI, {n} x {k}"] = times["difference"]
     terms = [[1.0, n * k / p, n] for n, k in sizes[:2] for p in (1, 2, 4)]
@@ -106,8 +112,18 @@ def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
         A = operators.get(who)
         actions[f"product {who}"] = A and partial(product, A, A.device.upload(b))
         actions[f"solve {who}"] = A and who != "4 ranks" and partial(solve, A)
+    numbers = [each.view(np.int32) for each in ((own.data, own.indices) if entries < n else (own,))]
+    triad_of_half, _ = triad(operators["2 ranks"].device, n < SIZES[False][0][0], 2)
+
+    def read() -> None:
+        for each in numbers:
+            each.max()
+
+    for what, half_of in (("reading the same", read), ("triad", triad_of_half)):
+        actions[f"{what} 1 rank"] = comm.rank == 0 and (lambda half_of=half_of: (half_of(), half_of()))
+        actions[f"{what} 2 ranks"] = lambda half_of=half_of: (half_of(), comm.Barrier())
     times = paired(comm, actions)
-    times |= {name: t / PRODUCTS for name, t in times.items() if "solve" not in name}
+    times |= {name: t / PRODUCTS for name, t in times.items() if name.startswith(("product", "exchange"))}
     answers = [solve(operators[who]) for who in ("2 ranks", "no MPI") if who in operators]
     return times | {
         "difference": float(np.linalg.norm(answers[0] - answers[-1]) / np.linalg.norm(answers[0]))

@@ -167,7 +167,7 @@ class Transport:
 
         def dense(T: Any) -> np.ndarray:
             T = T.tocsr().toarray() if hasattr(T, "tocsr") else T  # of memory, or of the rows of a store
-            return T if isinstance(T, np.ndarray) else as_operator(T, self.device).to_dense()
+            return intact(T) if isinstance(T, np.ndarray) else as_operator(T, self.device).to_dense()
 
         whole = np.array([[dense(T) for T in row] for row in rows])
         return whole if self.blocks else whole[0] if self.channels == 3 else whole[0, 0]

@@ -155,8 +155,8 @@ TASK = (*TRANSPORT, solve_options, picture_options)
 def load(context: Context, path: Path, dark_note: bool = True) -> Transport:
     """Open the device, then load: a mistyped device does not wait for a large file."""
     device, out = context.options["device"], context.options.get("out")
-    if out is not None and out.exists() and path.exists() and out.samefile(path):
-        raise InputError(f"--out is {out}, which is TRANSPORT itself; it must be another place")
+    if out is not None and path.exists() and path.resolve() in (out.resolve(), *out.resolve().parents):
+        raise InputError(f"--out is {out}, which is TRANSPORT itself or in it; it must be another place")
     if context.options.get("mpi"):
         from mpi4py import MPI
 

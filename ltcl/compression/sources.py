@@ -27,6 +27,7 @@ COLUMNS = 16  # blocks are of a multiple of this, so that kernels run alike what
 _WINDOW = 64  # pixels a side of the part of a picture on which bases are compared
 _PER_VALUE = 32  # bytes of host memory for a value of a block: float64, float32, transformed, kept
 _BLOCK, _MOST = 1 << 27, 512  # bytes of a block unless `memory` says otherwise; rows: more do not help
+_ITEMS = 512  # for workers, or up to twice as many: each costs the client some milliseconds
 
 
 class Rows(scipy.sparse.linalg.LinearOperator):
@@ -54,19 +55,22 @@ class Rows(scipy.sparse.linalg.LinearOperator):
         make, size = self.make, rows_at_once(self.shape[1], self.memory)
         fetch = self.fetch if self.there or self.client is None else None
 
-        def task(item: tuple[int, int, Any, Any]) -> list[Any]:  # without `self`: workers get it
-            start, stop, rows, value = item
-            rows = fetch(start, stop) if fetch else rows
-            blocks = [(start, stop, rows)]
-            if stop - start > size:
-                blocks = [(start + i, start + j, rows[i:j]) for i, j in cut(stop - start, size)]
-            return [work(slice(i, j), np.asarray(make(i, j, block), dtype), value) for i, j, block in blocks]
+        def task(item: tuple[list[Any], Any]) -> list[Any]:  # without `self`: workers get it
+            (parts, value), results = item, []
+            for start, stop, rows in parts:
+                rows, count = fetch(start, stop) if fetch else rows, stop - start
+                for i, j in cut(count, size):
+                    block = make(start + i, start + j, rows[i : j if j < count else None])
+                    results.append(work(slice(start + i, start + j), np.asarray(block, dtype), value))
+            return results
 
         if isinstance(self.chunks, int):
-            spans = cut(self.shape[0], size * -(-self.chunks // size) if self.there else size)
+            spans = [*cut(self.shape[0], size * -(-self.chunks // size) if self.there else size)]
         else:
-            spans = itertools.pairwise([0, *itertools.accumulate(self.chunks)])
-        items = ((*span, None if fetch else self.fetch(*span), value()) for span in spans)
+            spans = [*itertools.pairwise([0, *itertools.accumulate(self.chunks)])]
+        parts = ((*span, None if fetch else self.fetch(*span)) for span in spans)
+        many = 1 + len(spans) // _ITEMS if self.there else 1
+        items = (([*itertools.islice(parts, many)], value()) for _ in range(0, len(spans), many))
         return itertools.chain.from_iterable(stream(self.client, task, items))
 
     def diagonal(self) -> np.ndarray:

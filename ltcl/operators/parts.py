@@ -30,6 +30,7 @@ from ltcl.operators.dense import Dense
 from ltcl.operators.rows import ReadableRows, RowOperator
 
 _READ = 1 << 22  # bytes of rows in one reading: what caches hold, while a disk is busy for long
+_AHEAD = 2  # readings at the same time
 _TRIAL = 4096  # rows and columns of the product by which devices are compared: beyond the caches
 
 
@@ -239,7 +240,7 @@ def row_blocks(matrix: Any) -> Iterator[tuple[int, Any]]:
     if scipy.sparse.issparse(matrix):
         return iter([(0, matrix)])
     rows = max(1, _READ // (matrix.itemsize * matrix.shape[1]))
-    return read_ahead(_reader(matrix, rows), range(0, matrix.shape[0], rows))
+    return read_ahead(_reader(matrix, rows), range(0, matrix.shape[0], rows), _AHEAD)
 
 
 def intact(array: Any) -> Any:
@@ -258,16 +259,20 @@ def _reader(matrix: np.ndarray, rows: int) -> Callable[[int], tuple[int, np.ndar
     if path is None or root.mode == "c" or not matrix.flags.c_contiguous:
         return lambda first: (first, matrix[first : first + rows])
     offset = root.offset + matrix.ctypes.data - root.ctypes.data
+    try:  # in turn: to get new memory from the system takes as long as to read into it
+        buffers = np.empty((_AHEAD + 1, rows * width), matrix.dtype)
+    except MemoryError as error:
+        raise MemoryLimitError(f"{path}: {error}") from error
 
     def read(first: int) -> tuple[int, np.ndarray]:
-        count, start = min(rows, height - first) * width, first * width * matrix.itemsize
+        values = buffers[first // rows % len(buffers), : min(rows, height - first) * width]
         try:
-            values = np.fromfile(path, matrix.dtype, count, offset=offset + start)
+            with open(path, "rb") as file:
+                file.seek(offset + first * width * matrix.itemsize)
+                size = file.readinto(values.data)
         except OSError as error:
             raise FileError(f"{path}: cannot be read: {error.strerror}") from error
-        except MemoryError as error:
-            raise MemoryLimitError(f"{path}: {error}") from error
-        if values.size < count:
+        if size < values.nbytes:
             intact(matrix)
         return first, values.reshape(-1, width)
 

@@ -23,6 +23,7 @@ from ltcl import checks
 from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.first_bounce import DARK
+from ltcl.operators.parts import intact
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, exchange, record
 from ltcl.store.record import CSR, Matrix, Parts, Record, about
@@ -128,9 +129,8 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     if T.blocks is not None:
         raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
     if not any(isinstance(M, Matrix) for M in T.matrices):
-        write(path, Parts(to_arrays(T)))
-        return
-    matrices = [record.floats("T", M) if isinstance(M, np.ndarray) else M for M in T.matrices]
+        return write(path, Parts(to_arrays(T)))
+    matrices = [record.floats("T", intact(M)) if isinstance(M, np.ndarray) else M for M in T.matrices]
     F = T.first_bounce if T.is_square else None
     write(path, Record(tuple(matrices), T.grid, T.camera_grid, F, T.mixing, T.measured_noise))
 

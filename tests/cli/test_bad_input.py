@@ -62,7 +62,7 @@ OTHERS = [
     ("compensate --transports {nan}.x {picture} --out {out}", ["nan.npy.x, and there is no such file"]),
     ("compensate {store} {picture} --out {store}", ["--out is", "zarr, which is TRANSPORT itself"]),
     ("compensate {store} {film} --out {store}", ["--out is", "zarr, which is TRANSPORT itself"]),
-    ("separate {store} {picture} --out {store}", ["--out is", "zarr, which is TRANSPORT itself"]),
+    ("separate {store} {picture} --out {store}/new", ["--out is", "new, which is TRANSPORT itself or in it"]),
     ("acquire run {simulated} --take {empty}", ["--take", "virtual"]),
     ("show {empty} --every 2 --arrival", ["--every is 2", "--arrival"]),
     ("show {empty} --every 0", ["is 0"]),
