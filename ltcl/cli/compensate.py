@@ -7,7 +7,6 @@ import glob
 import inspect
 import json
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
@@ -27,7 +26,6 @@ from ltcl.transport import Transport
 
 _MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
 _RESULTS = ("gain", "clipped", "error", "transport_error", "gap")
-_SHEET = 12  # pictures on a contact sheet, at most
 _DIM = 4  # times as bright: what is that much darker is shown a second time on a contact sheet, amplified
 _REASONS = {
     "dark": "; where the pattern is at 1 a lower --gain helps, or --gain auto",
@@ -101,8 +99,6 @@ def compensate(
     gain for all; Ctrl-C keeps what is done, for --resume. With --cluster workers solve, and do --transports;
     docs/guide/cluster.md shows how.
     """
-    from ltcl.acquisition import Setup
-
     asked, paths = context.options, picture or []
     has_scenes = asked["transports"] is not None
     paths = [transport, *paths] if has_scenes else paths
@@ -111,9 +107,7 @@ def compensate(
     film = _film(paths, asked)
     if has_scenes:
         return _compensate_scenes(context, paths, out)
-    measured = calibration or (transport if options.is_measured(transport) else None)
-    setup = Setup.of(measured) if measured else None
-    T = options.load(context, transport)
+    setup, T = options.setup(transport, calibration), options.load(context, transport)
     if setup is not None and (setup.grid, setup.channels) != (T.grid, T.channels):
         sizes = f"{setup.grid} and {setup.channels} channel(s); TRANSPORT has {T.grid} and {T.channels}"
         raise InputError(f"{calibration}: is of {sizes}")
@@ -189,7 +183,7 @@ def _compensate_pictures(
             for what, reason in _REASONS.items():
                 if (share := facts[f"too_{what}"]) > _MANY:
                     note(f"{path}: {100 * share:.0f} % of it stays too {what}{reason}")
-        pictures.contact_sheet(sheet[:_SHEET]).save(folder / "compensate.png")
+        pictures.contact_sheet(sheet[:12]).save(folder / "compensate.png")
     columns = ("picture", "method", "products", "gain", "clipped", "error", "pattern")
     where = f"\npatterns, appearances and what is out of reach as .exr and .png in {out}"
     return [table(columns, rows), where, f"look at {out / 'compensate.png'}"]
@@ -236,12 +230,11 @@ def _compensate_frames(
         with _cluster(context) as client:
             result = compensate_frames(T, film, out, progress=context.progress, client=client, **arguments)
     except KeyboardInterrupt:
-        count = f"{context.progress.done:.0f} frame(s) are done and stay in {out}"
+        count = f"{context.progress.tasks[0].completed:.0f} frame(s) are done and stay in {out}"
         raise KeyboardInterrupt(f"interrupted; {count}; --resume goes on from there") from None
     worst, most, records = result.worst, result.most_clipped, result.records
-    names = ("video", "gain", "solved", "seconds", "frames_per_second", "transport_error", "worst")
-    text |= {"source": film, **{name: getattr(result, name) for name in names}}
-    text |= {"most_clipped": most, "frames": records}
+    names = "video gain solved seconds frames_per_second transport_error worst most_clipped"
+    text |= {"source": film, **{name: getattr(result, name) for name in names.split()}, "frames": records}
     if most.clipped > _MANY:
         count = sum(record.clipped > _MANY for record in records)
         frame = f"frame {most.number} ({most.name}) most; a lower --gain helps where patterns are at 1"
@@ -277,11 +270,18 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer
         raise InputError(f"--out is {out}, where transports are; it must be another place")
     asked = context.options | dict.fromkeys(("transports", "cluster", "workers"))
     asked |= {} if context.options["cluster"] is None else {"device": None}  # workers have their own
+    own = {name: asked.get(name) for name in [*inspect.signature(inspect.unwrap(compensate)).parameters][1:]}
+
+    def files_of(scene: Path) -> dict[str, bytes]:
+        with TemporaryDirectory() as folder, Progress(quiet=True) as progress:
+            place, call = Path(folder) / "scene", Context("compensate", asked, progress)
+            inspect.unwrap(compensate)(call, **own | {"transport": scene, "picture": paths, "out": place})
+            return {file.name: file.read_bytes() for file in place.iterdir()}
+
     reports, rows, failed = [], [], None
     with _cluster(context) as client:
         try:
-            task = partial(_compensate_scene, asked, paths)
-            results = of_each(task, scenes, client=client, progress=context.progress)
+            results = of_each(files_of, scenes, client=client, progress=context.progress)
         except BatchError as error:
             results, failed = error.results, error
     for scene, files in zip(scenes, results, strict=True):
@@ -296,16 +296,6 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer
         raise failed
     lines = [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"]
     return Answer({"folder": out, "scenes": reports}, lines)
-
-
-def _compensate_scene(asked: dict[str, Any], paths: list[Path], scene: Path) -> dict[str, bytes]:
-    """The files of one scene."""
-    with TemporaryDirectory() as folder, Progress(quiet=True) as progress:
-        call, place = inspect.unwrap(compensate), Path(folder) / "scene"
-        own = {name: asked.get(name) for name in [*inspect.signature(call).parameters][1:]}
-        own |= {"transport": scene, "picture": paths, "out": place}
-        call(Context("compensate", asked, progress), **own)
-        return {file.name: file.read_bytes() for file in place.iterdir()}
 
 
 @command(*options.TASK)
@@ -341,9 +331,8 @@ def separate(
             for part, picture_of in light.items():
                 panels.append(pictures.panel(picture_of, part, factor))
                 place = f"{name}/{part}" if len(photographs) > 1 else part
-                facts: dict[str, Any] = {"part": part}
-                facts |= pictures.write(folder, place, picture_of, panels[-1])
                 mean, solves = float(picture_of.mean(dtype=np.float64)), solved.get(part, [])
+                facts: Any = {"part": part, **pictures.write(folder, place, picture_of, panels[-1])}
                 facts |= {"lowest": float(picture_of.min()), "share": mean / whole if whole else None}
                 facts["channels"] = solves
                 if part in std:
@@ -385,11 +374,8 @@ def relight(
 
     Writes pictures exactly as .exr, and for the eye as .png at one exposure, which relight.json names.
     """
-    from ltcl.acquisition import Setup
-
     T = options.load(context, transport, dark_note=False)
-    setup = Setup.of(transport) if options.is_measured(transport) else None
-    patterns = pictures.read_all(context, pattern, T.grid, "the projector", setup)
+    patterns = pictures.read_all(context, pattern, T.grid, "the projector", options.setup(transport))
     light = {name: relighting.relight(T, each) for name, each in patterns.items()}
     factor, text = pictures.exposure(*light.values()), options.heading(context, transport, T)
     text["exposure"], text["pictures"], rows = factor, [], []
