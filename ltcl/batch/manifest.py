@@ -68,7 +68,7 @@ def read(folder: Path, head: dict[str, Any], resume: bool) -> dict[int, Record]:
         raise FileError(f"{path}: is no list of frames of ltcl, or damaged ({reason})") from None
     if not resume:
         count = f"{folder}: holds {len(records)} frame(s) of an earlier run"
-        raise InputError(f"{count}; give resume=True to go on with it, or another folder")
+        raise InputError(f"{count}; give resume=True (--resume) to go on with it, or another folder")
     for name in sorted({*head["settings"], *settings}):
         before, now = settings.get(name), head["settings"].get(name)
         if before != now:
