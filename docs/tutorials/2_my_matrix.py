@@ -142,10 +142,13 @@ ltcl.save(folder / "T.npz", better)
 #
 # .. code-block:: sh
 #
-#    ltcl info T.npy --grid 12x24                           # the verdict, dark pixels, noise
-#    ltcl convert T.mat T.npz --grid 12x24                  # from one format to another; .npz keeps the grid
+#    # the verdict, and what it comes from
+#    ltcl analyze T.npy --grid 12x24
+#    # from one format to another; .npz keeps the grid, and no further command needs it
+#    ltcl convert T.mat T.npz --grid 12x24
 #    ltcl compensate T.npz picture.png --resize --out out
-#    ltcl separate T.npz photograph.exr --out out
+#    # a photograph of the scene in linear light, or what 'compensate' has made
+#    ltcl separate T.npz out/picture_appearance.exr --out out
 #
 # Formats and their limits stand in :doc:`../reference/formats`; noise, dark pixels and deviations in
 # :doc:`../guide/noise`.

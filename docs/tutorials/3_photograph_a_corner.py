@@ -16,31 +16,68 @@ simulated corner in place of yours, and then makes every mistake, to show what l
 #
 # 1. Put the projector in front of the corner so that its picture fills both walls. Put the camera beside it,
 #    on a tripod. It must see all of the projected picture.
-# 2. Switch off what is automatic in the camera: exposure, ISO, white balance, focus, flash. Let it save raw
-#    files (or PNG, TIFF), never JPEG.
+# 2. Switch off what is automatic in the camera: exposure, ISO, white balance, focus, flash. A phone needs an
+#    app with a manual ("pro") mode. Let it save raw files (or PNG, TIFF), and not JPEG: ltcl reads JPEG, but
+#    most of the dim light that bounced is lost in it.
 # 3. Make the room dark, and leave it so: a small lamp that stays on does no harm, one that changes does.
-# 4. Write how many pixels you want into a file ``scan/acquisition.toml``. Begin with few; the time grows with
-#    their number.
+# 4. Install what shows patterns on a projector, ``python -m pip install ".[projector]"``, and for raw files
+#    ``".[camera]"``. Let the projector extend the desktop of your computer, not mirror it.
+# 5. Make a folder ``scan``, with a file ``acquisition.toml`` in it. It says how many pixels you want, and
+#    which exposures your camera has, in seconds: 0.0167 is 1/60 s. Without that line ltcl asks for any
+#    time, such as 0.0783 s. Begin with few pixels; the time grows with their number.
 #
 # .. code-block:: toml
 #
 #    [rig]
 #    kind = "folder"
-#    projector_grid = [4, 8]      # height, width
-#    projector = [1080, 1920]     # the pixels of your projector
+#    projector_grid = [4, 8]   # height, width
+#    projector = [1080, 1920]  # the pixels of your projector
+#    exposures = [
+#        0.001, 0.002, 0.004, 0.008, 0.0167, 0.0333,
+#        0.0667, 0.125, 0.25, 0.5, 1, 2, 4, 8, 15, 30,
+#    ]
+#
+# ``ltcl acquire plan scan`` says how many photographs that takes, and how long.
 #
 # How it goes
 # -----------
 #
 # .. code-block:: sh
 #
-#    ltcl acquire run scan            # says which photograph is next; writes patterns/ and shots.csv
-#    ltcl show scan                   # shows the patterns, one after the other, on the projector
-#    ltcl acquire run scan --take CARD  # copies your photographs from the folder CARD, in their order
+#    # writes patterns and their list, scan/shots.csv
+#    ltcl acquire run scan
+#    # shows them on the projector; a key is for the next
+#    ltcl show scan
+#    # copies your photographs from the folder CARD
+#    ltcl acquire run scan --take CARD
 #
-# You do this six to eight times: ltcl first needs to see white and black to know how long to expose, then
-# stripes to know where each pixel lands, then the patterns of the scan. ``ltcl acquire run scan`` can be
-# stopped at any time, and goes on where it was.
+# The last command also writes the next patterns. So you repeat the second and the third, six to eight times:
+# ltcl first needs to see white and black to know how long to expose, then stripes to know where each pixel
+# lands, then the patterns of the scan. ``ltcl acquire run scan`` can be stopped at any time, and goes on
+# where it was.
+#
+# * Each pattern on the list needs one photograph, with the exposure that stands there, in that order.
+# * ``--take`` copies new files in the order of the numbers in their names. Older ones may stay in CARD. There
+#   must be as many new ones as are missing: delete those that are too many. Of a camera that saves a raw and
+#   a JPEG file of each photograph, leave the raw ones only.
+# * A photograph that is refused: delete it in ``scan/photographs``, and in CARD. Then ``ltcl acquire run
+#   scan`` asks for it again, and ``ltcl show scan`` shows its pattern alone.
+#
+# At the end
+# ----------
+#
+# ``ltcl acquire run scan`` ends with a report, whose last line says what the measurement is good for. Do not
+# move projector and camera: the walls can now be given any picture.
+#
+# .. code-block:: sh
+#
+#    ltcl compensate scan/transport.zarr picture.png --resize --out shown
+#    ltcl show shown/picture_pattern.png
+#    ltcl separate scan/transport.zarr shown/picture_appearance.exr --out shown
+#
+# The pattern has one pixel for each of ``projector_grid``. ``ltcl show`` makes them as large as they were in
+# the scan, and puts them in the same place; another program would not. ``shown/separate.png`` has the
+# bounces of light.
 #
 # The same in Python, with a stand-in for you
 # -------------------------------------------
@@ -135,8 +172,8 @@ figure = pictures(
 #
 # For each line of the table the photographs were copied, and one mistake made in them. The message is what
 # ltcl really said when this page was built. ltcl compares each group of photographs with what it knows
-# already before it keeps them, so nothing is lost: mend or retake what is named, and run the same command
-# again.
+# already before it keeps them, so nothing is lost. Some mistakes can only be seen with the photographs of the
+# next round. Exchange or delete what is named, and run the same command again.
 #
 # The code is long, as there are many mistakes. The table is below it.
 

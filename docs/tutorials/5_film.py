@@ -86,9 +86,20 @@ for record in done.records[::4]:
 #
 # .. code-block:: sh
 #
-#    ltcl compensate T.npz film.mp4 --gain auto --resize --video patterns.mkv --out patterns
-#    ltcl compensate T.npz film.mp4 --gain auto --resize --video patterns.mkv --out patterns --resume
-#    ltcl play film.mp4 T.npz        # compensates while it runs, in a window for the projector
+#    ltcl compensate T.npz film.mp4 --gain auto --resize --out patterns
+#    # after it was stopped: the same, and --resume
+#    ltcl compensate T.npz film.mp4 --gain auto --resize --out patterns --resume
+#    # on the projector, 24 a second (extra projector)
+#    ltcl show patterns --every 0.0417
+#    # or compensated while it plays, in a window for the projector (extra view)
+#    ltcl play film.mp4 T.npz
+#
+# A pattern has as many pixels as the projector's grid in T. ``ltcl show`` and ``ltcl play`` make each pixel
+# a square, where the scan had it. ``--video patterns.mkv`` writes a film for other programs: do not let them
+# smooth it when they enlarge it. Sound is left out.
+#
+# ``gain="auto"`` sees eight frames only. Where others ask for more light than there is, ltcl names the worst
+# frame; begin again in another folder with a ``--gain`` a little lower.
 #
 # ``ltcl play`` drops frames that would be late, and tells how many frames a second it reached. For a large
 # T make it fast first: ``ltcl compress``, then ``ltcl invert`` (:doc:`6_large`). Films over several

@@ -75,7 +75,7 @@ class Project:
         """Read and check the file of a folder: FileError where it is none, InputError for its keys."""
         path = (folder := as_path(folder)) / FILE
         if not path.exists():
-            raise FileError(f"{path}: no such file; 'ltcl simulate' makes one, in a folder")
+            raise FileError(f"{path}: no such file; docs/guide/acquisition.md and 'ltcl simulate' show one")
         try:
             content = tomllib.loads(input_file(path).read_text(encoding="utf-8-sig"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -194,7 +194,7 @@ def compensate_frames(
         except LtclError as error:
             if run.records and not isinstance(error, OtherRun):
                 done = f"{len(run.records)} frame(s) are done and stay in {folder}"
-                error.args = (f"{error}; {done}, resume=True goes on from there",)
+                error.args = (f"{error}; {done}; resume=True (--resume) goes on from there",)
             raise
     records = tuple(run.records[number] for number in sorted(run.done))
     error = (options.get("exact") or T).error
@@ -345,7 +345,7 @@ class _Run:
             picture = frame.picture()
             if picture.shape[:2] != (h, w) and not self.resize:
                 size = f"{picture.shape[0]} x {picture.shape[1]} pixels, but the camera has {h} x {w}"
-                raise InputError(f"{place} is {size}; give resize=True to scale all frames")
+                raise InputError(f"{place} is {size}; give resize=True (--resize) to scale all frames")
         except InputError as error:
             if isinstance(error, OtherRun) or not (isinstance(error, FileError) or self.read):
                 raise  # also where all seem to be of another size

@@ -64,7 +64,7 @@ def read(folder: Path, head: dict[str, Any], resume: bool) -> dict[int, Record]:
         transport = {**content["transport"], "error": head["transport"]["error"]}  # that of the first bounce
     if not resume:
         count = f"{folder}: holds {len(records)} frame(s) of an earlier run"
-        raise InputError(f"{count}; give resume=True to go on with it, or another folder")
+        raise InputError(f"{count}; give resume=True (--resume) to go on with it, or another folder")
     for name in sorted({*head["settings"], *settings}):
         before, now = settings.get(name), head["settings"].get(name)
         if before != now:

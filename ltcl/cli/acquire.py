@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
+import shlex
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -212,13 +213,10 @@ def run(
                 with project.naming("acquire"):
                     acquire(rig, progress=context.progress, **settings)
             except PhotographMissing as error:  # the normal way of a folder scan
-                missing, shot = rig.missing(), error.shot._asdict()
+                missing, shot, name = rig.missing(), error.shot._asdict(), shlex.quote(str(folder))
                 data = {"folder": folder, "next": shot, "missing": missing, "exit_code": WAITING}
-                lines = [
-                    f"next: {error}",
-                    f"{len(missing)} photograph(s) are missing; {folder}/shots.csv lists them",
-                    f"'ltcl show {folder}' shows their patterns; then: ltcl acquire run {folder}",
-                ]
+                then = f"'ltcl show {name}' shows their patterns; then: ltcl acquire run {name} --take CARD"
+                lines = [f"next: {error}", f"{folder / 'shots.csv'} lists all {len(missing)}", then]
                 return Answer(data, lines, WAITING)
     except (AcquisitionError, KeyboardInterrupt) as error:
         error.args = (f"{str(error) or 'interrupted'}; {_advice(project, error)}",)
@@ -230,16 +228,16 @@ def _advice(project: Any, error: BaseException) -> str:
     """What is kept of an acquisition that ends early, and how it goes on."""
     from ltcl.acquisition.session import calibration_photographs
 
-    again = f"'ltcl acquire run {project.folder}' goes on"
+    again = f"'ltcl acquire run {shlex.quote(str(project.folder))}' goes on"
     if isinstance(error, ScanRefused):
         return f"remove {project.store} to begin again"
+    if project.kind == "folder" and not isinstance(error, KeyboardInterrupt):
+        return f"remove wrong ones from {project.folder / 'photographs'}; {again}, and asks for them again"
     if project.state == "begun":
         return f"what was photographed before is kept in {project.store}; {again}"
-    if project.kind != "folder":
-        return f"{calibration_photographs(project.store)} photographs of the calibration are kept; {again}"
-    if isinstance(error, KeyboardInterrupt):
+    if project.kind == "folder":
         return again
-    return f"take wrong photographs in {project.folder}/photographs again; then {again}"
+    return f"{calibration_photographs(project.store)} photographs of the calibration are kept; {again}"
 
 
 def report(context: Context, folder: options.Acquisition, device: options.Device = None) -> Answer:
@@ -251,6 +249,8 @@ def report(context: Context, folder: options.Acquisition, device: options.Device
     from ltcl.acquisition import Project, Report, Setup
 
     project, opened = Project.open(folder), open_device(device)
+    if not project.store.exists():
+        raise FileError(f"{project.store}: no such folder yet; 'ltcl acquire run' makes it")
     context.progress("entries and noise")
     facts = Report.of(project.store)
     data = {"folder": folder, "store": project.store, **json.loads(facts.to_json())}

@@ -123,7 +123,7 @@ def compensate(
     notes = [options.caveat("errors are", T, asked["exact"])]
     notes += ["masked pixels do not count in errors"] * bool(weights is None and T.masked.any())
     if setup is not None:
-        notes.append("pattern .png holds the codes of the measured projector: show it pixel for pixel")
+        notes.append("pattern .png holds the codes of the measured projector; 'ltcl show' shows it there")
     if setup is not None and background is None:
         settings["background"], text["options"]["background"] = setup.ambient, "measured"
         notes.append("the background is the ambient light that was measured")

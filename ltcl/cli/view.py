@@ -104,7 +104,7 @@ def play(
 @command()
 def show(
     context: Context,
-    folder: Annotated[Path, argument("FOLDER", "Pictures, or an acquisition with its patterns.")],
+    folder: Annotated[Path, argument("FOLDER", "Pictures, one or a folder; or an acquisition.")],
     display: Annotated[int, option("Number of the display, from 0.", metavar="N", min=0)] = 1,
     every: Annotated[float | None, option("Next picture after so many seconds.", metavar="SECONDS")] = None,
     arrival: Annotated[bool, option(_ARRIVAL, "--arrival")] = False,

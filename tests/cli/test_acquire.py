@@ -130,7 +130,7 @@ BY_HAND += 'geometry = "aligned"\nstrategy = "pixel"\nresponse = "linear"\nexpos
 def photograph(truth: Path, folder: Path, missing: list[int], card: Path | None) -> None:
     """What is missing of the shooting list, as a person would: into the folder, or onto the camera's card."""
     T = ltcl.load(truth / "truth.npz")
-    scene = VirtualRig(T, T.grid, bits=12, response="linear", black=0.0, ambient=0.01)
+    scene = VirtualRig(T, T.grid, bits=12, response="linear", black=0.0, ambient=0.01, seed=missing[0])
     rows = [row.split(",") for row in (folder / "shots.csv").read_text().splitlines()]
     for number in missing:
         _, pattern, seconds, name = rows[number]
@@ -141,23 +141,26 @@ def photograph(truth: Path, folder: Path, missing: list[int], card: Path | None)
 
 def test_a_person_is_told_the_next_photograph_and_it_is_no_error(program, tmp_path, simulated):
     """Which pattern, for how long, under which name; on stdout, with an exit code of its own."""
-    (tmp_path / "acquisition.toml").write_text(BY_HAND)
+    (folder := tmp_path / "my scan").mkdir()
     (card := tmp_path / "card").mkdir()
+    (folder / "acquisition.toml").write_text(BY_HAND)
+    program("acquire", "report", folder).refused(f"{folder / 'transport.zarr'}: ", "ltcl acquire run")
     for step in range(15):
-        outcome, report = program("acquire", "run", tmp_path), program("acquire", "run", tmp_path, "--json")
+        outcome, report = program("acquire", "run", folder), program("acquire", "run", folder, "--json")
         if outcome.code == 0:
             break
         assert (outcome.code, outcome.err, report.code, report.document["exit_code"]) == (3, "", 3, 3)
         shot, missing = report.document["next"], report.document["missing"]
-        for part in (shot["pattern"], f"{shot['seconds']:.6g} s", shot["save_as"], "ltcl acquire run"):
+        next_run = f"ltcl acquire run '{folder}'"  # a shell takes it as it is
+        for part in (shot["pattern"], f"{shot['seconds']:.6g} s", shot["save_as"], next_run):
             assert part in outcome.out
-        assert ((tmp_path / shot["pattern"]).is_file(), shot["number"] in missing) == (True, True)
-        photograph(simulated, tmp_path, missing, card if step == 2 else None)
-        if step == 2:  # the camera's own files
-            program("acquire", "run", tmp_path, "--take", card / "none").refused(f"{card / 'none'}: ")
-            assert program("acquire", "run", tmp_path, "--take", card).code in (0, 3)
-            assert not {*missing} & {*FolderRig(tmp_path, GRID, pattern_bits=16).missing()}
-    assert error_of(tmp_path, simulated) < 0.02
+        assert ((folder / shot["pattern"]).is_file(), shot["number"] in missing) == (True, True)
+        photograph(simulated, folder, missing, card if step >= 2 else None)
+        if step >= 2:  # the camera's own files, which stay on its card
+            program("acquire", "run", folder, "--take", card / "none").refused(f"{card / 'none'}: ")
+            assert program("acquire", "run", folder, "--take", card).code in (0, 3)
+            assert not {*missing} & {*FolderRig(folder, GRID, pattern_bits=16).missing()}
+    assert error_of(folder, simulated) < 0.02
 
 
 def test_how_the_next_pattern_comes(program, monkeypatch, tmp_path):

@@ -88,7 +88,8 @@ class Display(Closing):
         self.index = min(1, len(sizes) - 1) if index is None else checks.count("index", index, least=0)
         if self.index not in range(len(sizes)):
             offered = ", ".join(f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes)) or "none"
-            raise InputError(f"index is {index}; it must be one of the displays there are ({offered})")
+            text = f"index is {index}, of {offered}; a projector must extend the desktop, not mirror it"
+            raise InputError(text)
         w, h = sizes[self.index]
         self.size = h, w
         enlarge(np.zeros(self.grid), self.size)  # refuses what does not fit
@@ -107,7 +108,7 @@ def show(
     advance: str | float = "key",
     progress: Callable[[Shot, int, int], None] | None = None,
 ) -> int:
-    """Show the patterns of a folder full screen, one after the other; returns how many.
+    """Show the patterns of a folder, or one picture, full screen, one after the other; returns how many.
 
     Of a `FolderRig` in the order of the shooting list, without photographs that are there already; else the
     pictures of the folder by the numbers in their names. `display` counts from 0, or is an open one or the
@@ -126,10 +127,14 @@ def show(
     if isinstance(advance, str) and advance not in ("key", "arrival"):
         raise InputError(f"advance is {advance!r}; it must be 'key', 'arrival' or seconds")
     patience = float("inf") if isinstance(advance, str) else checks.number("advance", advance, above=0.0)
+    is_picture = folder.is_file() and advance != "arrival"
+    folder, name = (folder.parent, folder.name) if is_picture else (folder, "")
     rig = FolderRig(folder, (1, 1))  # any grid has the same list
-    if rig.shots:
+    if is_picture:
+        shots = [Shot(1, name, 0.0, "")]
+    elif rig.shots:
         shots = [rig.shots[number - 1] for number in rig.missing()]
-    elif advance == "arrival" or not folder.is_dir():
+    elif advance == "arrival" or not folder.is_dir() or (folder / "acquisition.toml").exists():
         raise FileError(f"{folder}: has no shooting list, which 'ltcl acquire run' writes")
     else:
         shots = [Shot(frame.number, frame.name, 0.0, "") for frame in open_frames(folder)]

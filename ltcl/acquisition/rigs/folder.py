@@ -13,6 +13,7 @@ that is started again finds its photographs. Their codes are not changed.
 from __future__ import annotations
 
 import csv
+import filecmp
 import json
 import os
 import re
@@ -33,7 +34,7 @@ from ltcl.files import as_path, input_file, replace_file
 
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 _SUFFIXES = (*images.BITS, *RAW)
-_KINDS = "PNG, TIFF, JPEG, BMP, EXR or camera RAW"
+_KINDS = "camera RAW, TIFF, PNG, EXR, BMP or JPEG"
 _FORMAT = "ltcl shooting list 1"
 _PHOTO = re.compile(r"photo_(\d{1,9})", re.IGNORECASE | re.ASCII)
 _FULL, _DEFECTS = 1.001, 0.01  # full scale of floats with what rounding adds; share of pixels above it
@@ -135,7 +136,8 @@ class FolderRig:
             missing, files = self.missing(), self._files.get(shot.number, [])
             if not files:
                 first, place = self.shots[missing[0] - 1], f"{self.folder}, as {_KINDS}"
-                text = f"project {first.pattern}, expose for {first.seconds:.6g} s, save as {first.save_as}"
+                time = f"{first.seconds:.6g} s" + f" (1/{1 / first.seconds:.3g})" * (first.seconds < 0.3)
+                text = f"project {first.pattern}, expose for {time}, save as {first.save_as}"
                 text = f"photograph {first.number} is missing ({len(missing)} in all): {text} in {place}"
                 raise PhotographMissing(text, first.number, first, len(missing))
             if len(files) > 1:
@@ -163,16 +165,20 @@ class FolderRig:
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in the order of the numbers in their names.
 
-        Nothing is copied where as many are not missing (InputError), or one is no photograph (FileError).
+        Files that were copied before, equal in every byte, are left out: a card need not be emptied. Nothing
+        is copied where as many are not missing (InputError), or one is no photograph (FileError).
         """
-        numbers = self.missing()
-        paths = sorted(map(as_path, files), key=lambda p: re.sub("[0-9]+", lambda n: n[0].zfill(20), p.name))
-        if len(paths) != len(numbers):
-            which = f": {numbers[0]} to {numbers[-1]}" if numbers else ""
-            raise InputError(f"files holds {len(paths)} photographs; {len(numbers)} are missing{which}")
-        for path in map(input_file, paths):
+        numbers, paths = self.missing(), [*map(input_file, files)]
+        for path in paths:
             if path.suffix.lower() not in _SUFFIXES:
                 raise FileError(f"{path}: is no photograph; it must be {_KINDS}")
+        copied = [path for files in self._files.values() for path in files]
+        paths = [path for path in paths if not any(filecmp.cmp(path, old, shallow=False) for old in copied)]
+        paths.sort(key=lambda path: re.sub("[0-9]+", lambda digits: digits[0].zfill(20), path.name))
+        if len(paths) != len(numbers):
+            which = f", {numbers[0]} to {numbers[-1]}" if numbers else ""
+            text = f"files holds {len(paths)} new photographs, but {len(numbers)} are missing{which}"
+            raise InputError(f"{text}; give just these, or save them by the names on the list")
         for number, path in zip(numbers, paths, strict=True):
             target = self.folder / (self.shots[number - 1].save_as + path.suffix.lower())
             with replace_file(target) as temporary:
@@ -210,9 +216,8 @@ class FolderRig:
         table, path = self.folder / "shots.csv", self.folder / "shots.json"
         if self._saved < len(self._shots) or not (path.exists() and table.exists()):
             with replace_file(table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-                rows = csv.writer(file)
-                rows.writerow(["number", "project", "seconds", "save as"])
-                rows.writerows([s.number, s.pattern, f"{s.seconds:.6g}", s.save_as] for s in self.shots)
+                rows = [(s.number, s.pattern, f"{s.seconds:.6g}", s.save_as) for s in self.shots]
+                csv.writer(file).writerows([("number", "project", "seconds", "save as"), *rows])
             shots = [{"codes": digest, "seconds": seconds} for (digest, seconds), _ in self._shots]
             with replace_file(path) as temporary:
                 temporary.write_text(json.dumps({"format": _FORMAT, "shots": shots}, indent=0))

@@ -152,7 +152,7 @@ def test_a_damaged_list_is_refused(tmp_path: Path, content: str) -> None:
 
 
 def test_the_cameras_own_files_are_taken(tmp_path: Path) -> None:
-    """In the order of their numbers, in place of those that are missing, and all or none."""
+    """In the order of their numbers, in place of those that are missing, all or none, and each once."""
     rig = prepared(tmp_path)
     paths = [tmp_path / name for name in ("IMG_101.png", "IMG_100.png", "IMG_10.png", "IMG_9.png")]
     for k, path in enumerate(paths):
@@ -165,6 +165,12 @@ def test_the_cameras_own_files_are_taken(tmp_path: Path) -> None:
     rig.take(paths)
     np.testing.assert_array_equal([rig.photograph(*s)[0, 0] for s in SHOTS], [1, 0, 2, 3, 4])
     assert all(path.exists() for path in paths)  # copied, not moved
+    rig.prepare([(HALF, 1.0)])
+    with pytest.raises(InputError, match=r"0 new .* 1 .* 6 to 6"):
+        rig.take(paths)
+    camera_files.write(new := tmp_path / "IMG_11.png", GREY + 5)
+    rig.take([new, *paths])
+    assert rig.photograph(HALF, 1.0)[0, 0] == 5
 
 
 NAMES = ["projector_grid", "channels", "camera_bits", "pattern_bits", "projector", "exposures"]
