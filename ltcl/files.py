@@ -124,8 +124,10 @@ def restore(target: Path) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
-    """One process at a time in a folder; without `wait` the second is refused."""
-    handle = os.open(folder, os.O_RDONLY) if fcntl else -1
+    """One process at a time in a folder, made if need be; without `wait` the second is refused."""
+    created = [place for place in (folder, *folder.parents) if not place.exists()]
+    with _written(folder / "*"):
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY) if fcntl else -1
     try:
         if fcntl:
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
@@ -135,6 +137,9 @@ def locked(folder: Path, *, wait: bool = True) -> Iterator[None]:
     finally:
         if fcntl:
             os.close(handle)
+        for place in created:
+            with contextlib.suppress(OSError):  # something is in it
+                place.rmdir()
 
 
 def sweep(folder: Path) -> None:
@@ -174,14 +179,13 @@ def _move_into(target: Path, temporary: Path, files: list[Path]) -> None:
 @contextlib.contextmanager
 def _written(path: str | os.PathLike[str]) -> Iterator[Path]:
     """The place that `path` means, its parents made; an OSError of the block becomes one line about it."""
-    target, created = Path(os.path.realpath(as_path(path))), []
+    target = Path(os.path.realpath(as_path(path)))
+    created = [folder for folder in target.parents if not os.path.exists(folder)]
     try:
-        for folder in reversed([p for p in target.parents if not os.path.exists(p)]):
-            folder.mkdir(exist_ok=True)
-            created.append(folder)
+        target.parent.mkdir(parents=True, exist_ok=True)
         yield target
     except BaseException as error:
-        for folder in reversed(created):
+        for folder in created:
             with contextlib.suppress(OSError):  # no longer empty: somebody else's by now
                 folder.rmdir()
         if not isinstance(error, OSError) or isinstance(error, LtclError):

@@ -66,9 +66,8 @@ def unpack(name: str, picture: Any, grid: tuple[int, int], channels: int) -> tup
             layout = Layout(flat, frames, colour or channels == 3)
             break
     else:
-        raise InputError(
-            f"{name} has shape {array.shape}; it must be {grid}, {(*grid, 3)} or frames of these"
-        )
+        allowed = f"{grid}, {(*grid, 3)} or frames of these"
+        raise InputError(f"{name} has shape {array.shape}; it must be {allowed}")
     values = array.reshape(layout.frames or 1, n, -1)  # (frames, N, 1 or 3)
     if channels == 1:
         return [np.array(values.transpose(1, 0, 2), order="C").reshape(n, -1)], layout

@@ -215,10 +215,8 @@ class Transport:
         elif isinstance(noise, Transport):
             for name in ("grid", "camera_grid", "channels"):
                 if getattr(noise, name) != getattr(self, name):
-                    text = f"noise is a T of {name} {getattr(noise, name)}"
-                    raise InputError(
-                        f"{text}; a second measurement has {name} {getattr(self, name)}, as matrix"
-                    )
+                    both = f"{getattr(noise, name)}; a second measurement has {name} {getattr(self, name)}"
+                    raise InputError(f"noise is a T of {name} {both}, as matrix")
         elif noise is not None:
             kind = type(noise).__name__
             raise InputTypeError(f"noise is a {kind}; it must be a Noise, or a Transport measured once more")

@@ -9,7 +9,6 @@ is missing from a batch is solved alone, to the same tolerance: the rest after `
 
 from __future__ import annotations
 
-import copy
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,11 +23,11 @@ import numpy as np
 
 from ltcl import checks, images, layout
 from ltcl.batch import manifest
-from ltcl.batch.manifest import OtherRun, Record, curve, identity, locked, setting
+from ltcl.batch.manifest import OtherRun, Record, curve, identity, setting
 from ltcl.cluster import is_there, stream
 from ltcl.compensation import compensate, problem
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
-from ltcl.files import as_path, read_ahead
+from ltcl.files import as_path, locked, read_ahead
 from ltcl.images.frames import Frame, Source, check_video, open_frames, write_video
 from ltcl.images.pictures import Encoding
 from ltcl.report import versions
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _Read = tuple[Frame, str, np.ndarray]  # a frame, its digest and its picture
-_USUAL_FPS = 25.0
 _NAMED = 5  # broken frames, in an error
 _WRITERS = 4  # threads: files are compressed and flushed side by side
 
@@ -177,23 +175,22 @@ def compensate_frames(
             raise InputError(f"{name} is {target}, where the frames are; it must be another place")
     settings = {**(compensate.__kwdefaults__ or {}), "gain": gain, "loss": loss}
     settings |= {"batch": checks.count("batch", batch), "format": format, "appearance": appearance}
-    settings |= {"encoding": encoding, "resize": resize, **options}
+    settings |= {"encoding": encoding, "resize": resize, "codes": codes and curve(codes, T.grid), **options}
     described = {name: setting(value) for name, value in settings.items() if name != "callback"}
-    described["codes"] = codes and curve(codes, T.grid)
     head = {"versions": versions(), "settings": described, "transport": identity(T), "gain": None}
     reload: Any = T.reload
     seen = client is not None and is_there(client, reload and reload.args[0])
     solver = _Solver(T, options, appearance, head["transport"], reload if seen else None)
     each = partial(stream, client, share_gpu=share_gpu)
     run = _Run(solver, each, opened, limit, folder, head, bounds[1] if bounds[1] > 0 else 1.0, codes)
-    with locked(folder):
+    with locked(folder, wait=False):
         run.records |= manifest.read(folder, head, resume)
         try:
             for done in run.solve(gain, loss):
                 if progress is not None:
                     progress("frames", done, run.count)
             if video is not None:
-                write_video(video, run.patterns(), fps or opened.fps or _USUAL_FPS)
+                write_video(video, run.patterns(), fps or opened.fps or 25.0)
         except LtclError as error:
             if run.records and not isinstance(error, OtherRun):
                 done = f"{len(run.records)} frame(s) are done and stay in {folder}"
@@ -251,8 +248,8 @@ class _Solver:
         return light, solved.frame_errors.tolist(), solved.frame_clipped.tolist()
 
     def __getstate__(self) -> dict[str, Any]:
-        options = {name: _portable(value) for name, value in self.options.items() if name != "callback"}
-        return dict(vars(self), T=None if self.reload else _portable(self.T), options=options)
+        options = {name: value for name, value in self.options.items() if name != "callback"}
+        return dict(vars(self), T=None if self.reload else self.T, options=options)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -260,6 +257,11 @@ class _Solver:
             self.T = self.reload()
             if identity(self.T) != self.identity:
                 raise InputError("the file of T holds another T there; give all workers the same")
+        for value in (self.T, *self.options.values()):  # each worker has a device of its own
+            if isinstance(value, Transport):
+                value._requested_device = None
+            elif isinstance(value, Inverse):
+                vars(value)["_index"] = None
 
 
 @dataclass(eq=False)
@@ -378,17 +380,7 @@ class _Run:
                 images.write(file, values / np.float32(white), bits=16)
 
 
-def _portable(value: Any) -> Any:
-    """What lies on a device, without it: each worker has its own."""
-    if isinstance(value, (Transport, Inverse)):
-        value = copy.copy(value)
-        vars(value)["_requested_device" if isinstance(value, Transport) else "_index"] = None
-    return value
-
-
 def _stack(batch: Sequence[_Read]) -> np.ndarray:
     """Its pictures: (frames, h, w), or (frames, h, w, 3) where one of them is in colour."""
-    pictures = [picture for *_, picture in batch]
-    if any(picture.ndim == 3 for picture in pictures):
-        pictures = [np.stack([p] * 3, axis=-1) if p.ndim == 2 else p for p in pictures]
-    return np.stack(pictures)
+    pictures = np.stack(np.broadcast_arrays(*(np.atleast_3d(picture) for *_, picture in batch)))
+    return pictures if pictures.shape[-1] == 3 else pictures[..., 0]

@@ -6,19 +6,19 @@ Replaced whole after every batch, when its patterns are on the disk: what ends a
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ltcl import files, report
+from ltcl import report
 from ltcl.acquisition.rig import fingerprint
-from ltcl.errors import FileError, InputError
+from ltcl.errors import InputError
 from ltcl.files import input_file, replace_file
+from ltcl.store.record import about
 from ltcl.transport import Transport
 
 NAME = "frames.json"
@@ -55,17 +55,13 @@ def read(folder: Path, head: dict[str, Any], resume: bool) -> dict[int, Record]:
     path, advice = folder / NAME, "give the same to go on with it, or another folder"
     if not path.exists():
         return {}
-    file = input_file(path)
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+    with about(path, reading=True):
+        content = json.loads(input_file(path).read_text(encoding="utf-8"))
         if content["format"] != _FORMAT:
             raise ValueError(f"format {content['format']!r}")
         records = {int(entry["number"]): Record(**entry) for entry in content["frames"]}
         head["gain"], settings = float(content["gain"]), dict(content["settings"])
         transport = {**content["transport"], "error": head["transport"]["error"]}  # that of the first bounce
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise FileError(f"{path}: is no list of frames of ltcl, or damaged ({reason})") from None
     if not resume:
         count = f"{folder}: holds {len(records)} frame(s) of an earlier run"
         raise InputError(f"{count}; give resume=True to go on with it, or another folder")
@@ -76,24 +72,6 @@ def read(folder: Path, head: dict[str, Any], resume: bool) -> dict[int, Record]:
     if transport != head["transport"]:
         raise OtherRun(f"{path}: that run was with another T; {advice}")
     return records
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Make the folder, and refuse other runs in it until the block ends; an empty one is removed again."""
-    created = [place for place in (folder, *folder.parents) if not place.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = "is a file; a folder cannot be written there" if folder.is_file() else error.strerror
-        raise FileError(f"{folder}: {reason}") from error
-    try:
-        with files.locked(folder, wait=False):
-            yield
-    finally:
-        for place in created:
-            with contextlib.suppress(OSError):  # something is in it
-                place.rmdir()
 
 
 def identity(T: Transport) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from ltcl import report
 from ltcl.cli.command import Context
 from ltcl.errors import InputError
-from ltcl.files import fill_folder
+from ltcl.files import fill_folder, locked
 
 _WIDTH = 512  # pixels of a picture for the eye, at least
 _MARGIN, _TEXT = 8, 18  # of contact sheets and labels, in pixels
@@ -30,9 +30,7 @@ _VISIBLE = 0.5 / 255  # of white: the smallest difference that is marked
 @contextmanager
 def fill(out: Path, text: dict[str, Any]) -> Iterator[Path]:
     """`fill_folder`, with a report `text`, named after its command, of all files; one run at a time."""
-    from ltcl.batch.manifest import locked
-
-    with locked(out), fill_folder(out) as folder:
+    with locked(out, wait=False), fill_folder(out) as folder:
         yield folder
         name, files = f"{text['command']}.json", [file for file in folder.rglob("*") if file.is_file()]
         text["files"] = [*sorted(file.relative_to(folder).as_posix() for file in files), name]
