@@ -29,12 +29,13 @@ import numpy as np
 
 from ltcl import checks
 from ltcl.acquisition import rigs
-from ltcl.acquisition.calibrate import expected_exposures
+from ltcl.acquisition.calibrate import expected_exposures, photographs
+from ltcl.acquisition.calibration import Calibration
 from ltcl.acquisition.radiometry import NoiseModel, Response
 from ltcl.acquisition.rig import Shots
 from ltcl.acquisition.rigs.mitsuba import SCENES
 from ltcl.acquisition.rigs.virtual import CURVES, Sensor
-from ltcl.acquisition.scanning.plan import Light
+from ltcl.acquisition.scanning.plan import Light, measured
 from ltcl.acquisition.task import Settings, acquire
 from ltcl.errors import FileError, InputError, InputTypeError, LtclError
 from ltcl.files import as_path, input_file
@@ -140,7 +141,7 @@ class Project:
             raise type(error)(f"{self.folder / FILE}: [{table}] {error}") from None
 
     def outlook(self) -> tuple[Settings, dict[str, Any]]:
-        """Settings as `acquire` checks them, and guesses for `scanning.plan.plans`; no camera is opened."""
+        """Settings as `acquire` checks them, and facts for `scanning.plan.plans`, measured or guessed."""
         arguments = {name: p.default for name, p in inspect.signature(acquire).parameters.items()}
         own = {name: value for name, value in arguments.items() if name not in _OBJECTS}
         with self.rig(closed=True) as rig:
@@ -154,7 +155,12 @@ class Project:
             times = expected_exposures(shots, light.direct + light.indirect, light.ambient)
             facts: dict[str, Any] = {"exposures": tuple(sorted(settings.exposures or times))}
             facts |= {"grid": shots.grid, "channels": shots.channels, "noise": noise, "light": light}
-            return settings, facts
+        if self.state != "new":
+            known = Calibration.of(self.store)
+            facts |= {"exposures": known.exposures, "noise": known.noise, "light": measured(known)}
+        ways = {"aligned": settings.geometry == "aligned", "by_hand": self.kind == "folder"}
+        facts["calibration"] = photographs(facts["grid"], facts["channels"], settings.frames, **ways)
+        return settings, facts | {name: getattr(settings, name) for name in ("block", "order", "threshold")}
 
 
 def _check(path: Path, name: str, table: Any, make: Any) -> dict[str, Any]:

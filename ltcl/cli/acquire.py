@@ -84,7 +84,8 @@ def simulate(
             name: "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in keys.items())
             for name, keys in (("rig", rig), ("acquire", settings))
         }
-        (folder / "acquisition.toml").write_text(_TOML.format(**tables), "utf-8")
+        template = Path(__file__).with_name("acquisition.toml.in").read_text("utf-8")
+        (folder / "acquisition.toml").write_text(template.format(**tables), "utf-8")
         with Project.open(folder).rig() as opened:  # refuses what cannot be photographed
             text |= {"projector_grid": opened.projector_grid, "channels": opened.channels}
     size = "{} x {} projector pixels".format(*text["projector_grid"])
@@ -116,52 +117,22 @@ def _rig(folder: Path, scene: str, asked: dict[str, Any]) -> dict[str, Any]:
         walls, sides = np.array([albedo]) if albedo[1:] else albedo[0], {"sides": 5} if scene == "box" else {}
         built = getattr(scenes, scene)(asked["size"] or 16, albedo=walls, **sides)
         record: Any = Record(built.matrices(), grid=built.grid)
-    else:
-        record = _file(scene, asked["grid"])
+    elif not Path(scene).suffix and not Path(scene).exists():
+        known = f"{', '.join(_SCENES)}, mitsuba:NAME or a transport file"
+        raise InputError(f"SCENE is {scene!r}; it must be {known}")
+    elif (record := formats.read(Path(scene))).grid is None and asked["grid"] is None:
+        raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
+    elif isinstance(record, Record) and asked["grid"] is not None:
+        record = dataclasses.replace(record, grid=checks.grid("--grid", asked["grid"], record.shape[1]))
     formats.write(folder / "truth.npz", record)
     rig |= {"kind": "virtual", "transport": "truth.npz"}
     rig |= {"ambient": 0.01 if asked["ambient"] is None else asked["ambient"]}
     if asked["camera_grid"]:  # a camera in the projector's place
         rig |= {"camera_map": "camera.npz"}
-        (H, W), (h, w) = asked["camera_grid"], record.camera_grid or record.grid
+        (H, W), (h, w) = asked["camera_grid"], checks.grid("grid", record.camera_grid or record.grid)
         seen = camera_map(lambda u, v: ((u + 0.5) * w / W - 0.5, (v + 0.5) * h / H - 0.5), (H, W), (h, w))
         formats.write(folder / "camera.npz", Record((seen,), grid=(h, w), camera_grid=(H, W)))
     return rig
-
-
-def _file(scene: str, grid: tuple[int, int] | None) -> Any:
-    """A record with a grid, or the arrays of a compressed transport."""
-    if not Path(scene).suffix and not Path(scene).exists():
-        known = f"{', '.join(_SCENES)}, mitsuba:NAME or a transport file"
-        raise InputError(f"SCENE is {scene!r}; it must be {known}")
-    record = formats.read(Path(scene))
-    if record.grid is None and grid is None:
-        raise InputError(f"{scene}: does not contain its grid; give --grid HxW")
-    if isinstance(record, Record) and grid is not None:
-        return dataclasses.replace(record, grid=checks.grid("--grid", grid, record.shape[1]))
-    return record
-
-
-_TOML = """\
-# What 'ltcl acquire' photographs in this folder, and how. The keys of [rig] are the arguments of
-# ltcl.acquisition.VirtualRig, MitsubaRig, FolderRig or LiveRig, those of [acquire] the arguments of
-# ltcl.acquire; "none" stands for None. Once photographs are taken, [acquire] must stay as it is.
-
-[rig]
-{rig}# gain = 10000.0           # electrons at full scale; "none": no photon noise
-# exposures = [0.1, 0.2]   # seconds that the camera offers; left out: any
-
-[acquire]
-{acquire}# geometry: "graycode" measures which projector pixel a camera pixel sees, "aligned": the same one
-# strategy: "auto", "adaptive", "pixel", "block" or "hadamard"; 'ltcl acquire plan' compares them
-# exposures = [0.5, 8.0]   # seconds of the photographs of each pattern; left out: chosen
-# response = "linear"      # of the camera where it is known; left out: measured
-
-# Other rigs: kind = "folder" with projector_grid = [48, 64] (height, width), worked by hand, with patterns
-# and photographs in this folder; or kind = "live", a camera on a cable before a display of this computer
-# (extras camera and projector), with [rig.camera] kind = "opencv" or "gphoto2", source = 0 and [rig.display]
-# grid = [48, 64], index = 1.
-"""
 
 
 _TAKE = "Folder with the camera's own files: copied, in the order of their numbers, to what is missing."
@@ -178,22 +149,14 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
     Noise and light are as measured once DIR/transport.zarr has its calibration, before that they are guessed.
     No camera is opened.
     """
-    from ltcl.acquisition import Calibration, Project
-    from ltcl.acquisition.calibrate import photographs
-    from ltcl.acquisition.scanning.plan import choose, measured, plans
+    from ltcl.acquisition import Project
+    from ltcl.acquisition.scanning.plan import choose, plans
 
     project = Project.open(folder)
     settings, facts = project.outlook()
-    if is_measured := project.state != "new":
-        known = Calibration.of(project.store)
-        facts = {"grid": known.resampling.grid, "channels": len(known.offset), "light": measured(known)}
-        facts |= {"exposures": known.exposures, "noise": known.noise}
-    kind: dict[str, Any] = {"aligned": settings.geometry == "aligned", "by_hand": project.kind == "folder"}
-    count = photographs(facts["grid"], channels=facts["channels"], frames=settings.frames, **kind)
-    asked: dict[str, Any] = {name: getattr(settings, name) for name in ("block", "order", "threshold")}
     with project.naming("acquire"):
-        strategies = plans(**facts, **asked, overhead=overhead, calibration=count)
-    best, why = choose(strategies)
+        strategies = plans(**facts, overhead=overhead)
+    (best, why), is_measured, count = choose(strategies), project.state != "new", facts["calibration"]
     data = {"folder": folder, "rig": project.kind, "measured": is_measured}
     data |= {"asked_for": settings.strategy, "auto": best, "why": why}
     data |= {name: facts[name] for name in ("exposures", "noise", "light", "channels")}

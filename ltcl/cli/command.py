@@ -18,10 +18,9 @@ from typing import Annotated, Any
 
 import rich.progress
 import typer
+from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
-from rich.text import Text
 from typer.models import ArgumentInfo
 
 from ltcl import report
@@ -153,16 +152,13 @@ def _log_to_stderr(quiet: bool, verbose: bool) -> Iterator[None]:
 
 def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
     """A table, numbers right-aligned; nothing is cut off in a narrow terminal."""
-    cells = [[_cell(value) for value in row] for row in rows]
-    frame = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
-    for name, *values in zip(columns, *cells, strict=True):
+    aligned = []
+    for name, *values in zip(columns, *([_cell(value) for value in row] for row in rows), strict=True):
         right = all(value[:1] in "+-.0123456789" or value == "diverges" for value in values)
-        frame.add_column(name, justify="right" if right else "left", no_wrap=True)
-    for row in cells:
-        frame.add_row(*map(Text, row))
-    with (console := Console(width=10_000)).capture() as capture:
-        console.print(frame)
-    return "\n".join(row.rstrip() for row in capture.get().splitlines())
+        width = max(map(cell_len, (name, *values)))
+        padded = ((text, " " * (width - cell_len(text))) for text in (name, *values))
+        aligned.append([gap + text if right else text + gap for text, gap in padded])
+    return "\n".join("   ".join(row).rstrip() for row in zip(*aligned, strict=True))
 
 
 def _cell(value: Any) -> str:
@@ -192,7 +188,6 @@ class Progress(rich.progress.Progress):
             *columns, *times, console=console, transient=True, disable=hidden, speed_estimate_period=_PERIOD
         )
         self._item = self._step = ""
-        self.done: float = 0
         self._solves = 0  # of this item that have begun
         self.add_task("", total=None)
 
@@ -200,7 +195,7 @@ class Progress(rich.progress.Progress):
         """Show what is being done and how much of it is done."""
         if step != self._step:
             _logger.info("%s%s", self._item, step)
-        (task,), self._step, self.done = self.tasks, step, done
+        (task,), self._step = self.tasks, step
         if task.total != total or done < task.completed:  # something else is counted, at another pace
             self.remove_task(task.id)
             self.add_task("", total=total)

@@ -101,8 +101,6 @@ def compensate(
     gain for all; Ctrl-C keeps what is done, for --resume. With --cluster workers solve, and do --transports;
     docs/guide/cluster.md shows how.
     """
-    from ltcl.acquisition import Setup
-
     asked, paths = context.options, picture or []
     has_scenes = asked["transports"] is not None
     paths = [transport, *paths] if has_scenes else paths
@@ -111,9 +109,7 @@ def compensate(
     film = _film(paths, asked)
     if has_scenes:
         return _compensate_scenes(context, paths, out)
-    measured = calibration or (transport if options.is_measured(transport) else None)
-    setup = Setup.of(measured) if measured else None
-    T = options.load(context, transport)
+    setup, T = options.setup(transport, calibration), options.load(context, transport)
     if setup is not None and (setup.grid, setup.channels) != (T.grid, T.channels):
         sizes = f"{setup.grid} and {setup.channels} channel(s); TRANSPORT has {T.grid} and {T.channels}"
         raise InputError(f"{calibration}: is of {sizes}")
@@ -236,12 +232,11 @@ def _compensate_frames(
         with _cluster(context) as client:
             result = compensate_frames(T, film, out, progress=context.progress, client=client, **arguments)
     except KeyboardInterrupt:
-        count = f"{context.progress.done:.0f} frame(s) are done and stay in {out}"
+        count = f"{context.progress.tasks[0].completed:.0f} frame(s) are done and stay in {out}"
         raise KeyboardInterrupt(f"interrupted; {count}; --resume goes on from there") from None
     worst, most, records = result.worst, result.most_clipped, result.records
-    names = ("video", "gain", "solved", "seconds", "frames_per_second", "transport_error", "worst")
-    text |= {"source": film, **{name: getattr(result, name) for name in names}}
-    text |= {"most_clipped": most, "frames": records}
+    names = "video gain solved seconds frames_per_second transport_error worst most_clipped"
+    text |= {"source": film, **{name: getattr(result, name) for name in names.split()}, "frames": records}
     if most.clipped > _MANY:
         count = sum(record.clipped > _MANY for record in records)
         frame = f"frame {most.number} ({most.name}) most; a lower --gain helps where patterns are at 1"
@@ -341,9 +336,8 @@ def separate(
             for part, picture_of in light.items():
                 panels.append(pictures.panel(picture_of, part, factor))
                 place = f"{name}/{part}" if len(photographs) > 1 else part
-                facts: dict[str, Any] = {"part": part}
-                facts |= pictures.write(folder, place, picture_of, panels[-1])
                 mean, solves = float(picture_of.mean(dtype=np.float64)), solved.get(part, [])
+                facts: Any = {"part": part, **pictures.write(folder, place, picture_of, panels[-1])}
                 facts |= {"lowest": float(picture_of.min()), "share": mean / whole if whole else None}
                 facts["channels"] = solves
                 if part in std:
@@ -385,11 +379,8 @@ def relight(
 
     Writes pictures exactly as .exr, and for the eye as .png at one exposure, which relight.json names.
     """
-    from ltcl.acquisition import Setup
-
     T = options.load(context, transport, dark_note=False)
-    setup = Setup.of(transport) if options.is_measured(transport) else None
-    patterns = pictures.read_all(context, pattern, T.grid, "the projector", setup)
+    patterns = pictures.read_all(context, pattern, T.grid, "the projector", options.setup(transport))
     light = {name: relighting.relight(T, each) for name, each in patterns.items()}
     factor, text = pictures.exposure(*light.values()), options.heading(context, transport, T)
     text["exposure"], text["pictures"], rows = factor, [], []

@@ -20,7 +20,7 @@ from ltcl.cli.options import option
 from ltcl.errors import InputError, LtclError
 from ltcl.noise import estimate
 from ltcl.store import BlockStore, Parts, Record, formats
-from ltcl.store.record import about
+from ltcl.store.record import CSR, about
 from ltcl.transport import Transport
 from ltcl.verdict import Verdict, verdict
 
@@ -54,7 +54,14 @@ def info(
             lights |= {} if F is None else {file.name: (F, record.grid or (1, record.shape[1]))}
             verdicts[str(file)] = judged = _verdict(record, facts)
             entries.append(facts | {"verdict": judged})
-            rows.append(_row(facts))
+            sizes = (facts[name] for name in ("shape", "grid", "camera_grid"))
+            shape, grid, camera_grid = ("{} x {}".format(*size) if size else "unknown" for size in sizes)
+            if facts["camera_grid"] in (None, facts["grid"]) and len({*facts["shape"]}) == 1:
+                camera_grid = "the same"
+            stored, size = f"{facts['stored']} {facts['dtype']}", checks.size(facts["nbytes"])
+            light = facts["first_bounce"] and _interval(*facts["first_bounce"]), facts["dark_pixels"]
+            counts = facts["channels"], grid, camera_grid, stored, facts["entries"], size
+            rows.append((file, shape, *counts, *light))
         except LtclError as error:
             entries.append({"file": str(file), **fail(error)})
     pictures.write_first_bounces(show_dark, lights)
@@ -65,47 +72,42 @@ def info(
 
 def _describe(file: Path, record: Record | Parts) -> tuple[dict[str, Any], np.ndarray | None]:
     """Facts about a transport in plain types, and F; refuses what could not be loaded again."""
+    sizes = {name: getattr(record, name) for name in ("shape", "grid", "camera_grid", "mixing")}
+    facts: dict[str, Any] = {"file": str(file), **sizes}
     if isinstance(record, Parts):  # whose operators are not made: that takes a device
         F, kinds, error = record.first_bounce, ", ".join(record.kinds), record.error
-        facts: dict[str, Any] = {"channels": len(F), "entries": record.entries, "solution_error": error}
+        facts |= {"channels": len(F), "entries": record.entries, "solution_error": error}
         facts |= {"dtype": f"{kinds}; error {checks.upwards(error)}", "nbytes": record.nbytes}
         facts |= {"first_bounce_from": "file", "stored": record.format.split("-")[1]}
     else:
-        F, facts = _describe_record(record)
-    sizes = {name: getattr(record, name) for name in ("shape", "grid", "camera_grid", "mixing")}
-    facts = {"file": str(file), **sizes, **facts, "first_bounce": None, "dark_pixels": None}
-    if F is not None:
-        facts["first_bounce"] = float(F.min()), float(F.max())
-        facts["dark_pixels"] = int(np.count_nonzero((F <= 0).any(axis=0)))
+        F, T = _first_bounce(record), list[Any](record.matrices)
+        kind = "dense" if record.dense else "row blocks" if record.stored else "sparse"
+        facts |= {"channels": len(T), "stored": kind, "dtype": str(T[0].dtype)}
+        facts["entries"] = sum(np.count_nonzero(M) if record.dense else M.nnz for M in T)
+        facts["nbytes"] = sum(getattr(M, "nbytes", 0) or sum(getattr(M, a).nbytes for a in CSR) for M in T)
+        source = "diagonal" if record.first_bounce is None else "file"
+        facts |= {"first_bounce_from": source, "solution_error": 0.0}
+    facts["first_bounce"] = None if F is None else (float(F.min()), float(F.max()))
+    facts["dark_pixels"] = None if F is None else int(np.count_nonzero((F <= 0).any(axis=0)))
     return facts, F
 
 
-def _describe_record(record: Record) -> tuple[np.ndarray | None, dict[str, Any]]:
-    """F (channels, N), 0 where dark, which a rectangular T has not, and facts about the matrices."""
+def _first_bounce(record: Record) -> np.ndarray | None:
+    """F (channels, N), 0 where dark, which a rectangular T has not, after all of a record is checked."""
     (rows, columns), F, matrices = record.shape, record.first_bounce, list[Any](record.matrices)
     for name, pixels in (("grid", columns), ("camera_grid", rows)):
         checks.grid(name, getattr(record, name) or (1, pixels), pixels)
-    if F is not None and rows != columns:
-        raise InputError(f"first_bounce is given, but T is {record.shape}; only a square T has one")
-    if F is None and rows == columns:
-        F = np.stack([T.diagonal() for T in matrices])
     for T in () if record.stored else matrices:  # blocks of a store have been checked
         checks.finite("T", T if record.dense else T.data)
-    layouts = [[T] if record.dense or record.stored else [T.data, T.indices, T.indptr] for T in matrices]
-    if F is not None:
-        F, grid = np.atleast_2d(checks.finite("first_bounce", F)), record.grid or (1, columns)
-        noise = lambda: record.noise or estimate(matrices, grid, record.camera_grid or grid)  # noqa: E731
-        known, share = record.noise is not None, first_bounce.DARK
-        F = np.where(first_bounce.dark(matrices, share, noise, known, F), 0.0, F)
-    return F, {
-        "channels": len(matrices),
-        "stored": "dense" if record.dense else "row blocks" if record.stored else "sparse",
-        "dtype": str(matrices[0].dtype),
-        "entries": sum(np.count_nonzero(T) if record.dense else T.nnz for T in matrices),
-        "nbytes": sum(array.nbytes for arrays in layouts for array in arrays),
-        "first_bounce_from": "diagonal" if record.first_bounce is None else "file",
-        "solution_error": 0.0,
-    }
+    if rows != columns and F is not None:
+        raise InputError(f"first_bounce is given, but T is {record.shape}; only a square T has one")
+    if rows != columns:
+        return None
+    F = np.stack([T.diagonal() for T in matrices]) if F is None else F
+    F, grid = np.atleast_2d(checks.finite("first_bounce", F)), record.grid or (1, columns)
+    noise = lambda: record.noise or estimate(matrices, grid, record.camera_grid or grid)  # noqa: E731
+    dark = first_bounce.dark(matrices, first_bounce.DARK, noise, record.noise is not None, F)
+    return np.where(dark, 0.0, F)
 
 
 def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
@@ -122,18 +124,6 @@ def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
         return verdict(Transport(known.pop("matrices"), **known))
     except InputError as error:  # dark all over
         return Verdict(f"Good for nothing: {error}.", False, False)
-
-
-def _row(entry: dict[str, Any]) -> tuple:
-    """Of the table; a camera has its grid where it is not that of the projector."""
-    grids = entry["shape"], entry["grid"], entry["camera_grid"]
-    shape, grid, camera_grid = ("{} x {}".format(*size) if size else "unknown" for size in grids)
-    if entry["camera_grid"] in (None, entry["grid"]) and entry["shape"][0] == entry["shape"][1]:
-        camera_grid = "the same"
-    stored, size = f"{entry['stored']} {entry['dtype']}", checks.size(entry["nbytes"])
-    facts = (shape, entry["channels"], grid, camera_grid, stored, entry["entries"], size)
-    first = entry["first_bounce"] and _interval(*entry["first_bounce"])
-    return (entry["file"], *facts, first, entry["dark_pixels"])
 
 
 def _plot(path: Path | None) -> Path | None:

@@ -16,13 +16,8 @@ from typing import Annotated
 import typer
 
 from ltcl import __version__
-from ltcl.cli.acquire import app as acquire
-from ltcl.cli.acquire import simulate
+from ltcl.cli import acquire, compensate, doctor, files, view
 from ltcl.cli.command import EXIT_CODES, USAGE, UsageError, fail
-from ltcl.cli.compensate import compensate, relight, separate
-from ltcl.cli.doctor import demo, devices, doctor
-from ltcl.cli.files import analyze, compress, convert, denoise, info, invert
-from ltcl.cli.view import play, show, view
 from ltcl.errors import InputError, LtclError
 
 _PATIENCE = 5.0  # seconds within which ranks that fail alike do so
@@ -36,10 +31,12 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_FILES = (info, analyze, convert, compress, invert, denoise)
-for _command in (devices, doctor, demo, simulate, *_FILES, compensate, separate, relight, view, play, show):
+_COMMANDS = [doctor.devices, doctor.doctor, doctor.demo, acquire.simulate, files.info, files.analyze]
+_COMMANDS += [files.convert, files.compress, files.invert, files.denoise, compensate.compensate]
+_COMMANDS += [compensate.separate, compensate.relight, view.view, view.play, view.show]
+for _command in _COMMANDS:
     app.command()(_command)
-app.add_typer(acquire, name="acquire")
+app.add_typer(acquire.app, name="acquire")
 
 
 @app.callback(invoke_without_command=True)

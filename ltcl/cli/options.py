@@ -42,7 +42,7 @@ def grid(text: str) -> tuple[int, int]:
 
 def path(text: str) -> Path:
     """A path that is not empty, which Path would take for this folder."""
-    if not text.strip():
+    if not str(text).strip():  # a default is a Path
         raise typer.BadParameter("the path is empty; write . for this folder")
     return Path(text)
 
@@ -180,6 +180,15 @@ def is_measured(path: Path) -> bool:
     with suppress(InputError):
         return path.is_dir() and "strategy" in store.BlockStore.open(path).attributes
     return False
+
+
+def setup(transport: Path, calibration: Path | None = None) -> Any:
+    """How the projector of a measured transport, or the one of `calibration`, was measured; else None."""
+    if calibration is None and not is_measured(transport):
+        return None
+    from ltcl.acquisition import Setup  # which takes a second
+
+    return Setup.of(calibration or transport)
 
 
 def note_lost(source: Path, target: Path) -> None:

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from ltcl import report
 from ltcl.cli.command import Context
 from ltcl.errors import InputError
-from ltcl.files import fill_folder, locked
+from ltcl.files import fill_folder, locked, replace_file
 
 _WIDTH = 512  # pixels of a picture for the eye, at least
 _MARGIN, _TEXT = 8, 18  # of contact sheets and labels, in pixels
@@ -151,4 +151,5 @@ def write_first_bounces(place: Path | None, lights: Mapping[str, tuple[np.ndarra
         codes = mark(shades(F.T.reshape(*grid, *F.shape[:-1]), exposure(F)), 1.0 * dark)
         rows.append([panel(codes, f"{name}: {np.count_nonzero(dark)} of {dark.size} pixels are dark")])
     if place is not None and rows:
-        contact_sheet(rows).save(place, "PNG")
+        with replace_file(place) as temporary:
+            contact_sheet(rows).save(temporary, "PNG")

@@ -37,14 +37,6 @@ def _address(context: Context) -> dict[str, Any]:
     return {"host": host, "port": port, "open_browser": not no_browser}
 
 
-def _setup(transport: Path) -> Any:
-    if not options.is_measured(transport):
-        return None
-    from ltcl.acquisition import Setup  # which takes a second
-
-    return Setup.of(transport)
-
-
 @command(*options.TRANSPORT, _address_options)
 def view(
     context: Context,
@@ -71,7 +63,7 @@ def view(
             options.load(context, transport),
             {each.name: images.read(each) for each in picture or []},
         )
-        scene = Scene(T, transport.name, pictures, _setup(transport))
+        scene = Scene(T, transport.name, pictures, options.setup(transport))
     with serve(scene, **_address(context)) as viewer:
         typer.echo(f"{viewer.url} shows {transport}; Ctrl-C ends it", err=True)
         context.progress(f"showing {transport}")
@@ -95,7 +87,7 @@ def play(
     from ltcl.viewer.answers import Scene
     from ltcl.viewer.window import Window, play
 
-    source, T, setup = open_frames(film), options.load(context, transport), _setup(transport)
+    source, T, setup = open_frames(film), options.load(context, transport), options.setup(transport)
     settings = options.solving(context, T, compensation.RTOL)
     del settings["callback"]  # the progress is that of the film
     settings["background"] = None if setup is None else setup.ambient

@@ -2,10 +2,6 @@
 """Transports on disk: load one from, and save one to, .npz, .npy, .mtx, .h5, .mat and .zarr.
 
 Everything that a file declares is checked before memory is taken for it; pickles are never loaded.
-
-formats         load, save, read and write by extension; exchange (.mtx, .h5, .mat)
-record          what is in files, and the checks of what they declare
-block_store     .zarr: in a `BlockStore` a scan grows by batches; a finished T is read block by block
 """
 
 from ltcl.store.block_store import ArrayLog, BlockStore

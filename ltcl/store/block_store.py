@@ -316,8 +316,7 @@ class BlockStore:
         for channel, blocks in itertools.product(range(layout.channels), parts):
             first, stop, columns = span(blocks[0])[0], span(blocks[-1])[1], []
             for C, variance in (self.block(channel, batch) for batch in batches):
-                V = np.full_like(C.data, np.nan) if variance is None else variance
-                data = np.stack([C.data, V], axis=1).view(np.complex64).ravel()  # T + i V
+                data = np.stack([C.data, variance], axis=1).view(np.complex64).ravel()  # T + i V
                 columns.append(scipy.sparse.csr_array((data, C.indices, C.indptr), C.shape)[:, first:stop])
             T = scipy.sparse.vstack(columns, "csr").T.tocsr()
             for block in blocks.tolist():

@@ -84,19 +84,14 @@ def write_mat(path: Path, record: Record) -> None:
 
 
 def read_mat(path: Path, variable: str | None = None) -> Record:
-    """Read a .mat of version 5, or of version 7.3."""
+    """Read a .mat of version 7.3, or 5, whose strings, cells and structures are left out."""
     with path.open("rb") as file:
         head = file.read(520)
     if b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:]):
         return read_hdf5(path, variable, *_OF_MATLAB)
     if not head.startswith(b"MATLAB 5.0 MAT-file") or head[126:128] != b"IM":
         raise FileError("is neither version 5, little-endian, nor 7.3; save it again with -v7 or -v7.3")
-    return _record(_version_5(path), variable, *_OF_MATLAB)
-
-
-def _version_5(path: Path) -> dict[str, Any]:
-    """Full and sparse matrices by name, as HDF5 has them; strings, cells and structures are left out."""
-    members: dict[str, Any] = {}
+    members: dict[str, Any] = {}  # as HDF5 has them
     checks.fits_host("the file", 2 * path.stat().st_size)
     for kind, content in _elements(memoryview(path.read_bytes())[128:]):
         if kind == _COMPRESSED:
@@ -115,7 +110,7 @@ def _version_5(path: Path) -> dict[str, Any]:
                 members |= zip((f"{name}/ir", f"{name}/jc", f"{name}/data"), arrays, strict=True)
             else:
                 (members[name],) = (array.reshape(shape[::-1]) for array in arrays)
-    return members
+    return _record(members, variable, *_OF_MATLAB)
 
 
 def _elements(data: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -158,8 +153,7 @@ def write_hdf5(path: Path, record: Record) -> None:
     """Write everything in `record`."""
     T: Any = record.matrices
     with _open(path, "w") as file:
-        for name, array in record.arrays().items():
-            file[name] = array
+        file.update(record.arrays())
         for name, csr in zip(("T",) if len(T) == 1 else CHANNELS, () if record.dense else T, strict=False):
             csc, group = csr.tocsc(), file.create_group(name)
             group.attrs["MATLAB_sparse"] = csc.shape[0]

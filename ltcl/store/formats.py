@@ -13,6 +13,7 @@ import logging
 import os
 import zipfile
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from ltcl.operators.parts import intact
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, exchange, record
 from ltcl.store.record import CSR, Matrix, Parts, Record, about
-from ltcl.transport import Transport, from_arrays, to_arrays
+from ltcl.transport import Transport, from_arrays, require, to_arrays
 
 COMPRESSED, INVERSE, RGB = "ltcl-compressed-1", "ltcl-inverse-1", "ltcl-rgb-csr-1"
 _INDICES = ("indices", "indptr", "row", "col", "coords", "offsets")
@@ -124,9 +125,7 @@ def save(path: str | os.PathLike[str], T: Transport) -> None:
     >>> ltcl.load(path).grid
     (2, 3)
     """
-    if not isinstance(T, Transport):
-        raise InputTypeError(f"T is a {type(T).__name__}; it must be a Transport (or use save_inverse)")
-    if T.blocks is not None:
+    if require(T, square=False).blocks is not None:
         raise InputTypeError("T has 3 x 3 blocks between colours; only one matrix or three can be saved")
     if not any(isinstance(M, Matrix) for M in T.matrices):
         return write(path, Parts(to_arrays(T)))
@@ -188,11 +187,8 @@ def write(path: str | os.PathLike[str], content: Record | Parts) -> None:
             logging.getLogger(__name__).warning("%s %s; .npz does", lost, " and ".join(names))
     with about(path):
         content = content.in_memory() if isinstance(content, Record) else content
-        if suffix == ".zarr":
-            block_store.write(path, content)
-        else:
-            with replace_file(path) as temporary:
-                FORMATS[suffix][1](temporary, content)
+        with nullcontext(path) if suffix == ".zarr" else replace_file(path) as place:
+            FORMATS[suffix][1](place, content)
 
 
 def find(path: Path, *, inverse: bool = False) -> str:

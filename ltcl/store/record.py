@@ -167,8 +167,7 @@ class Record:
         """Named arrays: `EXTRAS`, those of noise, and T (M, N) or (3, M, N) where that is dense."""
         T = self.matrices
         values = {"T": (T[0] if len(T) == 1 else np.stack(T)) if self.dense else None}
-        values |= {name: getattr(self, name) for name in EXTRAS}
-        values |= self.noise.to_arrays() if self.noise else {}
+        values |= {n: getattr(self, n) for n in EXTRAS} | (self.noise.to_arrays() if self.noise else {})
         return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 

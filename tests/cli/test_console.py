@@ -104,7 +104,7 @@ def test_progress_is_a_bar_with_elapsed_time_and_time_left(capsys, monkeypatch):
             progress("frames", 16, 32)
             progress.refresh()
         out, err = capsys.readouterr()
-        assert (out, progress.done) == ("", 16)
+        assert (out, progress.tasks[0].completed) == ("", 16)
         assert all((part in err) == (terminal and not quiet) for part in ("frames", "0:00:0", "left"))
 
 
