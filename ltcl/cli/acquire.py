@@ -166,12 +166,11 @@ def plan(context: Context, folder: options.Acquisition, overhead: _Overhead = 0.
         sizes = datetime.timedelta(seconds=round(each.seconds)), checks.size(each.disk)
         rows.append((name, *counts, *sizes, percent(each.error, 2)))
     columns = ("strategy", "pixels", "patterns", "photographs", "time", "disk at most", "error of T p")
-    times = ", ".join(f"{t:.3g}" for t in facts["exposures"])
     source = "measured" if is_measured else "guessed; the calibration will measure them"
     advice = "" if settings.strategy == "auto" else f"acquisition.toml asks for {settings.strategy}; "
     lines = [
         f"{folder}: {project.kind} rig, {facts['channels']} channel(s)",
-        f"exposures {times} s, noise and light {source}\n",
+        f"exposures {', '.join(f'{t:.3g}' for t in facts['exposures'])} s, noise and light {source}\n",
         table(columns, rows),
         f"\nphotographs: all, {count} of them of the calibration; error of T p: by noise, relative",
         f"{advice}auto takes {best}: {why}",

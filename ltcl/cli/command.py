@@ -128,19 +128,16 @@ def note(text: str) -> None:
     _logger.log(_NOTE, "%s", text)
 
 
-class _Log(logging.Handler):
-    """Messages of the library as lines on stderr."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
-        typer.echo(f"ltcl: {level}{' '.join(record.getMessage().split())}", err=True)
-
-
 @contextmanager
 def _log_to_stderr(quiet: bool, verbose: bool) -> Iterator[None]:
     """Show warnings and notes of ltcl; errors only if `quiet`, and what it is doing if `verbose`."""
-    logger, handler = logging.getLogger("ltcl"), _Log()
-    before = logger.level
+
+    def show(record: logging.LogRecord) -> None:
+        level = f"{record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        typer.echo(f"ltcl: {level}{' '.join(record.getMessage().split())}", err=True)
+
+    logger, handler = logging.getLogger("ltcl"), logging.Handler()
+    before, handler.emit = logger.level, show
     logger.addHandler(handler)
     logger.setLevel(logging.ERROR if quiet else logging.INFO if verbose else _NOTE)
     try:

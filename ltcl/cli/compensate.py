@@ -7,7 +7,6 @@ import glob
 import inspect
 import json
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
@@ -27,7 +26,6 @@ from ltcl.transport import Transport
 
 _MANY = 0.01  # part of a picture or pattern out of reach from which advice is given
 _RESULTS = ("gain", "clipped", "error", "transport_error", "gap")
-_SHEET = 12  # pictures on a contact sheet, at most
 _DIM = 4  # times as bright: what is that much darker is shown a second time on a contact sheet, amplified
 _REASONS = {
     "dark": "; where the pattern is at 1 a lower --gain helps, or --gain auto",
@@ -185,7 +183,7 @@ def _compensate_pictures(
             for what, reason in _REASONS.items():
                 if (share := facts[f"too_{what}"]) > _MANY:
                     note(f"{path}: {100 * share:.0f} % of it stays too {what}{reason}")
-        pictures.contact_sheet(sheet[:_SHEET]).save(folder / "compensate.png")
+        pictures.contact_sheet(sheet[:12]).save(folder / "compensate.png")
     columns = ("picture", "method", "products", "gain", "clipped", "error", "pattern")
     where = f"\npatterns, appearances and what is out of reach as .exr and .png in {out}"
     return [table(columns, rows), where, f"look at {out / 'compensate.png'}"]
@@ -272,11 +270,18 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer
         raise InputError(f"--out is {out}, where transports are; it must be another place")
     asked = context.options | dict.fromkeys(("transports", "cluster", "workers"))
     asked |= {} if context.options["cluster"] is None else {"device": None}  # workers have their own
+    own = {name: asked.get(name) for name in [*inspect.signature(inspect.unwrap(compensate)).parameters][1:]}
+
+    def files_of(scene: Path) -> dict[str, bytes]:
+        with TemporaryDirectory() as folder, Progress(quiet=True) as progress:
+            place, call = Path(folder) / "scene", Context("compensate", asked, progress)
+            inspect.unwrap(compensate)(call, **own | {"transport": scene, "picture": paths, "out": place})
+            return {file.name: file.read_bytes() for file in place.iterdir()}
+
     reports, rows, failed = [], [], None
     with _cluster(context) as client:
         try:
-            task = partial(_compensate_scene, asked, paths)
-            results = of_each(task, scenes, client=client, progress=context.progress)
+            results = of_each(files_of, scenes, client=client, progress=context.progress)
         except BatchError as error:
             results, failed = error.results, error
     for scene, files in zip(scenes, results, strict=True):
@@ -291,16 +296,6 @@ def _compensate_scenes(context: Context, paths: list[Path], out: Path) -> Answer
         raise failed
     lines = [table(("scene", "gain", "worst error"), rows), f"\na folder for each in {out}"]
     return Answer({"folder": out, "scenes": reports}, lines)
-
-
-def _compensate_scene(asked: dict[str, Any], paths: list[Path], scene: Path) -> dict[str, bytes]:
-    """The files of one scene."""
-    with TemporaryDirectory() as folder, Progress(quiet=True) as progress:
-        call, place = inspect.unwrap(compensate), Path(folder) / "scene"
-        own = {name: asked.get(name) for name in [*inspect.signature(call).parameters][1:]}
-        own |= {"transport": scene, "picture": paths, "out": place}
-        call(Context("compensate", asked, progress), **own)
-        return {file.name: file.read_bytes() for file in place.iterdir()}
 
 
 @command(*options.TASK)

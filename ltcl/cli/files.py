@@ -25,7 +25,6 @@ from ltcl.transport import Transport
 from ltcl.verdict import Verdict, verdict
 
 _COLOURS = {1: ("grey",), 3: ("red", "green", "blue")}
-_JUDGED = 1 << 28  # bytes of a transport at most
 _UNITS = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "ki": 1024, "mi": 1024**2, "gi": 1024**3}
 _interval = "{:.4g} .. {:.4g}".format
 
@@ -115,7 +114,7 @@ def _verdict(record: Record | Parts, facts: dict[str, Any]) -> Verdict:
         return Verdict(f"Unknown: stored as {facts['stored']}: run 'ltcl analyze' on what it was made of.")
     square, missing = record.shape[0] == record.shape[1], "" if record.grid else " --grid HxW"
     missing += "" if square or record.camera_grid else " --camera-grid HxW"
-    if missing or (square and facts["nbytes"] > _JUDGED):
+    if missing or (square and facts["nbytes"] > 1 << 28):
         why = "the file does not contain the grid" if missing else "T takes more than 256 MiB"
         tool = f"analyze {facts['file']}" if square else f"convert {facts['file']} OUT.npz"
         return Verdict(f"Unknown: {why}: run 'ltcl {tool}{missing}'.")
@@ -214,13 +213,8 @@ def compress(
     norm: Annotated[Literal["pictures", "worst"], option("Whose error: of pictures, or any.")] = "pictures",
 ) -> Answer:
     """Write R in a basis where it is sparse; basis, threshold and precision are chosen by measurement."""
-    rtol, basis = context.options["rtol"], context.options["basis"] or None
-
-    def make(T: Transport, progress: Any) -> Transport:
-        if T.is_compressed and T.error:
-            raise InputError(f"{file}: is compressed already, to {T.error:.2g}; compress what it came from")
-        return compression.compress(T, rtol, budget, norm=norm, basis=basis, progress=progress)
-
+    asked = {"rtol": context.options["rtol"], "basis": context.options["basis"] or None}
+    make = partial(compression.compress, budget=budget, norm=norm, **asked)
     _, C, data = _transform(context, file, out, make)
     facts: Any = C.compression
     data |= {"bytes": facts.uncompressed, "bytes_compressed": C.nbytes, "bytes_on_disk": options.on_disk(out)}
@@ -233,8 +227,7 @@ def compress(
         rows.append((colour, channel.basis, core, channel.kept, checks.size(channel.nbytes), channel.error))
     within = f"solutions within {checks.upwards(C.error)}, {disk} on disk, in {facts.seconds:.3g} s"
     within += f", or {checks.upwards(C.error_bound)} for light that is no picture" * (norm == "pictures")
-    line = f"\n{out}: {before} to {after} with the first bounce, {within}"
-    return Answer(data, [table(columns, rows), line])
+    return Answer(data, [table(columns, rows), f"\n{out}: {before} to {after} with the first bounce, {within}"])
 
 
 @command(*options.TRANSPORT)

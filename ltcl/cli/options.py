@@ -69,10 +69,9 @@ def _known(name: str) -> str:
     return name
 
 
-def argument(metavar: str, help: str, **settings: Any) -> Any:
+def argument(metavar: str, help: str, parser: Any = path, **settings: Any) -> Any:
     """An argument, by default a path."""
-    arguments: dict[str, Any] = {"parser": path, "metavar": metavar, "help": help, **settings}
-    return typer.Argument(**arguments)
+    return typer.Argument(metavar=metavar, help=help, parser=parser, **settings)
 
 
 def option(help: str, *names: str, **settings: Any) -> Any:
@@ -204,7 +203,18 @@ def solving(context: Context, T: Transport, rtol: float, solves: int = 1) -> dic
     """
     asked = context.options
     inverse = asked["inverse"] and store.load_inverse(asked["inverse"], device=T.device)
-    exact = asked["exact"] and _load_exact(asked["exact"], T, asked["variable"])
+    exact, path = None, asked["exact"]
+    if path is not None:  # what T was compressed from, with its first bounce
+        same = {"grid": T.grid, "first_bounce": T.first_bounce, "device": T.device}
+        on_dark, variable = "mask" if T.masked.any() else "raise", asked["variable"]
+        exact = store.load(path, variable=variable, on_dark=on_dark, dark=0.0, **same)
+        resolve_reference(T, exact)  # refuses other colours
+        pattern = np.random.default_rng(0).random((*T.grid, *(3,) * (T.channels == 3)))
+        picture = T @ pattern
+        error = float(np.linalg.norm(picture - exact @ pattern) / np.linalg.norm(picture))
+        if not error <= T.error + _ROUNDING:
+            text = f"pictures differ by {error:.2g}, more than {checks.upwards(T.error + _ROUNDING)}"
+            raise InputError(f"{path}: is not what TRANSPORT was compressed from: {text}")
     rtol = default_rtol(rtol, T, exact, inverse) if asked["rtol"] is None else asked["rtol"]
     settings = {"method": asked["method"], "rtol": rtol, "inverse": inverse, "exact": exact}
     settings |= {name: asked[name] for name in ("samples", "seed") if asked[name] is not None}
@@ -216,20 +226,6 @@ def shows_noise(T: Transport, settings: dict[str, Any]) -> bool:
     """Whether its results have standard deviations: noise of T was measured, or T shows its entries."""
     judged = settings["exact"] or T
     return not judged.is_compressed or judged.measured_noise is not None
-
-
-def _load_exact(path: Path, T: Transport, variable: str | None) -> Transport:
-    """What T was compressed from, with its first bounce; InputError where it is another transport."""
-    on_dark, same = "mask" if T.masked.any() else "raise", {"grid": T.grid, "first_bounce": T.first_bounce}
-    exact = store.load(path, variable=variable, on_dark=on_dark, dark=0.0, device=T.device, **same)
-    resolve_reference(T, exact)  # refuses other colours
-    pattern = np.random.default_rng(0).random((*T.grid, *(3,) * (T.channels == 3)))
-    picture = T @ pattern
-    error = float(np.linalg.norm(picture - exact @ pattern) / np.linalg.norm(picture))
-    if not error <= T.error + _ROUNDING:
-        text = f"pictures differ by {error:.2g}, more than {checks.upwards(T.error + _ROUNDING)}"
-        raise InputError(f"{path}: is not what TRANSPORT was compressed from: {text}")
-    return exact
 
 
 def verdicts(files: Mapping[str, Verdict]) -> list[str]:
@@ -265,5 +261,4 @@ def heading(context: Context, path: Path, T: Transport, **options: Any) -> dict[
 
 def on_disk(path: Path) -> int:
     """Bytes of a file, or of all files in a folder."""
-    files = path.rglob("*") if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
+    return sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())

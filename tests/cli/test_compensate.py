@@ -15,7 +15,7 @@ from PIL import Image
 import ltcl
 from ltcl import images
 from ltcl.batch import frames
-from ltcl.batch.manifest import locked
+from ltcl.files import locked
 from ltcl.images.frames import open_frames, write_video
 
 from .conftest import write
