@@ -59,7 +59,8 @@ def devices(context: Context) -> Answer:
     rows = []
     for *names, memory, largest, is_chosen in map(dict.values, data):
         rows.append(("->" if is_chosen else "", *names, checks.size(memory), checks.size(largest)))
-    return Answer(data, [table(("", "index", "name", "kind", "driver", "units", "memory", "largest buffer"), rows)])
+    columns = ("", "index", "name", "kind", "driver", "units", "memory", "largest buffer")
+    return Answer(data, [table(columns, rows)])
 
 
 @command()

@@ -225,9 +225,9 @@ def compress(
     for colour, channel in zip(_COLOURS[C.channels], facts.channels, strict=True):
         core = f"{channel.format} 1 x {channel.width} {channel.precision}"
         rows.append((colour, channel.basis, core, channel.kept, checks.size(channel.nbytes), channel.error))
-    within = f"solutions within {checks.upwards(C.error)}, {disk} on disk, in {facts.seconds:.3g} s"
-    within += f", or {checks.upwards(C.error_bound)} for light that is no picture" * (norm == "pictures")
-    return Answer(data, [table(columns, rows), f"\n{out}: {before} to {after} with the first bounce, {within}"])
+    more = f"solutions within {checks.upwards(C.error)}, {disk} on disk, in {facts.seconds:.3g} s"
+    more += f", or {checks.upwards(C.error_bound)} for light that is no picture" * (norm == "pictures")
+    return Answer(data, [table(columns, rows), f"\n{out}: {before} to {after} with the first bounce, {more}"])
 
 
 @command(*options.TRANSPORT)
