@@ -266,6 +266,8 @@ def _transform(
     if not is_inverse and out.suffix.lower() not in (".npz", ".zarr"):
         raise InputError(f"--out is {out}; what {context.name} makes must be a .npz or a .zarr")
     T = options.load(context, file)
+    if context.name == "compress" and T.is_compressed and T.error:
+        raise InputError(f"{file}: is compressed already, to {T.error:.2g}; compress what it came from")
     result = make(T, progress=partial(context.progress, total=1.0))
     (store.save_inverse if is_inverse else store.save)(out, result)
     if not is_inverse:

@@ -197,7 +197,7 @@ def note_lost(source: Path, target: Path) -> None:
 
 
 def solving(context: Context, T: Transport, rtol: float, solves: int = 1) -> dict[str, Any]:
-    """Arguments of a task of tolerance `rtol` by default; its progress is that of `solves` solves a channel."""
+    """Arguments of a task of tolerance `rtol` by default; its progress: so many solves a channel."""
     asked = context.options
     inverse = asked["inverse"] and store.load_inverse(asked["inverse"], device=T.device)
     exact, path = None, asked["exact"]
