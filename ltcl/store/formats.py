@@ -23,11 +23,10 @@ from ltcl import checks
 from ltcl.errors import FileError, InputError, InputTypeError
 from ltcl.files import as_path, input_file, replace_file, unknown_extension
 from ltcl.first_bounce import DARK
-from ltcl.operators.parts import intact
 from ltcl.solvers import Inverse
 from ltcl.store import block_store, exchange, record
 from ltcl.store.record import CSR, Matrix, Parts, Record, about
-from ltcl.transport import Transport, from_arrays, to_arrays
+from ltcl.transport import Transport, from_arrays, intact, to_arrays
 
 COMPRESSED, INVERSE, RGB = "ltcl-compressed-1", "ltcl-inverse-1", "ltcl-rgb-csr-1"
 _INDICES = ("indices", "indptr", "row", "col", "coords", "offsets")
