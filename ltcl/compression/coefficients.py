@@ -140,9 +140,8 @@ def quantize(C: scipy.sparse.csr_array, allowance: float) -> Packed:
     frobenius = allowance * math.sqrt(len(C.indptr) - 1)  # or less: the 2-norm of rounding is far below
     while True:
         packed = smallest(C, frobenius / size if size else 0.0)
-        if packed.precision == "float32" or packed.difference[1] <= allowance:
-            return packed
-        if estimate_norm(scipy.sparse.csr_array(packed.matrix() - C))[0] <= allowance:
+        fits = packed.precision == "float32" or packed.difference[1] <= allowance
+        if fits or estimate_norm(scipy.sparse.csr_array(packed.matrix() - C))[0] <= allowance:
             return packed
         frobenius = 0.5 * packed.difference[0]
 
@@ -213,8 +212,7 @@ class Coefficients:
         if threshold <= self.threshold:
             return self
         core, lost = drop_below(self.core, threshold)
-        second = math.sqrt(self.second**2 + lost)
-        return replace(self, core=core, second=second, threshold=threshold)
+        return replace(self, core=core, second=math.sqrt(self.second**2 + lost), threshold=threshold)
 
 
 def coefficients(

@@ -82,10 +82,8 @@ class Rows(scipy.sparse.linalg.LinearOperator):
         return np.concatenate([*self.each(lambda at, rows, _: rows @ x)]).astype(np.float64)
 
     def _rmatmat(self, X: np.ndarray) -> np.ndarray:
-        x, product = X.astype(np.float32), np.zeros((self.shape[1], X.shape[1]))
-        for part in self.each(lambda at, rows, _: rows.T @ x[at]):
-            product += part
-        return product
+        x = X.astype(np.float32)
+        return sum(self.each(lambda at, rows, _: rows.T @ x[at]), np.zeros((self.shape[1], X.shape[1])))
 
 
 def source(name: str, matrix: Any, memory: int | None = None, client: Any = None) -> Rows:

@@ -12,9 +12,9 @@ platform, as many as it is fast, and all work at once.
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
+from logging import getLogger
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,7 @@ from ltcl.operators.csr import CSR, Pattern, RowBlocks
 from ltcl.operators.dense import Dense
 from ltcl.operators.rows import ReadableRows, RowOperator
 
-_READ = 1 << 22  # bytes of rows in one reading: what caches hold, while a disk is busy for long
-_AHEAD = 2  # readings at the same time
+_READ, _AHEAD = 1 << 22, 2  # bytes of rows in a reading, which caches hold; readings at the same time
 _TRIAL = 4096  # rows and columns of the product by which devices are compared: beyond the caches
 
 
@@ -226,9 +225,7 @@ def stays_on_disk(matrices: Sequence[Any], device: Device) -> bool:
             each.require(entries // (1 + len(device.others)) + copied * each.is_cpu, "R")
     except MemoryLimitError as error:
         size = checks.size(sum(T.nbytes for T in matrices))
-        logging.getLogger(__name__).warning(
-            "T of %s stays on the disk and is read at each product: %s", size, error
-        )
+        getLogger(__name__).warning("T of %s stays on the disk and is read at each product: %s", size, error)
         return True
     return False
 
@@ -259,10 +256,8 @@ def _reader(matrix: np.ndarray, rows: int) -> Callable[[int], tuple[int, np.ndar
     if path is None or root.mode == "c" or not matrix.flags.c_contiguous:
         return lambda first: (first, matrix[first : first + rows])
     offset = root.offset + matrix.ctypes.data - root.ctypes.data
-    try:  # in turn: to get new memory from the system takes as long as to read into it
-        buffers = np.empty((_AHEAD + 1, rows * width), matrix.dtype)
-    except MemoryError as error:
-        raise MemoryLimitError(f"{path}: {error}") from error
+    checks.fits_host(f"{path}: reading it", (_AHEAD + 1) * rows * width * matrix.itemsize)
+    buffers = np.empty((_AHEAD + 1, rows * width), matrix.dtype)  # in turn: new memory costs like reading
 
     def read(first: int) -> tuple[int, np.ndarray]:
         values = buffers[first // rows % len(buffers), : min(rows, height - first) * width]

@@ -15,7 +15,6 @@ import zarr
 
 import ltcl
 from ltcl import checks
-from ltcl.compression import sources
 from ltcl.compression.coefficients import Analysis, coefficients
 from ltcl.compression.sources import source
 from ltcl.errors import InputError, InputTypeError
@@ -110,7 +109,7 @@ def test_numbers_of_rows_larger_than_memory_are_those_of_the_serial_ones(
     limits, sides, client, matrix, device, monkeypatch
 ):
     monkeypatch.setattr(checks, "host_memory", lambda: 4 * N * N)  # half of it is too little for all
-    monkeypatch.setattr(sources, "_ITEMS", 3)  # several blocks in each
+    monkeypatch.setattr("ltcl.compression.sources._ITEMS", 3)  # several blocks in each
     W = Analysis(Wavelet(device, GRID, "db2"))
     out = W if sides == 2 else None
     serial = coefficients(source("T", matrix, SMALLEST), out, W, **limits)
