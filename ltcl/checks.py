@@ -193,10 +193,11 @@ def host_memory() -> int:
     return available
 
 
-def fits_host(what: str, needed: int) -> None:
-    """Refuse an allocation of `needed` bytes that the host does not have, before it is tried."""
-    if needed > (available := host_memory()):
-        raise MemoryLimitError(f"{what} needs {size(needed)}, but the host has {size(available)} free")
+def fits_host(what: str, needed: int, most: int = 1 << 62) -> None:
+    """Refuse an allocation of `needed` bytes beyond `most` or what the host has, before it is tried."""
+    if needed > (available := min(host_memory(), most)):
+        limit = f"{size(most)} are allowed" if available == most else f"the host has {size(available)} free"
+        raise MemoryLimitError(f"{what} needs {size(needed)}, but {limit}")
 
 
 def shown(value: Any) -> str:

@@ -13,7 +13,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from statistics import median
 from typing import Any
@@ -119,42 +118,32 @@ def play(
         target = target if background is None else target - np.atleast_3d(background)
         return inverse.pattern(target if target.shape[2] == 3 else target[..., 0])
 
-    now, period, title, frames = time.monotonic, 1.0 / (film.fps or 25.0), window.title, iter(film)
+    now, period, title, late = time.monotonic, 1.0 / (film.fps or 25.0), window.title, list[float]()
     computing, drawing = deque([0.0], _RECENT), deque([0.0], _RECENT)  # seconds of frames
-
-    def prepare(start: float, earliest: float) -> tuple[int, np.ndarray] | None:
-        """Number and codes of the newest frame that is due when it can be shown, at `earliest` or later."""
-        for frame in frames:
-            begun = now()
-            if start + (frame.number + 1) * period >= max(begun + median(computing), earliest):
-                codes = scene.codes(pattern(picture(frame)), 1.0)
-                computing.append(now() - begun)
-                return frame.number, codes
-        return None
-
-    start, due, sent = math.inf, 0.0, 0.0  # when frame 0 was due; the one on show was due, and sent
-    late, facts, shown = list[float](), dict[str, Any](), 0
-    with ThreadPoolExecutor(1) as thread:
-        ahead = thread.submit(prepare, start, 0.0)
-        while (prepared := ahead.result()) is not None:
-            number, codes = prepared
-            wait = start + number * period - now() if shown else 0.0
-            drawn = max(now() + wait, sent + median(drawing)) + median(drawing)
-            ahead = thread.submit(prepare, start, drawn)
-            time.sleep(max(wait, 0.0))
-            begun = now()
-            drawn = window.show(codes)
-            if shown and now() - begun < _PAUSE:
-                late.append(drawn - due)
-                drawing.append(drawn - sent)
-            else:  # the film waited for a window
-                start = now() - number * period
-            sent = now()
-            due, shown = start + number * period, shown + 1
-            facts = {"shown": shown, "dropped": number - shown, "gain": gain}
-            facts |= {"frames_per_second": shown / (now() - start), "latency": median(late or [0.0])}
-            text = "{frames_per_second:.1f} frames/s, {dropped} dropped, latency {latency:.3f} s"
-            window.title = f"{title}: {(text := text.format(**facts))}"
-            progress("playing", number, film.count, detail=f": {text}")
+    start, sent, number, shown = 0.0, 0.0, 0, 0  # when frame 0 was due, the last one sent; its number
+    facts = dict[str, Any]()
+    for frame in film:
+        begun = now()
+        earliest = max(begun + median(computing), sent + median(drawing))
+        if shown and start + (frame.number + 1) * period < earliest:
+            continue
+        codes = scene.codes(pattern(picture(frame)), 1.0)
+        ready = now()
+        if shown:  # kernels were built for the first one
+            computing.append(ready - begun)
+            time.sleep(max(start + frame.number * period - ready, 0.0))
+        asked = now()
+        drawn = window.show(codes)
+        if shown and now() - asked < _PAUSE:
+            late.append(drawn - start - number * period)
+            drawing.append(drawn - sent)
+        else:  # the film waited for a window
+            start = now() - frame.number * period
+        sent, number, shown = now(), frame.number, shown + 1
+        facts = {"shown": shown, "dropped": number - shown, "gain": gain}
+        facts |= {"frames_per_second": shown / (sent - start), "latency": median(late or [0.0])}
+        text = "{frames_per_second:.1f} frames/s, {dropped} dropped, latency {latency:.3f} s"
+        window.title = f"{title}: {(text := text.format(**facts))}"
+        progress("playing", number, film.count, detail=f": {text}")
     window.wait(_PAUSE)
     return facts

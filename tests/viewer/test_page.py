@@ -19,7 +19,7 @@ import ltcl
 from ltcl.acquisition import FolderRig
 from ltcl.images import to_srgb
 from ltcl.images.pictures import to_linear
-from ltcl.viewer import serve
+from ltcl.viewer import serve, server
 from ltcl.viewer.scan import Scan
 from ltcl.viewer.window import Window
 
@@ -556,6 +556,18 @@ def test_server_is_killed_and_started_again(
         (tmp_path / f"viewer-{port}").unlink()
         with ltcl.view(T, open_browser=False, port=port):
             page.get_by_text("another address").wait_for()
+
+
+def test_a_page_too_many_is_told_so_and_comes_in_later(
+    page: Page, viewer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "PAGES", 1)
+    other = page.context.new_page()
+    other.goto(viewer.url)
+    other.get_by_text("1 pages are open here").wait_for()
+    page.goto("about:blank")
+    other.wait_for_selector("body[data-state=ready]")
+    assert other.locator("#banner").is_hidden()
 
 
 def test_an_acquisition_as_it_grows(page: Page, tmp_path: Path) -> None:

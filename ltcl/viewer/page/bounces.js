@@ -31,7 +31,7 @@ export function bounces({ $, ask, press, hello }) {
   }
 
   // Of the rest.
-  const nothing = ({ data, h, w, c, dtype }) => ({ data: data.slice().fill(0), h, w, c, dtype, scale: 1 });
+  const nothing = ({ data, h, w, c }) => ({ data: data.slice().fill(0), h, w, c });
 
   function row(picture, k, share) {
     const last = mix.weights.length - 1;
