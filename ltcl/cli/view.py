@@ -57,8 +57,8 @@ def view(
     coverage, time left and warnings; and its transport as soon as that is finished.
     """
     from ltcl import images
-    from ltcl.viewer import serve
     from ltcl.viewer.answers import Scene
+    from ltcl.viewer.server import Viewer
 
     if (transport / "acquisition.toml").exists():
         from ltcl.viewer.scan import Scan
@@ -70,7 +70,7 @@ def view(
         T = options.load(context, transport)
         pictures = {each.name: images.read(each) for each in picture or []}
         scene = Scene(T, transport.name, pictures, _setup(transport))
-    with serve(scene, **_address(context)) as viewer:
+    with Viewer(scene, **_address(context)) as viewer:
         typer.echo(f"{viewer.url} shows {transport}; Ctrl-C ends it", err=True)
         context.progress(f"showing {transport}")
         with contextlib.suppress(KeyboardInterrupt):  # which is how it ends

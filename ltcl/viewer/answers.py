@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ltcl import __version__, checks, images, layout, report
+from ltcl import checks, images, layout, report
 from ltcl.compensation import compensate
 from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.first_bounce import ENTRIES
@@ -50,22 +50,19 @@ class Scene:
             entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
             self._shows_noise = T.is_square and (entries or T.measured_noise is not None)
         self._pictures: dict[int, tuple[str, np.ndarray, np.ndarray]] = {}  # for the camera, the projector
-        self._first = self._next = 1  # of those that are uploaded
+        self._given, self._count = len(pictures), 0
         for name, picture in pictures.items():
-            self._first = 1 + self.add(name, as_picture(name, picture))
+            self.add(name, as_picture(name, picture))
         self._compensation: tuple[Any, dict[str, Any]] | None = None
 
     def hello(self) -> dict[str, Any]:
         """What a page has to know; `grid` is None where there is no T."""
         facts: dict[str, Any] = {name: name in self.questions for name in ("scan", "next")}
         facts |= {"title": self.title, "grid": None}
-        if (T := self.T) is None:
-            return facts
-        facts |= {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
-        facts |= {"version": __version__, "device": T.device.name}
-        facts |= {"square": T.is_square, "compressed": T.is_compressed, "masked": int(T.masked.sum())}
-        facts |= {"noise": self._shows_noise, "measured": self.setup is not None}
-        return facts | {"pictures": [name for name, *_ in self._pictures.values()]}
+        if (T := self.T) is not None:
+            facts |= {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
+            facts |= {"device": T.device.name, "square": T.is_square, "compressed": T.is_compressed}
+        return facts
 
     def answer(self, do: str, asked: dict[str, Any], callback: Callback) -> Reply:
         """The answer to a question by name; `callback` is called between the steps of a solve."""
@@ -103,11 +100,10 @@ class Scene:
             self.pattern, self.white = light, 1.0
         return {}, {"picture": seen} | ({"pattern": light} if pattern is None else {})
 
-    def bounces(self, callback: Callback, of: Any = "pattern", picture: Any = None, count: Any = 4) -> Reply:
+    def bounces(self, callback: Callback, picture: Any = None, count: Any = 4) -> Reply:
         """Direct light and bounces of a picture, or of what the current pattern looks like."""
         checks.count("count", count, least=0, most=_BOUNCES)
-        is_pattern = checks.one_of("of", of, ("pattern", "picture")) == "pattern"
-        image = self.T @ self.pattern if is_pattern else self._picture(picture)[1]
+        image = self.T @ self.pattern if picture is None else self._picture(picture)[1]
         result = separate(self.T, image, count, callback=callback)
         numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
         light = {"direct": result.direct, **numbered, "rest": result.rest}
@@ -116,15 +112,12 @@ class Scene:
         if self._shows_noise:
             deviations = zip(["direct", *numbered], [result.std.direct, *result.std.bounces], strict=True)
             light |= {f"{name}_std": deviation for name, deviation in deviations}
-        return {"shares": shares, "warning": result.warning}, light
+        return {"shares": shares}, light
 
-    def compensate(
-        self, callback: Callback, picture: Any, gain: Any = None, bounds: Any = (0, 1), method: Any = "auto"
-    ) -> Reply:
+    def compensate(self, callback: Callback, picture: Any, gain: Any = 1.0, bounds: Any = (0, 1)) -> Reply:
         """The pattern under which the scene looks like a picture; the projector shows it from now on."""
         name, desired, shown = self._picture(picture)
-        gain = ("auto" if self.setup else 1.0) if gain is None else gain
-        asked, start = {"gain": gain, "bounds": bounds, "method": method}, time.perf_counter()
+        asked, start = {"gain": gain, "bounds": bounds}, time.perf_counter()
         ambient = None if self.setup is None else self.setup.ambient
         c = compensate(self.T, desired, background=ambient, callback=callback, **asked)
         facts = {key: getattr(c, key) for key in ("error", "gain", "clipped", "gap", "transport_error")}
@@ -134,9 +127,9 @@ class Scene:
         facts["products"] = sum(solve["products"] for solve in solves)
         facts["residuals"] = max((solve["residuals"] for solve in solves), key=len)
         self.pattern, self.white = c.pattern, max(float(bounds[1]), 0.0) or 1.0
-        versions = {"versions": report.versions(), "device": report.device(self.T.device)}
-        known = {"title": self.title, **versions, "picture": name, **asked}
-        self._compensation = c, known | facts | {"white": self.white, "solves": solves}
+        known = {"title": self.title, "versions": report.versions(), "device": report.device(self.T.device)}
+        known |= {"picture": name, **asked, **facts, "white": self.white, "solves": solves}
+        self._compensation = c, known
         plain = self.T @ shown  # the picture itself as a pattern, made as bright as the target
         plain *= np.float32(c.target.mean() / max(plain.mean(), np.finfo(np.float32).tiny))
         return facts, {name: getattr(c, name) for name in PICTURES} | {"uncompensated": plain}
@@ -153,11 +146,11 @@ class Scene:
         """Keep a picture, on the grids of camera and projector; its number."""
         grids = (self.T.camera_grid, self.T.grid)
         sizes = [picture if picture.shape[:2] == grid else images.resize(picture, grid) for grid in grids]
-        number, self._next = self._next, self._next + 1
-        self._pictures[number] = name, sizes[0], sizes[1]
-        if number >= self._first + UPLOADS:
-            del self._pictures[number - UPLOADS]
-        return number
+        self._count += 1
+        self._pictures[self._count] = name, sizes[0], sizes[1]
+        if self._count > self._given + UPLOADS:
+            del self._pictures[self._count - UPLOADS]
+        return self._count
 
     def upload(self, name: str, content: bytes | bytearray) -> dict[str, Any]:
         """Keep the picture of a file; InputError, before it is decoded, where that has too many pixels."""

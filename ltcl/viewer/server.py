@@ -25,17 +25,20 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import uvicorn
-from starlette.requests import HTTPConnection, Request
-from starlette.responses import JSONResponse, Response
-from starlette.websockets import WebSocket, WebSocketDisconnect
-from uvicorn.protocols.http.h11_impl import H11Protocol
-
 from ltcl import checks
 from ltcl.device import tuning
 from ltcl.errors import InputError, LtclError
 from ltcl.viewer import messages
 from ltcl.viewer.answers import LARGEST_FILE
+
+try:
+    import uvicorn
+    from starlette.requests import HTTPConnection, Request
+    from starlette.responses import JSONResponse, Response
+    from starlette.websockets import WebSocket, WebSocketDisconnect
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+except ImportError as error:
+    raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
 
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".json": "application/json"}
 TYPES |= {".svg": "image/svg+xml", ".png": "image/png", ".exr": "image/x-exr"}
@@ -159,7 +162,7 @@ def _token(port: int) -> str:
 class Viewer(contextlib.AbstractContextManager):
     """A viewer in threads of its own until `close`, or the end of a with block; `url` is its page."""
 
-    def __init__(self, scene: Any, host: str, port: int, open_browser: bool) -> None:
+    def __init__(self, scene: Any, host: str = "127.0.0.1", port: int = 0, open_browser: bool = True) -> None:
         try:
             if not host:  # which would be anywhere
                 raise OSError("it is empty")

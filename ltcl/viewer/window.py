@@ -22,8 +22,8 @@ import numpy as np
 from ltcl import images
 from ltcl.compensation import compensate
 from ltcl.images.frames import Frame, Source
-from ltcl.viewer import serve
 from ltcl.viewer.answers import Reply, Scene
+from ltcl.viewer.server import Viewer
 
 _POLL = 0.1  # seconds, in which Ctrl-C is heard
 _PAUSE = 1.0  # without a window for longer, a film waits
@@ -34,7 +34,7 @@ _SAMPLE = 8  # frames that decide on the gain
 class Window(Scene, contextlib.AbstractContextManager):
     """Windows of a browser, whichever are open, in the place of a `ltcl.acquisition.rigs.Display`.
 
-    `address` are arguments of `ltcl.viewer.serve`. Space, an arrow or page key there is a key pressed.
+    `address` are arguments of `Viewer`. Space, an arrow or page key there is a key pressed.
     """
 
     page = "projector.html"
@@ -44,7 +44,7 @@ class Window(Scene, contextlib.AbstractContextManager):
         super().__init__(None, title, {}, None)
         self._drawn = 0.0
         self._is_drawn, self._pressed = threading.Event(), threading.Event()
-        self._viewer = serve(self, **address)
+        self._viewer = Viewer(self, **address)
         self.url, self.close = self._viewer.url, self._viewer.close  # windows keep what they show
 
     def show(self, codes: np.ndarray) -> float:
