@@ -195,9 +195,10 @@ def host_memory() -> int:
 
 def fits_host(what: str, needed: int, most: int = 1 << 62) -> None:
     """Refuse an allocation of `needed` bytes beyond `most` or what the host has, before it is tried."""
-    if needed > (available := min(host_memory(), most)):
-        limit = f"{size(most)} are allowed" if available == most else f"the host has {size(available)} free"
-        raise MemoryLimitError(f"{what} needs {size(needed)}, but {limit}")
+    if needed > most:
+        raise MemoryLimitError(f"{what} needs {size(needed)}; it may take at most {size(most)}")
+    if needed > (available := host_memory()):
+        raise MemoryLimitError(f"{what} needs {size(needed)}, but the host has {size(available)} free")
 
 
 def shown(value: Any) -> str:

@@ -37,7 +37,7 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "compensation, separation, relighting, analysis": (1370, _TASKS),
     # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
     "noise": (1406, _NOISE),
-    "transport and the rest": (1428, ["ltcl/*.py"]),
+    "transport and the rest": (1429, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
 _TESTS = (
