@@ -193,8 +193,10 @@ def host_memory() -> int:
     return available
 
 
-def fits_host(what: str, needed: int) -> None:
-    """Refuse an allocation of `needed` bytes that the host does not have, before it is tried."""
+def fits_host(what: str, needed: int, most: int = 1 << 62) -> None:
+    """Refuse an allocation of `needed` bytes beyond `most` or what the host has, before it is tried."""
+    if needed > most:
+        raise MemoryLimitError(f"{what} needs {size(needed)}; it may take at most {size(most)}")
     if needed > (available := host_memory()):
         raise MemoryLimitError(f"{what} needs {size(needed)}, but the host has {size(available)} free")
 

@@ -303,8 +303,9 @@ class Transport:
         """Relight: the picture (float32) under `pattern`, frames and colours as in `ltcl.relight`."""
         columns, shape = layout.unpack("pattern", pattern, self.grid, self.channels)
         columns = [np.concatenate(columns)] if self.couples else columns
-        pictures = [T.matmat(x) for T, x in zip(self.operators, columns, strict=True)]
-        return shape.pack(pictures, self.camera_grid)
+        uploaded = [(T, T.device.upload(x)) for T, x in zip(self.operators, columns, strict=True)]
+        pictures = [T.apply(x) for T, x in uploaded]  # all are queued before the first is waited for
+        return shape.pack([picture.get() for picture in pictures], self.camera_grid)
 
     def _require_first_bounce(self) -> np.ndarray:
         if self._F is None:

@@ -37,7 +37,7 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "compensation, separation, relighting, analysis": (1370, _TASKS),
     # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
     "noise": (1406, _NOISE),
-    "transport and the rest": (1427, ["ltcl/*.py"]),
+    "transport and the rest": (1429, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
 _TESTS = (
@@ -75,7 +75,7 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     "past one machine": (856, [f"ltcl/{name}.py" for name in _PAST]),
     "tests past one machine": (1247, [f"tests/{name}.py" for name in _TESTS_PAST]),
     # 700 were asked for; its commands count with the command line.
-    "viewer, without its page": (1060, ["ltcl/viewer"]),
+    "viewer, without its page": (950, ["ltcl/viewer"]),
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),
     "tests of these": (
         9220,

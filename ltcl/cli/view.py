@@ -49,8 +49,8 @@ def view(
     coverage, time left and warnings; and its transport as soon as that is finished.
     """
     from ltcl import images
-    from ltcl.viewer import serve
     from ltcl.viewer.answers import Scene
+    from ltcl.viewer.server import Viewer
 
     if (transport / "acquisition.toml").exists():
         from ltcl.viewer.scan import Scan
@@ -59,12 +59,10 @@ def view(
             raise InputError(f"PICTURE is {picture[0]}, but {transport} is an acquisition; it takes none")
         scene: Scene = Scan(transport, open_device(context.options["device"]))
     else:
-        T, pictures = (
-            options.load(context, transport),
-            {each.name: images.read(each) for each in picture or []},
-        )
+        T = options.load(context, transport)
+        pictures = {each.name: images.read(each) for each in picture or []}
         scene = Scene(T, transport.name, pictures, options.setup(transport))
-    with serve(scene, **_address(context)) as viewer:
+    with Viewer(scene, **_address(context)) as viewer:
         typer.echo(f"{viewer.url} shows {transport}; Ctrl-C ends it", err=True)
         context.progress(f"showing {transport}")
         with contextlib.suppress(KeyboardInterrupt):  # which is how it ends
@@ -89,8 +87,7 @@ def play(
 
     source, T, setup = open_frames(film), options.load(context, transport), options.setup(transport)
     settings = options.solving(context, T, compensation.RTOL)
-    del settings["callback"]  # the progress is that of the film
-    settings["background"] = None if setup is None else setup.ambient
+    settings |= {"callback": None, "background": None if setup is None else setup.ambient}
     with Window(film.name, **_address(context)) as window:
         typer.echo(f"{window.url} plays {film}; Ctrl-C ends it", err=True)
         facts = {}
@@ -120,11 +117,14 @@ def show(
     from ltcl.viewer.window import Window
 
     def progress(shot: Any, done: int, total: int) -> None:
+        nonlocal count
         context.progress(f"photograph {shot.number}: {shot.seconds:g} s, {shot.save_as}", done, total)
+        count = done + 1
 
-    advance = "arrival" if arrival else "key" if every is None else every
+    advance, count = "arrival" if arrival else "key" if every is None else every, 0
     with Window(str(folder)) if browser else contextlib.nullcontext(display) as screen:
         if isinstance(screen, Window):
-            typer.echo(f"{screen.url} shows {folder}", err=True)
-        count = rigs.show(folder, display=screen, advance=advance, progress=progress)
+            typer.echo(f"{screen.url} shows {folder}; Ctrl-C ends it", err=True)
+        with contextlib.suppress(*[KeyboardInterrupt] * browser):
+            count = rigs.show(folder, display=screen, advance=advance, progress=progress)
     return Answer({"folder": folder, "shown": count}, [f"{count} pattern(s) were shown"])

@@ -43,13 +43,16 @@ _FIGURE = """<figure style="display:inline-block;margin:4px"><img src="data:imag
 style="width:128px;image-rendering:pixelated"><figcaption>{}: white is {:.2g}</figcaption></figure>"""
 
 
-def read(path: str | os.PathLike[str], *, encoding: Encoding = "auto", upright: bool = True) -> np.ndarray:
+def read(
+    path: str | os.PathLike[str], *, encoding: Encoding = "auto", upright: bool = True, memory: int = 1 << 62
+) -> np.ndarray:
     """Read a picture as linear light: float32, (h, w) or (h, w, 3) RGB, white of an integer format is 1.
 
     `path` is a .png, .jpg, .jpeg, .bmp, .tif, .tiff (8, 16 or 32 bits) or .exr file, opaque everywhere.
     `encoding` is what it holds, "srgb" or "linear"; "auto" takes integers as sRGB and floats as linear. The
     orientation in the header (EXIF, TIFF) is applied, unless `upright` is False, as for a photograph.
-    FileError for no picture, a damaged or transparent one, NaN; MemoryLimitError for one too large.
+    FileError for no picture, a damaged or transparent one, NaN; MemoryLimitError, before it is decoded, for
+    24 bytes a pixel beyond `memory` or what the host has.
 
     Examples
     --------
@@ -60,7 +63,7 @@ def read(path: str | os.PathLike[str], *, encoding: Encoding = "auto", upright: 
     array([[0.5, 0.5, 0.5]], dtype=float32)
     """
     checks.one_of("encoding", encoding, ENCODINGS)
-    codes, orientation = _stored(as_path(path))
+    codes, orientation = _stored(as_path(path), memory)
     return to_linear(np.ascontiguousarray(_turned(codes, orientation) if upright else codes), encoding)
 
 
@@ -221,18 +224,18 @@ def _bits(path: Path) -> tuple[int, ...]:
     return BITS[path.suffix.lower()]
 
 
-def _stored(path: Path) -> tuple[np.ndarray, int]:
+def _stored(path: Path, memory: int = 1 << 62) -> tuple[np.ndarray, int]:
     """Codes, (h, w) or (h, w, 3) RGB, on the pixels of the file, and their orientation, 1 for upright."""
     _bits(path)
     with decoding(input_file(path)):
         if path.suffix.lower() == ".exr":
-            return _exr(path), 1
+            return _exr(path, memory), 1
         checks.fits_host("the file", path.stat().st_size)
         data = path.read_bytes()
         if data.startswith((b"II", b"MM")):
-            return _tiff(data)
+            return _tiff(data, memory)
         picture = Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "BMP"))
-        checks.fits_host("the picture", _BYTES * picture.width * picture.height)
+        checks.fits_host("the picture", _BYTES * picture.width * picture.height, memory)
         if picture.format == "PNG":
             Image.open(io.BytesIO(data)).verify()  # checksums, which decoding does not look at
             if b"\0\0\0\0IEND\xaeB`\x82" not in data:  # libpng would write to stderr
@@ -260,9 +263,8 @@ def _pillow(picture: Image.Image) -> np.ndarray:
     modes = {"1": "L", "L": "L", "LA": "LA", "P": "RGBA", "RGB": "RGB", "RGBA": "RGBA"}
     if picture.mode not in modes:
         raise FileError(f"holds {picture.mode} pixels; it must be grey or RGB")
-    return _opaque(
-        np.array(picture.convert("RGBA" if picture.has_transparency_data else modes[picture.mode]))
-    )
+    mode = "RGBA" if picture.has_transparency_data else modes[picture.mode]
+    return _opaque(np.array(picture.convert(mode)))
 
 
 def _opencv(data: bytes) -> np.ndarray:
@@ -273,7 +275,7 @@ def _opencv(data: bytes) -> np.ndarray:
     return codes[..., ::-1] if codes.ndim == 3 else codes  # OpenCV keeps BGR
 
 
-def _tiff(data: bytes) -> tuple[np.ndarray, int]:
+def _tiff(data: bytes, memory: int) -> tuple[np.ndarray, int]:
     """Codes and orientation; as a picture, Pillow would refuse float RGB, and write on stderr."""
     file = io.BytesIO(data)
     directory = TiffImagePlugin.ImageFileDirectory_v2(file.read(16 if data[2:3] == b"+" else 8))
@@ -281,13 +283,13 @@ def _tiff(data: bytes) -> tuple[np.ndarray, int]:
     directory.load(file)
     if directory.next:
         raise FileError("holds several pages; it must hold one picture, so save each to a file")
-    checks.fits_host("the picture", _BYTES * int(directory[256]) * int(directory[257]))
+    checks.fits_host("the picture", _BYTES * int(directory[256]) * int(directory[257]), memory)
     orientation = directory.get(_ORIENTATION) or 1
     # OpenCV turns a TIFF upright whatever its flags: turned back.
     return _turned(_opencv(data), {6: 8, 8: 6}.get(orientation, orientation)), orientation
 
 
-def _exr(path: Path) -> np.ndarray:
+def _exr(path: Path, memory: int) -> np.ndarray:
     """(h, w) or (h, w, 3), float16 or float32, of an EXR of one part with R, G, B or a single channel."""
     head = OpenEXR.File(str(path), header_only=True)
     header = head.header()
@@ -297,7 +299,7 @@ def _exr(path: Path) -> np.ndarray:
     if not np.array_equal(window, display):
         raise FileError(f"has the data window {window.tolist()}; it must be the display window")
     w, h = (window[1] - window[0] + 1).tolist()
-    checks.fits_host("the picture", _BYTES * h * w)
+    checks.fits_host("the picture", _BYTES * h * w, memory)
     names = sorted((channel.name for channel in header["channels"]), key="RGBA".find)
     if len(names) != 1 and names not in ([*"RGB"], [*"RGBA"]):
         raise FileError(f"holds the channels {names}; they must be R, G, B, or one")

@@ -166,6 +166,8 @@ def read(path: str | os.PathLike[str], *, variable: str | None = None) -> Record
         raise FileError(f"{path}: variable is {variable!r}, but the matrix of this format has no name")
     if suffix != ".zarr":
         input_file(path)
+    elif path.is_dir() and not (path / "zarr.json").exists():
+        raise FileError(f"{path}: is a folder with neither zarr.json, of a store, nor acquisition.toml")
     with about(path, reading=True):
         return FORMATS[suffix][0](path, *([] if variable is None else [variable]))
 

@@ -6,20 +6,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from ltcl.errors import InputError
 from ltcl.transport import Transport, require
 
 if TYPE_CHECKING:
     from ltcl.viewer.server import Viewer
-
-
-def serve(scene: Any, host: str = "127.0.0.1", port: int = 0, open_browser: bool = True) -> Viewer:
-    """A viewer of a scene, and a page of it; errors as of `view`."""
-    try:
-        from ltcl.viewer.server import Viewer
-    except ImportError as error:
-        raise InputError(f"a viewer needs Starlette ({error}); pip install 'ltcl[view]'") from None
-    return Viewer(scene, host, port, open_browser)
 
 
 def view(
@@ -50,7 +40,8 @@ def view(
     True
     """
     from ltcl.viewer.answers import Scene
+    from ltcl.viewer.server import Viewer
 
     require(T, square=False)
     pictures = picture if isinstance(picture, Mapping) else {} if picture is None else {"picture": picture}
-    return serve(Scene(T, title or repr(T).strip("<>"), pictures, setup), host, port, open_browser)
+    return Viewer(Scene(T, title or repr(T).strip("<>"), pictures, setup), host, port, open_browser)

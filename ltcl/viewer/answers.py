@@ -11,22 +11,20 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import OpenEXR
-from PIL import Image
 
-from ltcl import __version__, checks, images, layout, report
+from ltcl import checks, images, layout, report
 from ltcl.compensation import compensate
-from ltcl.errors import FileError, InputError, InputTypeError, LtclError
+from ltcl.errors import InputError, InputTypeError, LtclError
 from ltcl.first_bounce import ENTRIES
-from ltcl.images.pictures import BITS, as_picture, decoding, from_linear, to_linear
+from ltcl.images.pictures import BITS, as_picture, from_linear, to_linear
 from ltcl.separation import separate
 
 Reply = tuple[dict[str, Any], dict[str, np.ndarray]]  # facts and pictures
 Callback = Callable[[int, float], None]  # of `ltcl.solve`
-QUICK = ("column", "row", "relight", "pictures", "projector")  # a product at most
 LONG = ("bounces", "compensate")  # solves, which call back
 PICTURES = ("pattern", "appearance", "target", "out_of_reach")  # of a compensation
-LARGEST_FILE, LARGEST_PICTURE, UPLOADS = 64 << 20, 64_000_000, 16  # bytes, pixels, how many are kept
+LARGEST_FILE, LARGEST_PICTURE = 64 << 20, 3 << 29  # bytes; decoded, 64 million pixels
+UPLOADS = 16  # that are kept
 _BOUNCES = 16
 _STEPS = 65535  # of light between black and white, of which each has a code: a table in place of powers
 _CODES = from_linear(np.linspace(0, 1, _STEPS + 1, dtype=np.float32), "srgb", 8, is_float=False)
@@ -41,7 +39,7 @@ class Scene:
     """
 
     page = "index.html"
-    questions: tuple[str, ...] = (*QUICK, *LONG)
+    questions: tuple[str, ...] = (*LONG, "column", "row", "relight", "pictures", "projector")
 
     def __init__(self, T: Any, title: str, pictures: Mapping[str, np.ndarray], setup: Any) -> None:
         self.T, self.title, self.setup = T, title, setup
@@ -52,22 +50,19 @@ class Scene:
             entries = all(isinstance(matrix, ENTRIES) for matrix in T.matrices)
             self._shows_noise = T.is_square and (entries or T.measured_noise is not None)
         self._pictures: dict[int, tuple[str, np.ndarray, np.ndarray]] = {}  # for the camera, the projector
-        self._first = self._next = 1  # of those that are uploaded
+        self._given, self._count = len(pictures), 0
         for name, picture in pictures.items():
-            self._first = 1 + self.add(name, as_picture(name, picture))
+            self.add(name, as_picture(name, picture))
         self._compensation: tuple[Any, dict[str, Any]] | None = None
 
     def hello(self) -> dict[str, Any]:
         """What a page has to know; `grid` is None where there is no T."""
         facts: dict[str, Any] = {name: name in self.questions for name in ("scan", "next")}
         facts |= {"title": self.title, "grid": None}
-        if (T := self.T) is None:
-            return facts
-        facts |= {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
-        facts |= {"version": __version__, "device": T.device.name}
-        facts |= {"square": T.is_square, "compressed": T.is_compressed, "masked": int(T.masked.sum())}
-        facts |= {"noise": self._shows_noise, "measured": self.setup is not None}
-        return facts | {"pictures": [name for name, *_ in self._pictures.values()]}
+        if (T := self.T) is not None:
+            facts |= {name: getattr(T, name) for name in ("grid", "camera_grid", "channels", "error")}
+            facts |= {"device": T.device.name, "square": T.is_square, "compressed": T.is_compressed}
+        return facts
 
     def answer(self, do: str, asked: dict[str, Any], callback: Callback) -> Reply:
         """The answer to a question by name; `callback` is called between the steps of a solve."""
@@ -78,38 +73,37 @@ class Scene:
             raise InputTypeError(f"{do}: {error}") from None
         return method(*bound.args, **bound.kwargs)
 
-    def column(self, pixel: Any, channel: Any = None) -> Reply:
+    def column(self, pixel: Any) -> Reply:
         """What one projector pixel lights."""
-        return {}, {"picture": self.T @ self._unit(pixel, channel, self.T.grid)}
+        return {}, {"picture": self.T @ _unit(pixel, self.T.grid)}
 
-    def row(self, pixel: Any, channel: Any = None) -> Reply:
+    def row(self, pixel: Any) -> Reply:
         """How much each projector pixel adds to one camera pixel."""
         T = self.T
-        unit = self._unit(pixel, channel, T.camera_grid)
+        unit = _unit(pixel, T.camera_grid)
         columns, shape = layout.unpack("pixel", unit, T.camera_grid, T.channels)
         columns = [np.concatenate(columns)] if T.couples else columns
         rows = [A.T.matmat(x) for A, x in zip(T.operators, columns, strict=True)]
         return {}, {"pattern": shape.pack(rows, T.grid)}
 
     def relight(self, pattern: Any = None, picture: Any = None) -> Reply:
-        """The picture under a pattern, linear light or sRGB codes, shown from now on; or the present."""
+        """The picture under a pattern, sRGB codes, or a picture, shown from now on; or the present."""
         if pattern is None:
             light = self.pattern if picture is None else self._picture(picture)[2]
         else:
-            pattern = checks.shape("pattern", checks.real("pattern", pattern), self.T.grid, (*self.T.grid, 3))
-            if self.T.channels == 1 and pattern.ndim == 3 and (pattern == pattern[..., :1]).all():
-                pattern = pattern[..., 0]  # a product in place of three
-            light = to_linear(pattern, "auto")
+            codes = checks.shape("pattern", checks.real("pattern", pattern), self.T.grid, (*self.T.grid, 3))
+            if self.T.channels == 1 and codes.ndim == 3 and (codes == codes[..., :1]).all():
+                codes = codes[..., 0]  # a product in place of three
+            light = to_linear(codes, "auto")
         seen = self.T @ light
         if light is not self.pattern:
             self.pattern, self.white = light, 1.0
         return {}, {"picture": seen} | ({"pattern": light} if pattern is None else {})
 
-    def bounces(self, callback: Callback, of: Any = "pattern", picture: Any = None, count: Any = 4) -> Reply:
+    def bounces(self, callback: Callback, picture: Any = None, count: Any = 4) -> Reply:
         """Direct light and bounces of a picture, or of what the current pattern looks like."""
         checks.count("count", count, least=0, most=_BOUNCES)
-        is_pattern = checks.one_of("of", of, ("pattern", "picture")) == "pattern"
-        image = self.T @ self.pattern if is_pattern else self._picture(picture)[1]
+        image = self.T @ self.pattern if picture is None else self._picture(picture)[1]
         result = separate(self.T, image, count, callback=callback)
         numbered = {f"bounce_{k}": bounce for k, bounce in enumerate(result.bounces, 1)}
         light = {"direct": result.direct, **numbered, "rest": result.rest}
@@ -118,15 +112,12 @@ class Scene:
         if self._shows_noise:
             deviations = zip(["direct", *numbered], [result.std.direct, *result.std.bounces], strict=True)
             light |= {f"{name}_std": deviation for name, deviation in deviations}
-        return {"shares": shares, "warning": result.warning}, light
+        return {"shares": shares}, light
 
-    def compensate(
-        self, callback: Callback, picture: Any, gain: Any = None, bounds: Any = (0, 1), method: Any = "auto"
-    ) -> Reply:
+    def compensate(self, callback: Callback, picture: Any, gain: Any = 1.0, bounds: Any = (0, 1)) -> Reply:
         """The pattern under which the scene looks like a picture; the projector shows it from now on."""
         name, desired, shown = self._picture(picture)
-        gain = ("auto" if self.setup else 1.0) if gain is None else gain
-        asked, start = {"gain": gain, "bounds": bounds, "method": method}, time.perf_counter()
+        asked, start = {"gain": gain, "bounds": bounds}, time.perf_counter()
         ambient = None if self.setup is None else self.setup.ambient
         c = compensate(self.T, desired, background=ambient, callback=callback, **asked)
         facts = {key: getattr(c, key) for key in ("error", "gain", "clipped", "gap", "transport_error")}
@@ -136,9 +127,9 @@ class Scene:
         facts["products"] = sum(solve["products"] for solve in solves)
         facts["residuals"] = max((solve["residuals"] for solve in solves), key=len)
         self.pattern, self.white = c.pattern, max(float(bounds[1]), 0.0) or 1.0
-        versions = {"versions": report.versions(), "device": report.device(self.T.device)}
-        known = {"title": self.title, **versions, "picture": name, **asked}
-        self._compensation = c, known | facts | {"white": self.white, "solves": solves}
+        known = {"title": self.title, "versions": report.versions(), "device": report.device(self.T.device)}
+        known |= {"picture": name, **asked, **facts, "white": self.white, "solves": solves}
+        self._compensation = c, known
         plain = self.T @ shown  # the picture itself as a pattern, made as bright as the target
         plain *= np.float32(c.target.mean() / max(plain.mean(), np.finfo(np.float32).tiny))
         return facts, {name: getattr(c, name) for name in PICTURES} | {"uncompensated": plain}
@@ -148,20 +139,18 @@ class Scene:
         return {"pictures": [{"picture": k, "name": name} for k, (name, *_) in self._pictures.items()]}, {}
 
     def projector(self) -> Reply:
-        """A window that is to show the pattern, or a page to get news of a scan; the server sends them."""
+        """A window that is to show the pattern, or has shown it; the server sends the next one."""
         return {}, {}
-
-    scan = projector
 
     def add(self, name: str, picture: np.ndarray) -> int:
         """Keep a picture, on the grids of camera and projector; its number."""
         grids = (self.T.camera_grid, self.T.grid)
         sizes = [picture if picture.shape[:2] == grid else images.resize(picture, grid) for grid in grids]
-        number, self._next = self._next, self._next + 1
-        self._pictures[number] = name, sizes[0], sizes[1]
-        if number >= self._first + UPLOADS:
-            del self._pictures[number - UPLOADS]
-        return number
+        self._count += 1
+        self._pictures[self._count] = name, sizes[0], sizes[1]
+        if self._count > self._given + UPLOADS:
+            del self._pictures[self._count - UPLOADS]
+        return self._count
 
     def upload(self, name: str, content: bytes | bytearray) -> dict[str, Any]:
         """Keep the picture of a file; InputError, before it is decoded, where that has too many pixels."""
@@ -172,8 +161,7 @@ class Scene:
             path = Path(folder) / f"picture{suffix}"
             path.write_bytes(content)
             try:
-                _check_pixels(path)
-                picture = images.read(path)
+                picture = images.read(path, memory=LARGEST_PICTURE)
             except LtclError as error:
                 raise InputError(str(error).removeprefix(f"{path}: ")) from None
         shape = [*picture.shape, 1][:3]
@@ -208,25 +196,14 @@ class Scene:
     def _picture(self, number: Any) -> tuple[str, np.ndarray, np.ndarray]:
         return self._pictures[checks.one_of("picture", number, self._pictures)]
 
-    def _unit(self, pixel: Any, channel: Any, grid: tuple[int, int]) -> np.ndarray:
-        """Light, or sight, of one pixel in one channel or in all."""
-        if not isinstance(pixel, list) or len(pixel) != 2:
-            raise InputError(f"pixel is {checks.shown(pixel)}; it must be [row, column]")
-        unit = np.zeros((*grid, self.T.channels), np.float32)
-        place = [*pixel, *([] if channel is None else [channel])]
-        for n, size in zip(place, unit.shape, strict=False):
-            checks.count("pixel or channel", n, least=0, most=size - 1)
-        unit[tuple(place)] = 1.0
-        return unit if self.T.channels == 3 else unit[..., 0]
 
-
-def _check_pixels(path: Path) -> None:
-    """Refuse a picture by the size that its header has."""
-    with decoding(path):
-        if path.suffix == ".exr":
-            low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
-            w, h = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
-        else:
-            w, h = Image.open(path, formats=("PNG", "JPEG", "BMP", "TIFF")).size
-        if w * h > LARGEST_PICTURE:
-            raise FileError(f"has {h} x {w} pixels; it must have at most {LARGEST_PICTURE}")
+def _unit(pixel: Any, grid: tuple[int, int]) -> np.ndarray:
+    """Light, or sight, of one pixel."""
+    if not isinstance(pixel, list) or len(pixel) != 2:
+        raise InputError(f"pixel is {checks.shown(pixel)}; it must be [row, column]")
+    place = tuple(
+        checks.count("pixel", n, least=0, most=size - 1) for n, size in zip(pixel, grid, strict=True)
+    )
+    unit = np.zeros(grid, np.float32)
+    unit[place] = 1.0
+    return unit

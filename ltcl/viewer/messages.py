@@ -4,10 +4,10 @@
 A text frame is a JSON header. A binary frame is the length of its header (uint32, little-endian), the header,
 padded with spaces so that arrays begin at multiples of 4, then the arrays, each padded to a multiple of 4:
 
-    {"id": 7, "do": "relight", "arrays": [{"name": "pattern", "shape": [h, w, c], "dtype": "f2", "scale": s}]}
+    {"id": 7, "do": "relight", "arrays": [{"name": "pattern", "shape": [h, w, c], "dtype": "u1"}]}
 
-Values are scale * numbers. Half floats are scaled by the largest value, so that none overflows. A fourth
-channel, alpha of a canvas, is left out.
+Light goes to the page as float32 ("f4"), codes either way as uint8 ("u1"). A fourth channel, alpha of a
+canvas, is left out.
 """
 
 from __future__ import annotations
@@ -21,30 +21,21 @@ import numpy as np
 from ltcl import checks, report
 from ltcl.errors import InputError, LtclError
 
-DTYPES = {"f2": "<f2", "f4": "<f4", "u1": "u1"}
 LARGEST_HEADER = 4096  # bytes of a question
-_ROUNDED = np.float32(0.75)
-_DARK = 1e-30  # what is not brighter is 0
 
 
 def largest(pixels: int) -> int:
     """Bytes of the largest question about a grid of so many pixels."""
-    return 8 * 3 * pixels + LARGEST_HEADER
+    return 4 * pixels + LARGEST_HEADER
 
 
 def encode(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None) -> str | bytes:
-    """A message of pictures (h, w[, 3]): float ones as half floats, uint8 as they are."""
+    """A message of pictures (h, w[, 3]): uint8 ones as they are, others as float32."""
     entries, parts = [], []
     for name, array in (arrays or {}).items():
-        values, scale, dtype = array.reshape(*array.shape[:2], -1), 1.0, "u1"
-        if array.dtype != np.uint8:
-            most, dtype = max(float(values.max()), -float(values.min()), _DARK), "f2"
-            scale = checks.number(f"the largest value of {name}", most)
-            values = values.astype(np.float32, copy=False) * np.float32(1.0 / scale)
-            values += _ROUNDED  # to what half floats near 0 hold: NumPy is slow where one underflows
-            values -= _ROUNDED
-            values = values.astype(DTYPES[dtype])
-        entries.append({"name": name, "shape": values.shape, "dtype": dtype, "scale": scale})
+        dtype = "u1" if array.dtype == np.uint8 else "f4"
+        values = checks.finite(name, array.reshape(*array.shape[:2], -1).astype(dtype, copy=False))
+        entries.append({"name": name, "shape": values.shape, "dtype": dtype})
         parts += [values.tobytes(), bytes(-values.nbytes % 4)]
     text = json.dumps(report.plain({**header, "arrays": entries} if entries else header), allow_nan=False)
     if not entries:
@@ -54,24 +45,21 @@ def encode(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = 
 
 
 def decode(message: str | bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays, float32 or uint8, of a question; InputError where it is none."""
+    """Header and arrays of codes, (h, w[, c]) uint8, of a question; InputError where it is none."""
     data = b"" if isinstance(message, str) else message
     start = 4 + int.from_bytes(data[:4], "little") if data else 0
-    text = message.encode("utf-8", "replace") if isinstance(message, str) else data[4:start]
+    text = message if isinstance(message, str) else data[4:start]
     checks.count("length of the header", len(text), most=LARGEST_HEADER)
     try:
         header, arrays = json.loads(text), {}
         checks.one_of("type of do", type(header["do"]), [str])
         checks.number("id", header["id"])
         for entry in header.pop("arrays", []):
+            checks.one_of("dtype", entry["dtype"], ["u1"])
             h, w, c = (checks.count("shape", n, most=1 << 24) for n in entry["shape"])
-            values = np.frombuffer(data, DTYPES[entry["dtype"]], h * w * c, start).reshape(h, w, c)
-            start += values.nbytes + -values.nbytes % 4
-            if values.dtype != np.uint8:
-                scale = np.float32(checks.number("scale", entry["scale"], most=1e38))
-                with np.errstate(over="ignore"):
-                    values = checks.finite("arrays", values.astype(np.float32) * scale)
-            arrays[str(entry["name"])] = values[..., 0] if c == 1 else values[..., : 3 if c == 4 else c]
+            codes = np.frombuffer(data, np.uint8, h * w * c, start).reshape(h, w, c)
+            arrays[str(entry["name"])] = codes[..., 0] if c == 1 else codes[..., : 3 if c == 4 else c]
+            start += codes.nbytes + -codes.nbytes % 4
     except LtclError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:

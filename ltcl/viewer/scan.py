@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`Scan`: the folder of an acquisition as it grows, and its transport once that is finished.
 
-What is new is read once a second, the newest first, for a while only. A rig that a person works by hand has
-all photographs in the folder. Of others those of the calibration are there until it has ended; then come
+What is new is read when a page asks, the newest first, for a while only. A rig that a person works by hand
+has all photographs in the folder. Of others those of the calibration are there until it has ended; then come
 batches of the scan, columns of T or pictures of an adaptive scan, in units of light.
 """
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ltcl import images
+from ltcl import checks, images
 from ltcl.acquisition import Calibration, Project, Setup
 from ltcl.acquisition.agreement import Sensor, find_deviation, sample
 from ltcl.acquisition.calibrate import photographs
@@ -27,7 +26,7 @@ from ltcl.acquisition.rigs.folder import Shot, read_photograph
 from ltcl.acquisition.session import calibration_folder
 from ltcl.errors import LtclError
 from ltcl.store import ArrayLog, BlockStore, load
-from ltcl.viewer.answers import Scene
+from ltcl.viewer.answers import Reply, Scene
 
 _BUDGET, _PERIOD = 0.5, 0.9  # seconds of reading in a look, and from one to the next
 _SIDE, _BINS, _SHOWN = 160, 32, 24  # pixels of a preview; of a histogram; photographs that a page has
@@ -45,14 +44,14 @@ class _File(NamedTuple):
 
 
 class Scan(Scene):
-    """A folder with an acquisition.toml; `T` is None, and only `news` are to be had, until it is finished."""
+    """A folder with an acquisition.toml; `T` is None, and only `scan` may be asked, until it is finished."""
 
     questions = ("scan", "pictures")
 
     def __init__(self, folder: Path, device: Any) -> None:
         super().__init__(None, folder.name, {}, None)
         self.project, self._device = Project.open(folder), device
-        self._lock, self._looked = threading.Lock(), 0.0
+        self._looked = 0.0
         self._read: dict[Path, float] = {}  # when files that were read had been written
         self._shown: dict[str, tuple[int, dict[str, Any], np.ndarray]] = {}  # photographs in order
         self._count = 0  # of those that were ever shown
@@ -70,18 +69,19 @@ class Scan(Scene):
             self._total = photographs(facts["grid"], facts["channels"], settings.frames, **ways)
             self.pixels = int(np.prod(facts["grid"]))
 
-    def news(self, seen: int) -> tuple[dict[str, Any], dict[str, np.ndarray], int]:
-        """Facts, and photographs of which a page has `seen` so many; how many it has then."""
-        with self._lock:
-            if time.monotonic() > self._looked + _PERIOD:
-                try:
-                    self._look()
-                except (LtclError, OSError) as error:  # files that change just now
-                    self._warnings["folder"] = " ".join(str(error).split())
-                self._looked = time.monotonic()
-            new = [(f, preview) for number, f, preview in self._shown.values() if number > seen]
-            facts = self._facts | {"warnings": [*self._warnings.values()], "photographs": [f for f, _ in new]}
-            return facts, {str(k): preview for k, (_, preview) in enumerate(new)}, self._count
+    def scan(self, seen: Any) -> Reply:
+        """How far it is and what is wrong, and photographs of which a page has `seen` so many."""
+        checks.count("seen", seen, least=0)
+        if time.monotonic() > self._looked + _PERIOD:
+            try:
+                self._look()
+            except (LtclError, OSError) as error:  # files that change just now
+                self._warnings["folder"] = " ".join(str(error).split())
+            self._looked = time.monotonic()
+        new = [(f, preview) for number, f, preview in self._shown.values() if number > seen]
+        facts = self._facts | {"warnings": [*self._warnings.values()], "photographs": [f for f, _ in new]}
+        facts |= {"seen": self._count, "finished": self.T is not None}
+        return facts, {str(k): preview for k, (_, preview) in enumerate(new)}
 
     def _look(self) -> None:
         self._warnings.pop("folder", None)

@@ -13,7 +13,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from statistics import median
 from typing import Any
@@ -23,8 +22,8 @@ import numpy as np
 from ltcl import images
 from ltcl.compensation import compensate
 from ltcl.images.frames import Frame, Source
-from ltcl.viewer import serve
 from ltcl.viewer.answers import Reply, Scene
+from ltcl.viewer.server import Viewer
 
 _POLL = 0.1  # seconds, in which Ctrl-C is heard
 _PAUSE = 1.0  # without a window for longer, a film waits
@@ -35,7 +34,7 @@ _SAMPLE = 8  # frames that decide on the gain
 class Window(Scene, contextlib.AbstractContextManager):
     """Windows of a browser, whichever are open, in the place of a `ltcl.acquisition.rigs.Display`.
 
-    `address` are arguments of `ltcl.viewer.serve`. Space, an arrow or page key there is a key pressed.
+    `address` are arguments of `Viewer`. Space, an arrow or page key there is a key pressed.
     """
 
     page = "projector.html"
@@ -45,7 +44,7 @@ class Window(Scene, contextlib.AbstractContextManager):
         super().__init__(None, title, {}, None)
         self._drawn = 0.0
         self._is_drawn, self._pressed = threading.Event(), threading.Event()
-        self._viewer = serve(self, **address)
+        self._viewer = Viewer(self, **address)
         self.url, self.close = self._viewer.url, self._viewer.close  # windows keep what they show
 
     def show(self, codes: np.ndarray) -> float:
@@ -119,42 +118,32 @@ def play(
         target = target if background is None else target - np.atleast_3d(background)
         return inverse.pattern(target if target.shape[2] == 3 else target[..., 0])
 
-    now, period, title, frames = time.monotonic, 1.0 / (film.fps or 25.0), window.title, iter(film)
+    now, period, title, late = time.monotonic, 1.0 / (film.fps or 25.0), window.title, list[float]()
     computing, drawing = deque([0.0], _RECENT), deque([0.0], _RECENT)  # seconds of frames
-
-    def prepare(start: float, earliest: float) -> tuple[int, np.ndarray] | None:
-        """Number and codes of the newest frame that is due when it can be shown, at `earliest` or later."""
-        for frame in frames:
-            begun = now()
-            if start + (frame.number + 1) * period >= max(begun + median(computing), earliest):
-                codes = scene.codes(pattern(picture(frame)), 1.0)
-                computing.append(now() - begun)
-                return frame.number, codes
-        return None
-
-    start, due, sent = math.inf, 0.0, 0.0  # when frame 0 was due; the one on show was due, and sent
-    late, facts, shown = list[float](), dict[str, Any](), 0
-    with ThreadPoolExecutor(1) as thread:
-        ahead = thread.submit(prepare, start, 0.0)
-        while (prepared := ahead.result()) is not None:
-            number, codes = prepared
-            wait = start + number * period - now() if shown else 0.0
-            drawn = max(now() + wait, sent + median(drawing)) + median(drawing)
-            ahead = thread.submit(prepare, start, drawn)
-            time.sleep(max(wait, 0.0))
-            begun = now()
-            drawn = window.show(codes)
-            if shown and now() - begun < _PAUSE:
-                late.append(drawn - due)
-                drawing.append(drawn - sent)
-            else:  # the film waited for a window
-                start = now() - number * period
-            sent = now()
-            due, shown = start + number * period, shown + 1
-            facts = {"shown": shown, "dropped": number - shown, "gain": gain}
-            facts |= {"frames_per_second": shown / (now() - start), "latency": median(late or [0.0])}
-            text = "{frames_per_second:.1f} frames/s, {dropped} dropped, latency {latency:.3f} s"
-            window.title = f"{title}: {(text := text.format(**facts))}"
-            progress("playing", number, film.count, detail=f": {text}")
+    start, sent, number, shown = 0.0, 0.0, 0, 0  # when frame 0 was due, the last one sent; its number
+    facts = dict[str, Any]()
+    for frame in film:
+        begun = now()
+        earliest = max(begun + median(computing), sent + median(drawing))
+        if shown and start + (frame.number + 1) * period < earliest:
+            continue
+        codes = scene.codes(pattern(picture(frame)), 1.0)
+        ready = now()
+        if shown:  # kernels were built for the first one
+            computing.append(ready - begun)
+            time.sleep(max(start + frame.number * period - ready, 0.0))
+        asked = now()
+        drawn = window.show(codes)
+        if shown and now() - asked < _PAUSE:
+            late.append(drawn - start - number * period)
+            drawing.append(drawn - sent)
+        else:  # the film waited for a window
+            start = now() - frame.number * period
+        sent, number, shown = now(), frame.number, shown + 1
+        facts = {"shown": shown, "dropped": number - shown, "gain": gain}
+        facts |= {"frames_per_second": shown / (sent - start), "latency": median(late or [0.0])}
+        text = "{frames_per_second:.1f} frames/s, {dropped} dropped, latency {latency:.3f} s"
+        window.title = f"{title}: {(text := text.format(**facts))}"
+        progress("playing", number, film.count, detail=f": {text}")
     window.wait(_PAUSE)
     return facts

@@ -10,21 +10,20 @@ from typing import Any
 import numpy as np
 from websockets.sync.client import ClientConnection, connect
 
-TYPES = {"f2": "<f2", "f4": "<f4", "u1": "u1"}
+TYPES = {"f4": "<f4", "u1": "u1"}
 
 
-def question(header: dict[str, Any], arrays: dict[str, tuple[np.ndarray, float]]) -> str | bytes:
-    """A frame; arrays (h, w, c) with their scales, numbers as they are."""
+def question(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> str | bytes:
+    """A frame; arrays (h, w, c), numbers as they are."""
     if not arrays:
         return json.dumps(header)
-    kinds = {name: f"{array.dtype.kind}{array.dtype.itemsize}" for name, (array, _) in arrays.items()}
+    kinds = {name: f"{array.dtype.kind}{array.dtype.itemsize}" for name, array in arrays.items()}
     entries = [
-        {"name": name, "shape": list(array.shape), "dtype": kinds[name], "scale": scale}
-        for name, (array, scale) in arrays.items()
+        {"name": name, "shape": list(array.shape), "dtype": kinds[name]} for name, array in arrays.items()
     ]
     text = json.dumps({**header, "arrays": entries}).encode()
     text += b" " * (-len(text) % 4)
-    bodies = [array.tobytes() for array, _ in arrays.values()]
+    bodies = [array.tobytes() for array in arrays.values()]
     padded = b"".join(body + bytes(-len(body) % 4) for body in bodies)
     return len(text).to_bytes(4, "little") + text + padded
 
@@ -38,7 +37,7 @@ def answer(message: str | bytes) -> dict[str, Any]:
     for entry in header.pop("arrays"):
         assert start % 4 == 0
         numbers = np.frombuffer(message, TYPES[entry["dtype"]], int(np.prod(entry["shape"])), start)
-        header[entry["name"]] = numbers.reshape(entry["shape"]) * float(entry["scale"])
+        header[entry["name"]] = numbers.reshape(entry["shape"]).astype(np.float64)
         start += numbers.nbytes + -numbers.nbytes % 4
     assert start == len(message)
     return header
@@ -63,7 +62,7 @@ class Page:
     def __exit__(self, *_: object) -> None:
         self._opened.close()
 
-    def send(self, do: str, arrays: dict[str, tuple[np.ndarray, float]] | None = None, **fields: Any) -> int:
+    def send(self, do: str, arrays: dict[str, np.ndarray] | None = None, **fields: Any) -> int:
         """Ask without waiting; the number of the question."""
         self.asked += 1
         self.socket.send(question({"id": self.asked, "do": do, **fields}, arrays or {}))

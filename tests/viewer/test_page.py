@@ -19,8 +19,9 @@ import ltcl
 from ltcl.acquisition import FolderRig
 from ltcl.images import to_srgb
 from ltcl.images.pictures import to_linear
-from ltcl.viewer import serve
+from ltcl.viewer import server
 from ltcl.viewer.scan import Scan
+from ltcl.viewer.server import Viewer
 from ltcl.viewer.window import Window
 
 pytest.importorskip("playwright", reason='playwright is not installed: pip install "ltcl[test]"')
@@ -151,7 +152,7 @@ def test_probe_by_pointer_shows_columns_and_rows(page: Page, T: ltcl.Transport) 
     shows(page, "probe-camera", T @ unit(T.grid, 2, 3))
     value = float((T @ unit(T.grid, 2, 3))[1, 1, 0])
     shown = page.locator("#probe-camera-values").inner_text()
-    assert float(shown.split("R ")[1].split()[0]) == pytest.approx(value, rel=2e-2)
+    assert float(shown.split("R\u00a0")[1].split()[0]) == pytest.approx(value, rel=2e-2)
     page.mouse.down()  # the other way
     page.mouse.up()
     shows(page, "probe-projector", row_of(T, 1, 1))
@@ -558,6 +559,18 @@ def test_server_is_killed_and_started_again(
             page.get_by_text("another address").wait_for()
 
 
+def test_a_page_too_many_is_told_so_and_comes_in_later(
+    page: Page, viewer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "PAGES", 1)
+    other = page.context.new_page()
+    other.goto(viewer.url)
+    other.get_by_text("1 pages are open here").wait_for()
+    page.goto("about:blank")
+    other.wait_for_selector("body[data-state=ready]")
+    assert other.locator("#banner").is_hidden()
+
+
 def test_an_acquisition_as_it_grows(page: Page, tmp_path: Path) -> None:
     text = '[rig]\nkind = "folder"\nprojector_grid = [4, 6]\n[acquire]\ngeometry = "aligned"\n'
     (tmp_path / "acquisition.toml").write_text(text)
@@ -565,7 +578,7 @@ def test_an_acquisition_as_it_grows(page: Page, tmp_path: Path) -> None:
     rig.prepare([(np.ones((4, 6)), 0.5), (np.zeros((4, 6)), 0.5)])
     first, second = (tmp_path / f"{shot.save_as}.png" for shot in rig.shots)
     ltcl.images.write(first, codes / 255, encoding="linear", bits=8)
-    with serve(Scan(tmp_path, None), open_browser=False) as viewer:
+    with Viewer(Scan(tmp_path, None), open_browser=False) as viewer:
         visit(page, viewer, "scan")
         page.get_by_text("photograph 1, 0.500 s").first.wait_for()
         assert page.locator("#tabs button:visible").all_inner_texts() == ["Scan"]

@@ -29,9 +29,9 @@ from ltcl.acquisition.agreement import ROUGH
 from ltcl.acquisition.radiometry import Response
 from ltcl.device import tuning
 from ltcl.images.frames import open_frames, write_video
-from ltcl.viewer import serve
 from ltcl.viewer.answers import Scene
 from ltcl.viewer.scan import Scan
+from ltcl.viewer.server import Viewer
 from ltcl.viewer.window import Window, play
 from tests import json_schema
 from tests.viewer.page import Page
@@ -49,13 +49,14 @@ def project(folder: Path, text: str) -> Project:
     return Project.open(folder)
 
 
-def news(page: Page, **wanted: Any) -> dict[str, Any]:
-    """What the page is told next that has these facts."""
+def news(page: Page, seen: int = 0, count: int = 0, **wanted: Any) -> dict[str, Any]:
+    """What the page is told that has these facts, `count` photographs and warnings; asks again and again."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
-        found = page.next()
-        if found["do"] == "scan" and found.items() >= wanted.items():
+        found = page.ask("scan", seen=seen)
+        if found.items() >= wanted.items() and len(found["photographs"] + found["warnings"]) >= count:
             return found
+        time.sleep(0.1)
     raise AssertionError(f"nothing with {wanted}")
 
 
@@ -67,11 +68,10 @@ def test_photographs_come_with_histograms_and_warnings(tmp_path: Path) -> None:
     files = [tmp_path / f"{shot.save_as}.png" for shot in rig.shots]
     images.write(files[0], codes / 255, encoding="linear", bits=8)
     files[1].write_bytes(b"no picture")
-    with serve(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
+    with Viewer(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
         facts = {"do": "hello", "title": tmp_path.name, "grid": None, "scan": True, "next": False}
         assert page.hello == facts
-        page.send("scan")
-        first = news(page, state="new", done=2)
+        first = news(page, 0, 2, state="new", done=2)
         np.testing.assert_array_equal(first["0"][..., 0], codes)
         shares, _ = np.histogram(codes / np.float32(255), 32, (0, 1))
         (photograph,) = first["photographs"]
@@ -82,13 +82,12 @@ def test_photographs_come_with_histograms_and_warnings(tmp_path: Path) -> None:
         time.sleep(0.01)
         images.write(files[1], codes / 255, encoding="linear", bits=8)  # taken again
         images.write(files[2], np.zeros((20, 31)), encoding="linear", bits=8)  # of another size
-        second = news(page, done=3)
+        second = news(page, first["seen"], 2, done=3)
         assert {each["name"] for each in second["photographs"]} == {"photograph 2"}
         (warning,) = second["warnings"]
         assert "photograph 3" in warning
         with Page(viewer.url) as late:
-            late.send("scan")
-            names = {each["name"] for each in news(late, done=3)["photographs"]}
+            names = {each["name"] for each in news(late, 0, 3, done=3)["photographs"]}
             assert names == {"photograph 1", "photograph 2"}
             assert "do" in late.ask("pictures")
             late.send("column", pixel=[0, 0])
@@ -110,7 +109,7 @@ def test_photographs_that_deviate_are_named(tmp_path: Path) -> None:
     known: Any = {"exposures": (0.1, 0.4), "response": Response.identity(), "noise": ROUGH, "offset": 0.0}
     known |= {"resampling": SimpleNamespace(coverage=np.ones(6)), "white": valid}
     scan._calibration = cast(Any, SimpleNamespace(**known))
-    warnings = scan.news(0)[0]["warnings"]
+    warnings = scan.scan(0)[0]["warnings"]
     for first, second in ((3, 4), (5, 6)):
         assert sum(f"photograph {first} or photograph {second} " in text for text in warnings) == 1
     assert sum(text.startswith("photograph 5: ") and "saturated" in text for text in warnings) == 1
@@ -121,24 +120,21 @@ def test_a_scan_is_watched_until_its_transport_is_shown(tmp_path: Path) -> None:
     truth = ltcl.scenes.dihedral(4, albedo=0.6).transport()
     ltcl.save(tmp_path / "T.npz", truth)
     scan = project(tmp_path, VIRTUAL)
-    serving = serve(Scan(tmp_path, None), open_browser=False)
-    with serving as viewer, Page(viewer.url) as page, Page(viewer.url) as other:
-        page.send("scan")
-        assert news(page, state="new")["done"] == 0
+    serving = Viewer(Scan(tmp_path, None), open_browser=False)
+    with serving as viewer, Page(viewer.url) as page:
+        assert news(page, state="new", finished=False)["done"] == 0
         with scan.rig() as rig:
             T = ltcl.acquire(rig, store=scan.store, **scan.settings)
-        found = news(page, state="final", left=None)
+        found = news(page, state="final", left=None, finished=True)
         assert found["done"] == found["total"] >= 32
         assert (found["coverage"], found["saturated"]) == (1.0, 0.0)
-        assert page.next().items() >= {"do": "hello", "grid": [4, 8], "scan": True, "measured": True}.items()
+        with Page(viewer.url) as again:
+            assert again.hello.items() >= {"grid": [4, 8], "scan": True}.items()
         unit = np.zeros(T.grid, np.float32)
         unit[1, 2] = 1.0
         column = page.ask("column", pixel=[1, 2])["picture"][..., 0]
         np.testing.assert_allclose(column, T @ unit, atol=2e-3 * column.max())
-        other.send("scan")  # which came before the end, and asks after it
-        assert news(other, state="final")
-        assert other.next().items() >= {"do": "hello", "grid": [4, 8]}.items()
-    with serve(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
+    with Viewer(Scan(tmp_path, None), open_browser=False) as viewer, Page(viewer.url) as page:
         assert (page.hello["grid"], page.hello["scan"]) == ([4, 8], True)
 
 
@@ -154,7 +150,7 @@ def test_a_page_that_comes_as_a_scan_ends_reads_no_half_of_it(tmp_path: Path, mo
     with acquisition.rig() as rig:
         ltcl.acquire(rig, store=acquisition.store, **acquisition.settings)
     monkeypatch.setattr(Scene, "__init__", hello)
-    assert scan.news(0)[0]["warnings"] == []
+    assert scan.scan(0)[0]["warnings"] == []
     assert grids == [None]
     assert scan.hello()["grid"] == (4, 8)
 
@@ -169,12 +165,12 @@ def test_batches_of_a_scan_that_was_stopped(tmp_path: Path) -> None:
 
     with scan.rig() as rig, pytest.raises(KeyboardInterrupt):
         ltcl.acquire(rig, store=scan.store, progress=stop, **scan.settings)
-    facts, previews, seen = Scan(tmp_path, None).news(0)
+    facts, previews = Scan(tmp_path, None).scan(0)
     assert facts["state"] == "begun"
     assert 0 < facts["done"] < facts["total"]
     assert [each["name"] for each in facts["photographs"]][-1] == "batch 1"
     assert {preview.shape for preview in previews.values()} == {(6, 12)}
-    assert seen == len(previews)
+    assert facts["seen"] == len(previews)
 
 
 @contextmanager
@@ -305,12 +301,12 @@ def test_pages_find_the_next_viewer_on_a_port_that_was_named(device, monkeypatch
     file = tuning.folder() / f"viewer-{number}"
     assert file.read_text() in first
     assert os.name != "posix" or file.stat().st_mode & 0o777 == 0o600
-    os.utime(file, times=(0, 0))
-    second = url(port=number)
-    assert second != first
+    file.unlink()
+    assert url(port=number) != first
     if os.name == "posix":
         file.chmod(0o644)  # others may have read it
-        assert url(port=number) != second
+        with pytest.raises(errors.InputError, match="others can read it"):
+            url(port=number)
         file.unlink()
         file.symlink_to(tmp_path / "elsewhere")
         with pytest.raises(errors.InputError, match="port"):
@@ -318,28 +314,45 @@ def test_pages_find_the_next_viewer_on_a_port_that_was_named(device, monkeypatch
         assert not (tmp_path / "elsewhere").exists()
 
 
-@pytest.mark.parametrize("command", ["play", "show", "view"])
-def test_the_commands_run(tmp_path: Path, command: str) -> None:
-    ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(24) / 2, (4, 6)))
-    project(tmp_path, BY_HAND)
-    for k in range(3):
-        images.write(tmp_path / "film" / f"{k}.png", np.full((4, 6), 0.1 * k))
-    film, T = tmp_path / "film", tmp_path / "T.npz"
-    words: dict[str, list[Any]] = {"play": [film, T, "--no-browser"], "show": [film, "--browser"]}
-    words |= {"view": [tmp_path, "--no-browser"]}
-    arguments = [sys.executable, "-m", "ltcl", command, *words[command], "--json"]
+@contextmanager
+def running(command: str, *arguments: Any) -> Iterator[Any]:
+    """A command in a process of its own, which has said its URL; what it prints is checked."""
+    words = [sys.executable, "-m", "ltcl", command, *arguments, "--json"]
     pipes: dict[str, Any] = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen(arguments, env=os.environ | {"BROWSER": "true"}, **pipes) as process:
+    with subprocess.Popen(words, env=os.environ | {"BROWSER": "true"}, **pipes) as process:
         assert process.stderr is not None
         assert process.stdout is not None
-        url = process.stderr.readline().split()[0]
-        if command == "view":
-            with Page(url) as page:
-                assert page.hello["scan"]
-                process.send_signal(signal.SIGINT)
-                assert process.wait(PATIENCE) == 0
-        else:
-            with looking(url, keys=True) as shown:
-                assert process.wait(PATIENCE) == 0
-            assert len(shown) >= 2
+        yield process, process.stderr.readline().split()[0]
+        assert process.wait(PATIENCE) == 0
         json_schema.check([command], json.load(process.stdout))
+
+
+def film(folder: Path) -> Path:
+    for k in range(3):
+        images.write(folder / f"{k}.png", np.full((4, 6), 0.1 * k))
+    return folder
+
+
+def test_play_and_show_run(tmp_path: Path) -> None:
+    ltcl.save(tmp_path / "T.npz", ltcl.Transport(np.eye(24) / 2, (4, 6)))
+    for command, *more in (["play", tmp_path / "T.npz", "--no-browser"], ["show", "--browser"]):
+        with running(command, film(tmp_path / "film"), *more) as (_, url), looking(url, keys=True) as shown:
+            pass
+        assert len(shown) >= 2
+
+
+def test_ctrl_c_ends_view_and_show(tmp_path: Path) -> None:
+    project(tmp_path, BY_HAND)
+    with running("view", tmp_path, "--no-browser") as (process, url), Page(url) as page:
+        assert page.hello["scan"]
+        process.send_signal(signal.SIGINT)
+    with running("show", film(tmp_path / "film"), "--browser") as (process, url), looking(url) as shown:
+        while not shown:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+    assert len(shown) == 1
+
+
+def test_a_folder_that_holds_nothing_is_called_so(tmp_path: Path) -> None:
+    with pytest.raises(errors.FileError, match=r"folder with neither zarr\.json.*acquisition\.toml"):
+        ltcl.load(tmp_path)

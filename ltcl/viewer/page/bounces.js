@@ -16,7 +16,7 @@ export function bounces({ $, ask, press, hello }) {
     const own = ++turn;
     set(() => 1);
     const count = Number($("bounces-count").value);
-    const of = source.value ? { of: "picture", picture: Number(source.value) } : { of: "pattern" };
+    const of = source.value ? { picture: Number(source.value) } : {}; // what the pattern looks like
     const answer = await ask("bounces", { ...of, count });
     if (!answer || own !== turn) return;
     const names = ["direct", ...Array.from({ length: count }, (_, k) => `bounce_${k + 1}`), "rest"];
@@ -31,7 +31,7 @@ export function bounces({ $, ask, press, hello }) {
   }
 
   // Of the rest.
-  const nothing = ({ data, h, w, c, dtype }) => ({ data: data.slice().fill(0), h, w, c, dtype, scale: 1 });
+  const nothing = ({ data, h, w, c }) => ({ data: data.slice().fill(0), h, w, c });
 
   function row(picture, k, share) {
     const last = mix.weights.length - 1;
@@ -40,7 +40,7 @@ export function bounces({ $, ask, press, hello }) {
     const [canvas, title, output, slider] = element.children;
     const white = picture.white() || 1, layers = new Layers(), times = mix.white / white;
     title.firstElementChild.textContent = name;
-    title.lastElementChild.textContent = `${(100 * share).toPrecision(2)} % of the light` +
+    title.lastElementChild.textContent = `${(100 * share).toPrecision(2)}\u00a0% of the light` +
       (times > 1.5 ? `, shown ${times < 10 ? times.toFixed(1) : Math.round(times)}× brighter` : "");
     slider.value = sliders[k]?.slider.value ?? 1; // moved while this was computed
     layers.set([picture]);

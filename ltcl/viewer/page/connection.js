@@ -25,10 +25,10 @@ export class Connection extends EventTarget {
     this.socket = new WebSocket(url);
     this.socket.binaryType = "arraybuffer";
     this.socket.onmessage = ({ data }) => this.receive(decode(data));
-    this.socket.onclose = () => {
+    this.socket.onclose = ({ reason }) => {
       for (const { sent, next } of this.kinds.values()) [...sent, next].forEach((each) => each?.answer(null));
       this.kinds.clear();
-      this.tell("lost");
+      this.tell("lost", reason);
       setTimeout(() => this.connect(), Math.min(LONGEST_WAIT, 250 * 2 ** this.tries++));
     };
   }

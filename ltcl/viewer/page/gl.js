@@ -88,22 +88,19 @@ function use(defines) {
 // Pictures of one size as the layers of one texture.
 export class Layers {
   set(pictures) {
-    const { h, w, c, dtype } = pictures[0], half = dtype === "f2";
-    const stored = c === 1 ? (half ? gl.R16F : gl.R32F) : half ? gl.RGB16F : gl.RGB32F;
-    const shape = [stored, w, h, pictures.length];
+    const { h, w, c } = pictures[0], shape = [c === 1 ? gl.R32F : gl.RGB32F, w, h, pictures.length];
     if (String(shape) !== String(this.shape)) {
       gl.deleteTexture(this.texture ?? null);
       this.texture = gl.createTexture();
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.texture);
       gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, ...shape);
       for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
-        gl.texParameteri(gl.TEXTURE_2D_ARRAY, filter, gl.NEAREST); // half floats and floats alike
+        gl.texParameteri(gl.TEXTURE_2D_ARRAY, filter, gl.NEAREST);
       }
     }
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.texture);
     pictures.forEach(({ data }, k) => {
-      const [format, type] = [c === 1 ? gl.RED : gl.RGB, half ? gl.HALF_FLOAT : gl.FLOAT];
-      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, w, h, 1, format, type, data);
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, w, h, 1, c === 1 ? gl.RED : gl.RGB, gl.FLOAT, data);
     });
     Object.assign(this, { shape, pictures, h, w, grey: c === 1 });
   }
@@ -136,15 +133,15 @@ export function draw(canvas, layers, look) {
     SUM: total(`${weight} * stored(light, at, #)`), UNCERTAIN: Number(Boolean(look.deviation)),
     VARIANCE: total("square(spreads[#] * stored(deviation, at, #))"),
   });
-  const scaled = (weights, of) => of.pictures.map(({ scale }, k) => ((weights[k] ?? 0) * scale) / look.white);
+  const scaled = (weights) => layers.pictures.map((_, k) => (weights[k] ?? 0) / look.white);
   gl.viewport(0, 0, w, h);
-  gl.uniform1fv(uniforms.weights, scaled(look.weights, layers));
+  gl.uniform1fv(uniforms.weights, scaled(look.weights));
   if (look.others) {
-    gl.uniform1fv(uniforms.others, scaled(look.others, layers));
+    gl.uniform1fv(uniforms.others, scaled(look.others));
     gl.uniform1f(uniforms.wipe, look.wipe * w);
   }
   if (look.deviation) {
-    gl.uniform1fv(uniforms.spreads, scaled(look.weights, look.deviation));
+    gl.uniform1fv(uniforms.spreads, scaled(look.weights));
     gl.uniform1i(uniforms.deviation, 1);
     gl.activeTexture(gl.TEXTURE1);
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, look.deviation.texture);

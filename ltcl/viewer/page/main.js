@@ -60,8 +60,8 @@ connection.addEventListener("open", async ({ detail: hello }) => {
   } else views[current].start();
 });
 
-connection.addEventListener("lost", () => {
-  say("Not connected; trying again…");
+connection.addEventListener("lost", ({ detail: reason }) => {
+  say(`Not connected${reason && `: ${reason}`}; trying again…`);
   fetch(location.pathname, { method: "HEAD" }).then(({ ok }) => {
     if (!ok) say("The viewer was started again, with another address: open that one");
   }, () => {});

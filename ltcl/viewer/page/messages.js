@@ -2,21 +2,17 @@
 // Bytes of a message, the same both ways: the length of the header as uint32 (little-endian), the header as
 // JSON padded with spaces so that arrays begin at a multiple of 4, then the arrays, each padded to 4 bytes.
 
-const TYPES = { f2: Uint16Array, f4: Float32Array, u1: Uint8Array }; // half floats go to the GPU as they are
+const TYPES = { f4: Float32Array, u1: Uint8Array }; // light, codes
 
 export class Pixels {
-  // A picture of h x w pixels and c numbers each, row by row; a value is scale times the stored number.
-  constructor(data, [h, w, c = 1], scale = 1, dtype = "f4") {
-    Object.assign(this, { data, h, w, c, scale, dtype });
-  }
-
-  number(index) {
-    const stored = this.data[index];
-    return this.scale * (this.dtype === "f2" ? half(stored) : stored);
+  // A picture of h x w pixels and c numbers each, row by row.
+  constructor(data, [h, w, c]) {
+    Object.assign(this, { data, h, w, c });
   }
 
   at(row, col) {
-    return Array.from({ length: this.c }, (_, k) => this.number((row * this.w + col) * this.c + k));
+    const first = (row * this.w + col) * this.c;
+    return [...this.data.subarray(first, first + this.c)];
   }
 
   // Of codes: as a canvas takes them.
@@ -34,18 +30,12 @@ export class Pixels {
     const light = new Float32Array(Math.ceil(n / step)); // whose numbers are sorted fast
     for (let i = 0; i < n; i += step) {
       let most = 0;
-      for (let k = 0; k < this.c; k++) most = Math.max(most, Math.abs(this.number(i * this.c + k)) || 0);
+      for (let k = 0; k < this.c; k++) most = Math.max(most, Math.abs(this.data[i * this.c + k]));
       light[i / step] = most;
     }
     light.sort();
     return light[Math.floor(share * (light.length - 1))] || light[light.length - 1];
   }
-}
-
-function half(bits) {
-  const exponent = (bits >> 10) & 31, mantissa = bits & 1023, sign = bits & 32768 ? -1 : 1;
-  if (exponent === 31) return mantissa ? NaN : sign * Infinity;
-  return sign * (exponent ? (1024 + mantissa) * 2 ** (exponent - 25) : mantissa * 2 ** -24);
 }
 
 const padded = (length) => Math.ceil(length / 4) * 4;
@@ -54,8 +44,8 @@ export function encode(header, arrays = {}) {
   const names = Object.keys(arrays);
   if (!names.length) return JSON.stringify(header);
   const list = names.map((name) => {
-    const { h, w, c, dtype, scale } = arrays[name];
-    return { name, shape: [h, w, c], dtype, scale };
+    const { h, w, c } = arrays[name];
+    return { name, shape: [h, w, c], dtype: "u1" };
   });
   const json = new TextEncoder().encode(JSON.stringify({ ...header, arrays: list }));
   const start = padded(4 + json.length);
@@ -78,9 +68,9 @@ export function decode(message) {
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
   const arrays = {};
   let offset = 4 + length;
-  for (const { name, shape, dtype, scale } of header.arrays) {
+  for (const { name, shape, dtype } of header.arrays) {
     const data = new TYPES[dtype](message, offset, shape.reduce((a, b) => a * b));
-    arrays[name] = new Pixels(data, shape, scale, dtype);
+    arrays[name] = new Pixels(data, shape);
     offset += padded(data.byteLength);
   }
   return { ...header, arrays };

@@ -153,7 +153,7 @@ export class Panel {
 
   read() {
     const [row, col] = this.cursor;
-    const names = ["R ", "G ", "B "];
+    const names = ["R\u00a0", "G\u00a0", "B\u00a0"];
     const format = (v) => (Math.abs(v) < 1e-3 && v ? v.toExponential(2) : v.toFixed(4));
     const text = this.values(row, col).map((v, k, all) => (all.length === 3 ? names[k] : "") + format(v));
     this.output.textContent = `row ${row}, column ${col}   ${text.join("   ")}`;

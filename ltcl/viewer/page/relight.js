@@ -24,7 +24,7 @@ export function relight({ $, ask, press, hello }) {
 
   const linear = (code) => (code <= 10 ? code / 255 / 12.92 : ((code / 255 + 0.055) / 1.055) ** 2.4);
 
-  const codes = () => new Pixels(paint.getImageData(0, 0, w, h).data, [h, w, 4], 1, "u1");
+  const codes = () => new Pixels(paint.getImageData(0, 0, w, h).data, [h, w, 4]);
 
   const show = (light) => seen.show(light, [1], light.white(0.97)); // bounces are darker than what is lit
 

@@ -3,8 +3,11 @@
 
 const percent = (share) => `${(100 * share).toFixed(1)} %`;
 
-export function scan({ $, ask, press, connection }) {
+const PERIOD = 1000; // ms between two looks into the folder
+
+export function scan({ $, ask, press, hello }) {
   const list = $("scan-photographs"), most = 24; // as many as the server keeps
+  let seen = 0, timer = null;
 
   function facts({ state, done, total, what, left, coverage, saturated }) {
     Object.assign($("scan-progress"), { max: total || 1, value: done });
@@ -40,11 +43,19 @@ export function scan({ $, ask, press, connection }) {
     if (button === list.firstElementChild && (!chosen || chosen === first)) button.click();
   }
 
-  connection.addEventListener("scan", ({ detail }) => {
-    facts(detail);
-    detail.photographs.forEach((each, k) => add(each, detail.arrays[k]));
-    const item = (textContent) => Object.assign(document.createElement("li"), { textContent });
-    $("scan-warnings").replaceChildren(...detail.warnings.map(item));
-  });
-  return { start: () => ask("scan") };
+  async function start() {
+    clearTimeout(timer);
+    const answer = await ask("scan", { seen });
+    if (answer) {
+      seen = answer.seen;
+      facts(answer);
+      answer.photographs.forEach((each, k) => add(each, answer.arrays[k]));
+      const item = (textContent) => Object.assign(document.createElement("li"), { textContent });
+      $("scan-warnings").replaceChildren(...answer.warnings.map(item));
+      if (answer.finished && !hello.grid) location.reload();
+    } else seen = 0; // the next viewer counts anew
+    timer = setTimeout(start, PERIOD);
+  }
+
+  return { start };
 }
