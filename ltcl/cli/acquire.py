@@ -215,8 +215,8 @@ def run(
             except PhotographMissing as error:  # the normal way of a folder scan
                 missing, shot, name = rig.missing(), error.shot._asdict(), shlex.quote(str(folder))
                 data = {"folder": folder, "next": shot, "missing": missing, "exit_code": WAITING}
-                then = f"'ltcl show {name}' shows their patterns; then: ltcl acquire run {name} --take CARD"
-                lines = [f"next: {error}", f"{folder / 'shots.csv'} lists all {len(missing)}", then]
+                lines = [f"next: {error}", f"{folder / 'shots.csv'} is the list; {len(missing)} are missing"]
+                lines.append(f"on the projector: ltcl show {name}; then: ltcl acquire run {name} --take CARD")
                 return Answer(data, lines, WAITING)
     except (AcquisitionError, KeyboardInterrupt) as error:
         error.args = (f"{str(error) or 'interrupted'}; {_advice(project, error)}",)
@@ -232,7 +232,7 @@ def _advice(project: Any, error: BaseException) -> str:
     if isinstance(error, ScanRefused):
         return f"remove {project.store} to begin again"
     if project.kind == "folder" and not isinstance(error, KeyboardInterrupt):
-        return f"remove wrong ones from {project.folder / 'photographs'}; {again}, and asks for them again"
+        return f"remove wrong ones from {project.folder / 'photographs'}, to be asked for them again; {again}"
     if project.state == "begun":
         return f"what was photographed before is kept in {project.store}; {again}"
     if project.kind == "folder":

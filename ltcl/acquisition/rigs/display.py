@@ -88,8 +88,7 @@ class Display(Closing):
         self.index = min(1, len(sizes) - 1) if index is None else checks.count("index", index, least=0)
         if self.index not in range(len(sizes)):
             offered = ", ".join(f"{k}: {w} x {h}" for k, (w, h) in enumerate(sizes)) or "none"
-            text = f"index is {index}, of {offered}; a projector must extend the desktop, not mirror it"
-            raise InputError(text)
+            raise InputError(f"index is {index}, of {offered}; a projector must extend the desktop")
         w, h = sizes[self.index]
         self.size = h, w
         enlarge(np.zeros(self.grid), self.size)  # refuses what does not fit

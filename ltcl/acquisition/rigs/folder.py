@@ -137,8 +137,8 @@ class FolderRig:
             if not files:
                 first, place = self.shots[missing[0] - 1], f"{self.folder}, as {_KINDS}"
                 time = f"{first.seconds:.6g} s" + f" (1/{1 / first.seconds:.3g})" * (first.seconds < 0.3)
-                text = f"project {first.pattern}, expose for {time}, save as {first.save_as}"
-                text = f"photograph {first.number} is missing ({len(missing)} in all): {text} in {place}"
+                text = f"project {first.pattern}, expose for {time}, save as {first.save_as} in {place}"
+                text = f"photograph {first.number} is missing ({len(missing)} in all): {text}"
                 raise PhotographMissing(text, first.number, first, len(missing))
             if len(files) > 1:
                 names = " and ".join(path.name for path in files)
@@ -165,16 +165,19 @@ class FolderRig:
     def take(self, files: Iterable[str | os.PathLike[str]]) -> None:
         """Copy the camera's own files, IMG_0412.NEF and so on, in the order of the numbers in their names.
 
-        Files that were copied before, equal in every byte, are left out: a card need not be emptied. Nothing
-        is copied where as many are not missing (InputError), or one is no photograph (FileError).
+        Files that were copied before are left out: a card need not be emptied. Nothing is copied where as
+        many are not missing (InputError), or one is no photograph (FileError).
         """
-        numbers, paths = self.missing(), [*map(input_file, files)]
-        for path in paths:
+        numbers, paths = self.missing(), []
+        copied = [path for paths in self._files.values() for path in paths]
+        order = {p: re.sub("[0-9]+", lambda n: n[0].zfill(20), p.name) for p in map(input_file, files)}
+        for path in sorted(order, key=order.__getitem__):
             if path.suffix.lower() not in _SUFFIXES:
                 raise FileError(f"{path}: is no photograph; it must be {_KINDS}")
-        copied = [path for files in self._files.values() for path in files]
-        paths = [path for path in paths if not any(filecmp.cmp(path, old, shallow=False) for old in copied)]
-        paths.sort(key=lambda path: re.sub("[0-9]+", lambda digits: digits[0].zfill(20), path.name))
+            if same := [old for old in copied if filecmp.cmp(path, old, shallow=False)]:
+                copied.remove(same[0])  # two of black may be equal: each accounts for one
+            else:
+                paths.append(path)
         if len(paths) != len(numbers):
             which = f", {numbers[0]} to {numbers[-1]}" if numbers else ""
             text = f"files holds {len(paths)} new photographs, but {len(numbers)} are missing{which}"

@@ -165,12 +165,13 @@ def test_the_cameras_own_files_are_taken(tmp_path: Path) -> None:
     rig.take(paths)
     np.testing.assert_array_equal([rig.photograph(*s)[0, 0] for s in SHOTS], [1, 0, 2, 3, 4])
     assert all(path.exists() for path in paths)  # copied, not moved
-    rig.prepare([(HALF, 1.0)])
-    with pytest.raises(InputError, match=r"0 new .* 1 .* 6 to 6"):
+    rig.prepare([(HALF, 1.0), (HALF, 1.0)])
+    with pytest.raises(InputError, match=r"0 new .* 2 .* 6 to 7"):
         rig.take(paths)
     camera_files.write(new := tmp_path / "IMG_11.png", GREY + 5)
-    rig.take([new, *paths])
-    assert rig.photograph(HALF, 1.0)[0, 0] == 5
+    shutil.copyfile(paths[0], twin := tmp_path / "IMG_102.png")  # a second one, equal in every byte
+    rig.take([twin, new, *paths])
+    assert [rig.photograph(HALF, 1.0)[0, 0] for _ in range(2)] == [5, 4]
 
 
 NAMES = ["projector_grid", "channels", "camera_bits", "pattern_bits", "projector", "exposures"]
