@@ -37,14 +37,14 @@ BUDGETS: dict[str, tuple[int, list[str]]] = {
     "compensation, separation, relighting, analysis": (1370, _TASKS),
     # Noise is new, and other parts use it: together 1 930 of the 3 000 lines for noise, scale and viewer.
     "noise": (1406, _NOISE),
-    "transport and the rest": (1429, ["ltcl/*.py"]),
+    "transport and the rest": (1430, ["ltcl/*.py"]),
 }
 _FOLDERS = ("device", "operators", "solvers", "theory", "compression", "compensation")
 _TESTS = (
     "analysis checks compensation diagnostics exact files first_bounce layers products public_calls "
     "separation transport warnings"
 )
-_OTHERS = {"acquisition": 6310, "store": 1200, "images": 500, "batch": 500, "cli": 2000, "scenes": 2710}
+_OTHERS = {"acquisition": 6320, "store": 1200, "images": 500, "batch": 500, "cli": 2000, "scenes": 2710}
 _PAST = ("cluster", "operators/parts", "operators/distributed", "batch/scenes")
 _TESTS_PAST = (
     "batch/conftest",

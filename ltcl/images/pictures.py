@@ -51,8 +51,7 @@ def read(
     `path` is a .png, .jpg, .jpeg, .bmp, .tif, .tiff (8, 16 or 32 bits) or .exr file, opaque everywhere.
     `encoding` is what it holds, "srgb" or "linear"; "auto" takes integers as sRGB and floats as linear. The
     orientation in the header (EXIF, TIFF) is applied, unless `upright` is False, as for a photograph.
-    FileError for no picture, a damaged or transparent one, NaN; MemoryLimitError, before it is decoded, for
-    24 bytes a pixel beyond `memory` or what the host has.
+    FileError for a damaged or transparent one, NaN; MemoryLimitError for 24 bytes a pixel beyond `memory`.
 
     Examples
     --------

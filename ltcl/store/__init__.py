@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Transports on disk: load one from, and save one to, .npz, .npy, .mtx, .h5, .mat and .zarr.
-
-Everything that a file declares is checked before memory is taken for it; pickles are never loaded.
-"""
+"""Transports on disk: .npz, .npy, .mtx, .h5, .mat and .zarr, whose declared sizes are checked; no pickles."""
 
 from ltcl.store.block_store import ArrayLog, BlockStore
 from ltcl.store.formats import load, load_inverse, save, save_inverse
