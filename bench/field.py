@@ -45,7 +45,7 @@ def commands(asked: list[str]) -> dict[str, str]:
 def make(data: Path, given: Options) -> dict[str, Any]:
     """Make what `data` lacks; facts of all its scenes."""
     facts: dict[str, Any] = {}
-    missing = [name for name in dataset.NAMES if not (data / name / "scene.json").exists()]
+    missing = [name for name in dataset.NAMES if name not in dataset.found(data)]
     why = tracing.unavailable() if missing else ""
     if why:
         facts[f"NOT TRACED: {', '.join(missing)}"] = why
@@ -57,9 +57,9 @@ def make(data: Path, given: Options) -> dict[str, Any]:
         else:
             small = {"size": 12, "paths": 256, "samples": 256}
             dataset.trace(data / name, name, **(small if given.smoke else {"size": given.more.size}))
-    if not dataset.names(data):
+    if not (scenes := dataset.found(data)):
         raise SystemExit(f"{data} has no scenes, and none can be traced: {why}")
-    return facts | {name: dataset.Scene(data / name).facts for name in dataset.names(data)}
+    return facts | {name: scene.facts for name, scene in scenes.items()}
 
 
 def main() -> None:
@@ -72,8 +72,7 @@ def main() -> None:
         data = given.more.data or Path(scratch)
         facts, results = make(data, given), dict[str, dict[str, dict[str, Any]]]()
         table = Table("scene", "method", *scoring.COLUMNS, *scoring.OTHERS)
-        for name in dataset.names(data):
-            scene = dataset.Scene(data / name)
+        for name, scene in dataset.found(data).items():
             results[name] = {"traced": scoring.traced(scene)}
             for method, command in chosen.items():
                 print(f"{name}: {method}", flush=True)

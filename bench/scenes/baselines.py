@@ -79,15 +79,18 @@ def by_ltcl(compress: bool, transport: Path, l: np.ndarray, out: Path) -> None:
     """The command line of ltcl; of F that an inverse tells, as `dense`."""
 
     def call(*arguments: object) -> None:
-        subprocess.run([sys.executable, "-m", "ltcl", *map(str, arguments), "--quiet"], check=True)  # noqa: S603
+        command = [sys.executable, "-m", "ltcl", *map(str, arguments), "--quiet"]
+        if code := subprocess.run(command, check=False).returncode:  # noqa: S603
+            raise SystemExit(code)  # the command has said why
 
     pictures = [out / f"{k}.exr" for k in range(len(l))]
     for path, picture in zip(pictures, l, strict=True):
         ltcl.images.write(path, picture)
-    options: list[object] = ["--first-bounce", "exact"]
+    exact: list[object] = ["--first-bounce", "exact"]
+    options = [*exact, "--rtol", RTOL]
     if compress:
-        call("compress", transport, "--rtol", "noise", "--out", out / "representation.npz", *options)
-        transport, options = out / "representation.npz", []
+        call("compress", transport, "--rtol", "noise", "--out", out / "representation.npz", *exact)
+        transport, options = out / "representation.npz", []  # to the error that it has
     call("compensate", transport, *pictures, "--out", out / "compensate", *options)
     call("separate", transport, *pictures, "--bounces", 3, "--out", out / "separate", *options)
     for end, name in (("", ""), ("_std", "_std")):

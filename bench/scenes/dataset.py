@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ SIMULATED = {
     "coloured": lambda n: scenes.trihedral(n, albedo=tracing.TRACED["coloured"].albedo),
 }
 PATTERNS = ("white", "smooth", "landscape", "text", "checkerboard", "stripes", "pixel", "pixel 2")
-SIZE, PATHS, SAMPLES = 64, 2560, 4096  # pixels; paths a camera pixel of the first T, of a photograph
+SIZE, PATHS, SAMPLES = 64, 2560, 10_000  # pixels; paths a camera pixel of the first T, of a photograph
 _BETTER = 4  # times the paths: the second measurement, which judges
 _NOISE = 1e-3  # of what is simulated
 
@@ -71,16 +72,24 @@ class Scene:
         """How it was made."""
         return json.loads((self.folder / "scene.json").read_text(encoding="utf-8"))
 
-    @property
+    @cached_property
     def photographs(self) -> dict[str, np.ndarray]:
         """`names`, `patterns` and `photographs`."""
         with np.load(self.folder / "photographs.npz", allow_pickle=False) as file:
             return dict(file)
 
-    def transport(self, measurement: str) -> np.ndarray:
-        """T of the "first" or "second"."""
-        with np.load(self.folder / f"{measurement}.npz", allow_pickle=False) as file:
+    @cached_property
+    def second(self) -> np.ndarray:
+        """T of the second measurement."""
+        with np.load(self.folder / "second.npz", allow_pickle=False) as file:
             return file["T"]
+
+    @cached_property
+    def truth(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounces 0 to 3 of the photographs by the second measurement, and their variance where it is."""
+        p = self.photographs["patterns"]
+        true = self.bounces("second", p).astype(np.float64)
+        return true, (self.bounces("first", p) - true) ** 2 / (1 + _BETTER)
 
     def bounces(self, measurement: str, p: np.ndarray) -> np.ndarray:
         """Bounces 0 to 3 of the light of patterns p, (K, 4, h, w) or (K, 4, h, w, 3), as traced."""
@@ -88,15 +97,14 @@ class Scene:
             return np.stack([relight(file[f"bounce_{k}"], p) for k in range(4)], axis=1)
 
 
-def names(data: Path) -> list[str]:
-    """Scenes in a folder, those of `NAMES` first."""
-    found = {path.parent.name for path in data.glob("*/scene.json")}
-    return sorted(found, key=lambda name: (name not in NAMES, (*NAMES, name).index(name), name))
+def found(data: Path) -> dict[str, Scene]:
+    """The scenes in a folder by their names."""
+    return {name: Scene(data / name) for name in NAMES if (data / name / "scene.json").exists()}
 
 
 def trace(folder: Path, name: str, size: int = SIZE, paths: int = PATHS, samples: int = SAMPLES) -> None:
     """A scene of `tracing.TRACED`, with Mitsuba, size x size pixels."""
-    start, grid, traced = time.perf_counter(), (size, size), tracing.TRACED[name]
+    start, grid, traced = time.process_time(), (size, size), tracing.TRACED[name]
     p = patterns(grid, traced.channels)
     facts: dict[str, Any] = {"about": traced.about, "origin": f"Mitsuba {tracing.version()}"}
     facts |= {"paths": [paths, _BETTER * paths], "samples": samples, "seeds": [1, 2, 3]}
@@ -107,13 +115,13 @@ def trace(folder: Path, name: str, size: int = SIZE, paths: int = PATHS, samples
 
 def simulate(folder: Path, name: str, size: int = 6) -> None:
     """A scene of `SIMULATED`, of walls of size x size pixels."""
-    start, scene = time.perf_counter(), SIMULATED[name](size)
+    start, scene = time.process_time(), SIMULATED[name](size)
     p, n = patterns(scene.grid, scene.channels), scene.albedo.shape[1]
-    A = scene.albedo[:, :, None] * scene.form_factors
-    bounces = [np.eye(n) * scene.albedo[:, None]]
-    for _ in range(60):
+    A, bounces = scene.albedo[:, :, None] * scene.form_factors, [np.eye(n) * scene.albedo[:, None]]
+    for _ in range(3):
         bounces.append(A @ bounces[-1])
-    exact = np.stack([*bounces[:4], np.sum(bounces[4:], axis=0)]).reshape(5, *A.shape[scene.channels == 1 :])
+    exact = np.stack([*bounces, np.stack(scene.matrices()) - np.sum(bounces, axis=0)])
+    exact = exact.reshape(5, *A.shape[scene.channels == 1 :])
     for seed, measurement in enumerate(("first", "second"), 1):
         noise = _NOISE / seed * np.random.default_rng(seed).standard_normal(exact.shape)
         noise[0] = 0.0  # paths that end at once have none
@@ -136,9 +144,6 @@ def _conclude(
     """Photographs and facts; these come last, so that a folder with them is whole."""
     pictures = {"patterns": p, "photographs": photographs.astype(np.float32)}
     np.savez(folder / "photographs.npz", names=PATTERNS, **pictures)
-    facts |= {
-        "grid": p.shape[1:3],
-        "channels": 1 if p.ndim == 3 else 3,
-        "seconds": time.perf_counter() - start,
-    }
+    facts |= {"grid": p.shape[1:3], "channels": 1 if p.ndim == 3 else 3}
+    facts["CPU seconds"] = time.process_time() - start
     (folder / "scene.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")

@@ -183,7 +183,9 @@ def photographs(name: str, patterns: np.ndarray, samples: int, seed: int) -> np.
         "rfilter": {"type": "box"},
         "pixel_format": "rgb",
     }
-    sensor = {"type": "perspective", **pinhole, "film": film | {"height": h, "width": w}, "near_clip": 1e-3}
+    film |= {"height": h, "width": w}
+    sensor = {"type": "perspective", **pinhole, "film": film, "near_clip": 1e-3}
+    sensor["sampler"] = {"type": "multijitter", "sample_count": samples}
     integrator = {"type": "path", "max_depth": _DEPTH + 1}
     pictures = []
     for k, pattern in enumerate(patterns):
