@@ -12,7 +12,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ class Options:
     json: Path | None
     plot: Path | None
     device: Device
+    more: argparse.Namespace = field(default_factory=argparse.Namespace)  # a bench's own arguments
 
 
 @dataclass(frozen=True)
@@ -67,18 +68,21 @@ class Row:
         return "hit" if part >= 1.0 else f"MISS: {part:.1%} of {self.target:.3g}x"
 
 
-def options(description: str) -> Options:
-    """Parse the command line and open the device."""
+def options(description: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Options:
+    """Parse the command line, with a bench's own arguments, and open the device."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--smoke", action="store_true", help="tiny sizes: does it run")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--plot", type=Path, help="draw what was found into this PNG")
     parser.add_argument("--device", help="as ltcl.open_device takes it")
+    for name, settings in (own or {}).items():
+        parser.add_argument(f"--{name}", **settings)
     arguments = parser.parse_args()
     if arguments.smoke:
         global _rest
         _rest = 0.0
-    return Options(arguments.smoke, arguments.json, arguments.plot, ltcl.open_device(arguments.device))
+    device = ltcl.open_device(arguments.device)
+    return Options(arguments.smoke, arguments.json, arguments.plot, device, arguments)
 
 
 def seconds(actions: Mapping[str, Callable[[], object]], repeats: int = 7) -> dict[str, float]:

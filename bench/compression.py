@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compression to what pictures need, judged by a second measurement and by pictures that it never saw.
 
-The case: a box with two blocks, 64 x 64 pixels, path-traced (`_traced`), so that two measurements differ by
-19 % in the Frobenius norm of R and by 0.31 % in T p; and a simulated one, four walls with a block, exact form
-factors, entries Poisson counts of as much noise. Then 200 pictures (parts of a photograph, letters,
-checkerboards, single pixels) in each of six scenes: the largest loss of appearance, direct light and
-compensating pattern, over what is stated.
+The case: a box with two blocks, 64 x 64 pixels, path-traced (`scenes.tracing`), so that two measurements
+differ by 19 % in the Frobenius norm of R and by 0.31 % in T p; and a simulated one, four walls with a block,
+exact form factors, entries Poisson counts of as much noise. Then 200 pictures (parts of a photograph,
+letters, checkerboards, single pixels) in each of six scenes: the largest loss of appearance, direct light
+and compensating pattern, over what is stated.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import _figures as figures
-import _traced
 import ltcl
 from _coefficients import relative
 from _figures import Claim
 from _harness import options
 from ltcl import scenes
 from ltcl.scenes.landscape import landscape
+from scenes import tracing
 
 FROBENIUS, HELD, ACCURATE = 0.19, 200, 1e-4
 PATHS = 10_240  # a camera pixel, for such differences
@@ -116,10 +116,10 @@ def main() -> None:
         "closed": scenes.box(small // 2, 6, albedo=0.5),
     }
     pairs, facts, claims = {"simulated": measure(box(n), (2 * n, 2 * n))}, {}, []
-    if why := "--smoke" if given.smoke else _traced.unavailable():
+    if why := "--smoke" if given.smoke else tracing.unavailable():
         facts["path-traced"] = f"not measured: {why}"
     else:
-        traced = (_traced.trace("blocks", (64, 64), PATHS, seed).sum(axis=0) for seed in (1, 2))
+        traced = (tracing.trace("blocks", (64, 64), PATHS, seed).sum(axis=0) for seed in (1, 2))
         pairs["path-traced"] = [ltcl.Transport(T, (64, 64)) for T in traced]
     for name, pair in pairs.items():
         more, further = case(name, pair, count)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Deviations, denoising and `rtol="noise"` of path-traced transports, judged by independent measurements.
 
-Mitsuba traces (`_traced`) a corner, a box, and a box with blocks ten times each. Twice, one measurement is
-judged by the mean of eight others, whose own errors are taken off all ratios; with the noise that T tells
-itself, and with that of the tenth. Deviations over errors: root mean squares over pixels, under white. Errors
+Mitsuba traces (`scenes.tracing`) a corner, a box, and a box with blocks ten times each. Twice, one is judged
+by the mean of eight others, whose own errors are taken off all ratios; with the noise that T tells itself,
+and with that of the tenth. Deviations over errors: root mean squares over pixels, under white. Errors
 denoised and compressed, over those before: of ten patterns of each kind, and of bounces of one of each.
 Also, what no measurement mends: the bounces of one view, by its `first_bounce`, against those traced.
 """
@@ -19,11 +19,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import _figures as figures
-import _traced
 import ltcl
 from _figures import Claim
 from _harness import options
 from denoise import QUANTITIES, patterns
+from scenes import tracing
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.noise.measured import measure, noise_of, truth
@@ -43,7 +43,7 @@ def measurements(scene: str, smoke: bool) -> tuple[list[ltcl.Transport], dict[st
     if smoke:
         T = truth("corner", 6)
         return [measure(T, noise_of(T, 1e-3), seed, known=False) for seed in range(4)], {}
-    traced = [_traced.trace(scene, GRID, PATHS, seed) for seed in range(1, SEEDS + 1)]
+    traced = [tracing.trace(scene, GRID, PATHS, seed) for seed in range(1, SEEDS + 1)]
     mean, off = np.mean(traced, axis=0, dtype=np.float64), {}
     white = mean.sum(axis=2).reshape(-1, *GRID)
     for first in ("diagonal", "exact"):
@@ -88,12 +88,12 @@ def judge(T: ltcl.Transport, true: ltcl.Transport) -> tuple[Any, ...]:
 def main() -> None:
     """Judge each scene, or say why not."""
     given = options(__doc__ or "")
-    if why := "" if given.smoke else _traced.unavailable():
+    if why := "" if given.smoke else tracing.unavailable():
         raise SystemExit(f"not measured: {why}")
     logging.getLogger("ltcl").setLevel(logging.ERROR)  # of T that is noisy
     facts: dict[str, Any] = {"path-traced": "not measured: --smoke"} if given.smoke else {}
     claims, half = list[Claim](), list[bool]()
-    for scene in ["simulated"] if given.smoke else _traced.TRACED:
+    for scene in ["simulated"] if given.smoke else ("corner", "box", "blocks"):
         measured, facts[f"{scene}: bounces of one view, off"] = measurements(scene, given.smoke)
         found: dict[str, list[Any]] = {"noise by T alone": [], "noise by two measurements": []}
         for k in range(JUDGED):
