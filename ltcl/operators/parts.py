@@ -257,7 +257,8 @@ def _reader(matrix: np.ndarray, rows: int) -> Callable[[int], tuple[int, np.ndar
         return lambda first: (first, matrix[first : first + rows])
     offset = root.offset + matrix.ctypes.data - root.ctypes.data
     checks.fits_host(f"{path}: reading it", (_AHEAD + 1) * rows * width * matrix.itemsize)
-    buffers = np.empty((_AHEAD + 1, rows * width), matrix.dtype)  # in turn: new memory costs like reading
+    # In turn, as new memory takes as long as reading: rows are valid until the third reading after them.
+    buffers = np.empty((_AHEAD + 1, rows * width), matrix.dtype)
 
     def read(first: int) -> tuple[int, np.ndarray]:
         values = buffers[first // rows % len(buffers), : min(rows, height - first) * width]

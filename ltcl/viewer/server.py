@@ -14,6 +14,7 @@ import contextlib
 import html
 import ipaddress
 import logging
+import os
 import secrets
 import socket
 import threading
@@ -46,6 +47,7 @@ PAGES, CONNECTIONS = 32, 256
 PATIENCE = 5.0  # seconds for a page to read an answer
 _BUFFER = 1 << 21  # bytes to a page: a picture is handed over at once
 _PERIOD = 0.1  # seconds between two reports of progress
+_KEPT = 86400.0  # seconds that a token on a named port serves
 _logger = logging.getLogger(__name__)
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -149,12 +151,15 @@ class _Http(H11Protocol):
 
 
 def _token(port: int) -> str:
-    """The token of the last viewer on a port that was named: pages of that find the next one."""
+    """The token of the last viewer on a port that was named, for a day: pages of that find the next one."""
     file = tuning.make_folder() / f"viewer-{port}"
+    if file.exists() and time.time() > file.stat().st_mtime + _KEPT:
+        file.unlink()
     if not file.exists():
         file.touch(0o600, exist_ok=False)
         file.write_text(secrets.token_urlsafe(24), "ascii")
-    if len(token := file.read_text("latin-1")) < 32 or file.stat().st_mode & 0o077:
+    others_read = os.name == "posix" and file.stat().st_mode & 0o077  # elsewhere the folder decides
+    if len(token := file.read_text("latin-1")) < 32 or others_read:
         raise OSError(f"{file} is no token, or others can read it; delete it")
     return token
 
