@@ -3,7 +3,7 @@
 
 With `--data DIR` traces the scenes that DIR lacks (Mitsuba 3, LLVM), and scores the baselines on all in it.
 `--method mine="python mine.py"` scores that command instead, `--method dense` one of the baselines; either
-may be repeated. Without LLVM `--smoke` simulates small scenes, and says so.
+may be repeated. `--smoke` takes one small scene, which it simulates without LLVM, and says so.
 """
 
 from __future__ import annotations
@@ -45,11 +45,12 @@ def commands(asked: list[str]) -> dict[str, str]:
 def make(data: Path, given: Options) -> dict[str, Any]:
     """Make what `data` lacks; facts of all its scenes."""
     facts: dict[str, Any] = {}
-    missing = [name for name in dataset.NAMES if name not in dataset.found(data)]
+    names = ("coloured",) if given.smoke else dataset.NAMES
+    missing = [name for name in names if name not in dataset.found(data)]
     why = tracing.unavailable() if missing else ""
     if why:
         facts[f"NOT TRACED: {', '.join(missing)}"] = why
-        missing = list(dataset.SIMULATED) if given.smoke else []
+        missing = missing * given.smoke
     for name in missing:
         print(f"making {name}", flush=True)
         if why:
