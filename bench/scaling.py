@@ -31,7 +31,7 @@ from ltcl.operators import CSR, Dense, Distributed, IdentityPlus
 
 SIZES = {False: ((32_768, 256), (131_072, 256), (16_384, 16_384)), True: ((1024, 16), (4096, 16), (512, 512))}
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "OMP_NUM_THREADS": "1"}
-ROUNDS, BLOCK, PRODUCTS = 5, 256, 4
+ROUNDS, BLOCK, PRODUCTS = 11, 256, 4
 GPUS, MEMORY, BUS, STEP = 64, 0.8 * 3.35e12, 25e9, 5e-6  # bytes a second, and seconds
 ASSUMED = "a GPU a rank, 80 % of 3.35 TB/s; bus and network 25 GB/s; log2 p steps of 5 us; a as here"
 
@@ -113,7 +113,7 @@ def compare(comm: Any, alone: Any, n: int, entries: int) -> dict[str, float]:
         actions[f"product {who}"] = A and partial(product, A, A.device.upload(b))
         actions[f"solve {who}"] = A and who != "4 ranks" and partial(solve, A)
     numbers = [each.view(np.int32) for each in ((own.data, own.indices) if entries < n else (own,))]
-    triad_of_half, _ = triad(operators["2 ranks"].device, n < SIZES[False][0][0], 2)
+    triad_of_half, _ = triad(operators["2 ranks"].device, n * entries < 1 << 20, 2)
 
     def read() -> None:
         for each in numbers:

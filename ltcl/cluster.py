@@ -17,7 +17,6 @@ import platform
 import secrets
 import threading
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 logger = logging.getLogger(__name__)
-_TRIES = 3  # of an item whose workers are lost, before it is taken for the reason
+_TRIES = 4  # of an item whose workers are lost, before it is taken for the reason
 _PATIENCE = 60.0  # seconds without a worker: what was killed has been started again by then
 _PERIOD = 1.0  # seconds between two looks at the list of workers
 _PCI = ("pci_domain_id_nv", "pci_bus_id_nv", "pci_slot_id_nv")  # what CUDA_VISIBLE_DEVICES does not renumber
@@ -192,6 +191,7 @@ def _pickled(value: Any, what: str = "what workers need cannot be sent to them",
 class _Task:
     item: bytes
     future: Any = None
+    data: Any = None  # the item on a worker
     workers: frozenset[str] = frozenset()  # that may do it
     tries: int = 0
 
@@ -215,16 +215,28 @@ class _Crew:
 
     def submit(self, task: _Task) -> None:
         """Send a task to the workers that are ready, when there are some."""
-        self.look()
-        while not self.ready:
-            time.sleep(_PERIOD / 10)
+        self.release(task)
+        sent = False
+        while not sent:
             self.look()
-        if task.future is not None:
-            task.future.release()  # tracebacks of waits in vain hold it, too
-        task.workers, task.tries = frozenset(self.ready), task.tries + 1
-        rules: Any = {"workers": [*task.workers], "pure": False}
-        with warnings.catch_warnings(action="ignore"):  # of large arguments, which `window` bounds
-            task.future = self.client.submit(_work, self.token, task.item, **rules)
+            if not self.ready:
+                time.sleep(_PERIOD / 10)
+                continue
+            task.workers = frozenset(self.ready)
+            rules: Any = {"workers": [*task.workers]}
+            try:  # not as an argument: Dask keeps a thousand of its messages, here and on the scheduler
+                task.data = self.client.scatter(task.item, hash=False, **rules)
+                task.future = self.client.submit(_work, self.token, task.data, pure=False, **rules)
+                sent = True
+            except (OSError, KeyError):  # of a worker that has just gone
+                self.looked = -math.inf
+        task.tries += 1
+
+    def release(self, task: _Task) -> None:
+        """Let the scheduler forget a task; tracebacks of waits in vain hold its futures, too."""
+        for future in (task.future, task.data):
+            if future is not None:
+                future.release()
 
     def result(self) -> Any:
         """What the first task gives, however many workers it takes."""
@@ -233,11 +245,12 @@ class _Crew:
         task, patience, result = self.tasks[0], _PERIOD, None
         while True:
             self.look()
-            lost = [each for each in self.tasks if not each.workers & self.ready.keys()]
+            there = self.ready.keys()
+            lost = [each for each in self.tasks if not each.workers & there or each.future.cancelled()]
             if task in lost and task.tries == _TRIES:
                 error = ClusterError(f"an item lost its workers {_TRIES} times; it may be what ends them")
                 break
-            for each in lost:  # all have gone, and Dask must not choose others
+            for each in lost:  # with the item, or all that may do it: Dask must not choose others
                 if each is task or each.tries < _TRIES - 1:  # the last try alone: others may end workers
                     self.submit(each)
             try:
@@ -258,7 +271,7 @@ class _Crew:
                 break
             self.admit(*refusal)
             task.workers, task.tries = frozenset(), 0
-        self.tasks.popleft().future.release()
+        self.release(self.tasks.popleft())
         if error is not None and not (self.errors and isinstance(error, LtclError)):
             raise error
         return result if error is None else error

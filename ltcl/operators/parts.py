@@ -44,7 +44,7 @@ class Parts(Operator):
     _gathered: Callable[[Array, bool], np.ndarray]  # A x or A^T x, on the host
 
     def _product(self, x: Array, out: Array, epilogue: Epilogue, transpose: bool) -> None:
-        a, b, y, c = epilogue
+        a, b, y, c = epilogue.without_shift(x)
         product = out.like().set(self._gathered(x, transpose).reshape(out.shape))
         vectors.axpby(a, product, b, product if y is None or not b else y, out)
         if c:

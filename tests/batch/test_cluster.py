@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,18 @@ def test_results_come_in_order_and_items_are_taken_as_results_are(client):
     for _ in range(50):  # nothing stays on the scheduler
         time.sleep(0.1 if client.futures else 0.0)
     assert not client.futures
+
+
+def test_items_that_are_done_leave_memory(client):
+    tracemalloc.start()
+    try:
+        sizes = []
+        for length in stream(client, len, (bytes(1 << 19) for _ in range(40))):
+            assert length == 1 << 19
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert sizes[-1] - sizes[9] < 5 << 20, sizes  # here and on the scheduler, which is in this process
 
 
 def test_a_function_is_sent_once_to_each_worker(client, monkeypatch):
