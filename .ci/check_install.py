@@ -50,7 +50,6 @@ def use(python: str, archive: Path, folder: Path) -> str | None:
     environment = {name: value for name, value in os.environ.items() if name not in HIDDEN}
     environment |= {"POCL_CACHE_DIR": str(folder / "pocl"), "LTCL_CACHE": str(folder / "cache")}
     own = folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
-    environment["PATH"] = str(own)
     steps = [
         [python, "-m", "venv", str(folder / "venv")],
         # The archive itself may be source, nothing else: `hatchling`, which builds it, is a wheel, too.
@@ -67,6 +66,7 @@ def use(python: str, archive: Path, folder: Path) -> str | None:
         )  # fmt: skip
         if run.returncode:
             return f"{' '.join(step)}: exit status {run.returncode}\n{run.stdout}"
+        environment["PATH"] = str(own)  # from then on: what makes environments may be a script
     sheet = folder / "demo" / "contact_sheet.png"
     return None if sheet.is_file() else f"the demo wrote no {sheet.name}"
 
