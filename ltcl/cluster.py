@@ -216,8 +216,8 @@ class _Crew:
     def submit(self, task: _Task) -> None:
         """Send a task to the workers that are ready, when there are some."""
         self.release(task)
-        sent = False
-        while not sent:
+        begun = time.monotonic()
+        while True:
             self.look()
             if not self.ready:
                 time.sleep(_PERIOD / 10)
@@ -227,9 +227,11 @@ class _Crew:
             try:  # not as an argument: Dask keeps a thousand of its messages, here and on the scheduler
                 task.data = self.client.scatter(task.item, hash=False, **rules)
                 task.future = self.client.submit(_work, self.token, task.data, pure=False, **rules)
-                sent = True
-            except (OSError, KeyError):  # of a worker that has just gone
+                break
+            except (OSError, KeyError) as error:  # of a worker that has just gone
                 self.looked = -math.inf
+                if time.monotonic() > begun + _PATIENCE:
+                    raise ClusterError(f"no worker at {self.scheduler} takes an item: {error}") from None
         task.tries += 1
 
     def release(self, task: _Task) -> None:
