@@ -216,29 +216,23 @@ class _Crew:
     def submit(self, task: _Task) -> None:
         """Send a task to the workers that are ready, when there are some."""
         self.release(task)
-        begun = time.monotonic()
-        while True:
+        self.look()
+        while not self.ready:
+            time.sleep(_PERIOD / 10)
             self.look()
-            if not self.ready:
-                time.sleep(_PERIOD / 10)
-                continue
-            task.workers = frozenset(self.ready)
-            rules: Any = {"workers": [*task.workers]}
-            try:  # not as an argument: Dask keeps a thousand of its messages, here and on the scheduler
-                task.data = self.client.scatter(task.item, hash=False, **rules)
-                task.future = self.client.submit(_work, self.token, task.data, pure=False, **rules)
-                break
-            except (OSError, KeyError) as error:  # of a worker that has just gone
-                self.looked = -math.inf
-                if time.monotonic() > begun + _PATIENCE:
-                    raise ClusterError(f"no worker at {self.scheduler} takes an item: {error}") from None
-        task.tries += 1
+        task.workers, task.tries, argument = frozenset(self.ready), task.tries + 1, task.item
+        rules: Any = {"workers": [*task.workers]}
+        # An argument stays in memory, here and on the scheduler: Dask keeps a thousand messages.
+        with contextlib.suppress(OSError, KeyError):  # of workers that have gone, or are short of memory
+            argument = task.data = self.client.scatter(task.item, hash=False, timeout=_PERIOD, **rules)
+        task.future = self.client.submit(_work, self.token, argument, pure=False, **rules)
 
     def release(self, task: _Task) -> None:
         """Let the scheduler forget a task; tracebacks of waits in vain hold its futures, too."""
         for future in (task.future, task.data):
             if future is not None:
                 future.release()
+        task.data = None
 
     def result(self) -> Any:
         """What the first task gives, however many workers it takes."""

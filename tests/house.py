@@ -72,11 +72,11 @@ BESIDE: dict[str, tuple[int, list[str]]] = {
     **{name: (budget, [f"ltcl/{name}"]) for name, budget in _OTHERS.items()},
     # Clusters, ranks, several devices and disks, as far as they have files of their own; about 200 lines more
     # are in other parts, mostly batch and cli: 900 are to be enough for all.
-    "past one machine": (872, [f"ltcl/{name}.py" for name in _PAST]),
+    "past one machine": (866, [f"ltcl/{name}.py" for name in _PAST]),
     "tests past one machine": (1260, [f"tests/{name}.py" for name in _TESTS_PAST]),
     # 700 were asked for; its commands count with the command line.
     "viewer, without its page": (955, ["ltcl/viewer"]),
-    "linker": (70, ["ltcl/linker"]),
+    "linker": (80, ["ltcl/linker"]),
     "plots and demo": (600, ["ltcl/plots", "ltcl/demo"]),
     "tests of these": (
         9000,

