@@ -23,7 +23,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "ltcl"
 # Low to high; a new unit of ltcl must be placed here.
 LAYERS: list[set[str]] = [
     {"errors"},
-    {"checks"},
+    {"checks", "linker"},
     {"files"},
     {"images", "device"},
     {"operators", "layout", "cluster"},
