@@ -3,8 +3,9 @@
 
 Workers are processes on this machine, of one core each, so that two are a machine twice as large as one. This
 process, which reads and writes the frames, has no core of its own; what it takes of one says how many frames
-it can feed to workers. Rates are those of a long film: after the first quarter, when workers have T and its
-kernels. In the kill table workers end by SIGKILL while a run is on its way; its files are compared with a
+it can feed to workers. The rate of one film is that of a long one: after the first quarter, when workers have
+T and its kernels. The other has a quarter of the pixels and is timed with the start, so that what a cluster
+costs shows. In the kill table workers end by SIGKILL while a run is on its way; its files are compared with a
 serial run's.
 """
 
@@ -14,7 +15,7 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,19 @@ def film(T: ltcl.Transport, folder: Path, frames: int) -> Path:
     return folder
 
 
+def rate(run: Callable[..., float], frames: int, out: str, client: Client) -> float:
+    """Frames a second after the first quarter."""
+    seen: list[tuple[int, float]] = []
+
+    def note(step: str, done: int, total: int | None) -> None:
+        if 4 * done >= frames:
+            seen.append((done, time.perf_counter()))
+
+    run(out, client=client, progress=note)
+    (before, start), (after, end) = seen[0], seen[-1]
+    return (after - before) / (end - start)
+
+
 def bytes_of(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
 
@@ -70,43 +84,35 @@ def main() -> None:
     kills, rows, facts = 1 if given.smoke else KILLS, [], {}
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         place = Path(name)
-        ltcl.save(place / "T.npz", ltcl.scenes.box(size, sides=3).transport())
-        T = ltcl.load(place / "T.npz", device=given.device)
+        for name, side in (("T.npz", size), ("little.npz", size // 2)):
+            ltcl.save(place / name, ltcl.scenes.box(side, sides=3).transport())
+        T, little = (ltcl.load(place / name, device=given.device) for name in ("T.npz", "little.npz"))
         os.environ["LTCL_CACHE"] = str(place / "cache")  # one memory of timings, so the same kernels
-        source = film(T, place / "film", frames)
+        source, short = film(T, place / "film", frames), film(little, place / "short", frames)
 
-        def run(out: str, source: Path = source, **others: Any) -> float:
+        def run(out: str, source: Path = source, T: ltcl.Transport = T, **others: Any) -> float:
             start = time.perf_counter()
             rules: Any = {"batch": BATCH, "rtol": RTOL, "clamp": True, **others}
             ltcl.batch.compensate_frames(T, source, place / out, **rules)
             return time.perf_counter() - start
 
-        def rate(out: str, client: Client) -> float:
-            """Frames a second after the first quarter."""
-            seen: list[tuple[int, float]] = []
-
-            def note(step: str, done: int, total: int | None) -> None:
-                if 4 * done >= frames:
-                    seen.append((done, time.perf_counter()))
-
-            run(out, client=client, progress=note)
-            (before, start), (after, end) = seen[0], seen[-1]
-            return (after - before) / (end - start)
-
         run("serial")
         rates: dict[int, list[float]] = {1: [], 2: []}
+        whole: dict[int, list[float]] = {1: [], 2: []}
         fed: list[float] = []  # frames a second of this process's core
         clients = {count: stack.enter_context(cluster(count, place / "cache")) for count in rates}
         for turn in range(2 if given.smoke else 6):  # the first compiles
             for count, client in clients.items():
                 before = time.process_time()
-                rates[count].append(rate(f"{count} {turn}", client))
-                fed += [frames / (time.process_time() - before)] * (turn > 0)
-        one, two = (float(np.median(rates[count][1:])) for count in rates)
+                rates[count].append(rate(run, frames, f"{count} {turn}", client))
+                whole[count].append(frames / run(f"whole {count} {turn}", short, little, client=client))
+                fed += [2 * frames / (time.process_time() - before)] * (turn > 0)
         facts |= {"pixels": T.shape[1], "frames": frames, "of memory": many, "cores": os.cpu_count()}
         facts["frames a second that this process can feed, of a core"] = float(np.median(fed))
         goal = None if given.smoke else 2.0 * EFFICIENCY
-        rows.append(Row("frames a second, two workers", "one worker", one, two, "frames/s", two / one, goal))
+        for what, found in (("long film", rates), ("short film of a quarter of the pixels", whole)):
+            one, two = (float(np.median(found[count][1:])) for count in found)
+            rows.append(Row(f"two workers, {what}", "one worker", one, two, "frames/s", two / one, goal))
         client, sizes, own = clients[2], [], psutil.Process()
 
         def weigh(step: str, done: int, total: int | None) -> None:

@@ -18,9 +18,8 @@ _RELRO, _STACK, _READ_WRITE = 0x6474E552, 0x6474E551, 6  # ELF: types of a progr
 
 def main(arguments: list[str]) -> int:
     """Exit code of the linker."""
-    objects = [
-        each for each in arguments if each.endswith(".so.o") and "tempfile_" in each
-    ]  # as PoCL names them
+    # PoCL names its objects so.
+    objects = [each for each in arguments if each.endswith(".so.o") and "tempfile_" in each]
     if "-shared" not in arguments or "-o" not in arguments or len(objects) != 1:
         own = Path(__file__).parent
         others = [each for each in os.environ.get("PATH", "").split(os.pathsep) if Path(each) != own]
